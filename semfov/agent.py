@@ -15,7 +15,16 @@ from semfov.belief.observers.any_of import TargetLike, class_meant
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import MOST, Verifier, check_thresholds, conclude, goal_cells, outcome_by_gain, outcome_of
+from semfov.decision import (
+    MOST,
+    CandidateCells,
+    Verifier,
+    check_thresholds,
+    conclude,
+    goal_cells,
+    outcome_by_gain,
+    outcome_of,
+)
 from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
@@ -254,7 +263,8 @@ class ActivePerception(nn.Module):
         verifier, model = None, self._verification(closer)
         if model is not None and model.thresholds is not None and goal is None and price is None:
             at = model.thresholds.changed(confirm, give_up)
-            outcome = verifier = Verifier(model, partial(self.eye.close_up, image), grid, index, at, closer)
+            places, close_up = CandidateCells(grid, index), partial(self.eye.close_up, image)
+            outcome = verifier = Verifier(model, places, close_up, at, closer)
         else:
             outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
         scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
@@ -265,9 +275,9 @@ class ActivePerception(nn.Module):
         if ended:
             scanpath = replace(scanpath, ending="decision")
         if verifier is not None:
-            decision = verifier.conclude(last)
+            decision = verifier.conclude()
             found = decision.outcome == "found"
-            index = verifier.best().target if found else index
+            index = verifier.best.target if found else index
             return replace(scanpath, found=found, target=index, decision=decision, closer=tuple(verifier.looks))
         # Without thresholds the target was found in the fixated cell.
         cell = None if thresholds is not None else int(last.cell)

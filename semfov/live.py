@@ -12,7 +12,7 @@ from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import MOST, CandidatePlace, CloserLook, Decision, LiveVerifier, conclude, decide
+from semfov.decision import MOST, CandidateCells, CloserLook, Decision, Verifier, conclude, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import check
@@ -37,7 +37,7 @@ class LivePerception:
 
     With a model of verification, the target is found by closer looks alone, as in a search. A frame is then either a
     look of the fovea or a closer look at a place that seems to hold the target, since each costs one pass of the
-    detector. What a closer look has told fades, too (`semfov.decision.LiveVerifier`). With rate 0, frames of a
+    detector. What a closer look has told fades, too (`semfov.decision.Verifier`). With rate 0, frames of a
     still picture give the looks, the closer looks and the decision of a search up to its end. Only a place that is
     probable enough, but not enough to end a search at once, is called found earlier, as soon as it was examined.
 
@@ -89,8 +89,11 @@ class LivePerception:
         self._first = first_cell(start, seed, cells[0] * cells[1])
         self._looks: LiveLooks | None = None
         self._steps: Iterator[Step] = iter(())
-        self._verifier: LiveVerifier | None = None
+        self._verifier: Verifier[Step] | None = None
         self._number = 0
+        # The present frame, and the detections of the last closer look.
+        self._image: Tensor | None = None
+        self._closely: Detections | None = None
         # The last look of the fovea, and the number of its frame.
         self._last: tuple[Step, int] | None = None
         # Detections of the looks of which at least half the evidence is left.
@@ -114,7 +117,8 @@ class LivePerception:
             self._check_size(image)
             if self._verifier is not None:
                 self._verifier.wait()
-            moment = self._look(image) if self._candidate is None else self._look_closely(image, self._candidate)
+            self._image, cell = image, self._candidate
+            moment = self._look(image) if cell is None else self._look_closely(cell)
             self._number += 1
             return moment
 
@@ -126,9 +130,16 @@ class LivePerception:
             check(size == wanted, "frame", f"{wanted} pixels, the size of the first frame", size)
 
     @property
-    def _candidate(self) -> CandidatePlace | None:
-        """The place that the next frame is spent on; None for a look of the fovea."""
-        return None if self._verifier is None else self._verifier.candidate
+    def _candidate(self) -> int | None:
+        """Cell of the place that the next frame is spent on; None for a look of the fovea."""
+        place = None if self._verifier is None else self._verifier.candidate
+        return None if place is None else place.cell
+
+    def _close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box of the present frame."""
+        assert self._image is not None
+        self._closely = self.eye.close_up(self._image, box)
+        return self._closely
 
     def _look(self, image: Tensor) -> Moment:
         """Spend a frame on a look of the fovea."""
@@ -147,21 +158,16 @@ class LivePerception:
         seconds = {**watch.seconds, **step.seconds}
         return self._moment(step, self._looks.grid, int(step.cell), step.detections, seconds)
 
-    def _look_closely(self, image: Tensor, candidate: CandidatePlace) -> Moment:
-        """Spend a frame on a closer look."""
+    def _look_closely(self, cell: int) -> Moment:
+        """Spend a frame on a closer look at a place in a cell."""
         assert self._looks is not None
         assert self._last is not None
         assert self._verifier is not None
-        watch, seen = Stopwatch(), []
-
-        def close_up(box: Tensor) -> Detections:
-            seen.append(self.eye.close_up(image, box))
-            return seen[-1]
-
-        step = self._last[0]
-        closer = self._verifier.look(step, close_up)
+        watch = Stopwatch()
+        closer = self._verifier.look()
         watch.lap("detect")
-        return self._moment(step, self._looks.grid, candidate.cell, seen[-1], watch.seconds, closer)
+        assert self._closely is not None
+        return self._moment(self._last[0], self._looks.grid, cell, self._closely, watch.seconds, closer)
 
     def _begin(self, image: Tensor, view: View) -> LiveLooks:
         """Start the episode at the first frame."""
@@ -178,9 +184,8 @@ class LivePerception:
             forgetting=self.forgetting,
         )
         if self.verification is not None and self.target is not None:
-            self._verifier = LiveVerifier(
-                self.verification, grid, self.target, self.forgetting, self.thresholds, self.closer
-            )
+            places = CandidateCells(grid, self.target, self.forgetting)
+            self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
         return looks
 
     def _moment(
@@ -203,14 +208,14 @@ class LivePerception:
             detections=detections,
             belief=step.belief,
             visited=step.visited[0],
-            next_cell=int(step.next_cell) if self._candidate is None else self._candidate.cell,
+            next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=closer,
         )
 
     def _decision(self, step: Step, grid: Grid) -> Decision | None:
         if self._verifier is not None:
-            return self._verifier.decision(step)
+            return self._verifier.decision()
         if self.target is None or self.thresholds is None:
             return None
         outcome = int(decide(step, self.target, self.thresholds))

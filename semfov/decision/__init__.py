@@ -1,9 +1,8 @@
 """Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
 
-from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces
+from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
 from semfov.decision.closer_look import CloserLook
 from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
-from semfov.decision.live_verifier import LiveVerifier
 from semfov.decision.rule import (
     NEARLY,
     OUTCOMES,
@@ -27,11 +26,11 @@ __all__ = [
     "NEARLY",
     "OUTCOMES",
     "SAME",
+    "CandidateCells",
     "CandidatePlace",
     "CandidatePlaces",
     "CloserLook",
     "Decision",
-    "LiveVerifier",
     "Outcome",
     "Verifier",
     "cell_of",

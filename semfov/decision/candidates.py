@@ -1,16 +1,21 @@
-"""Places that seem to hold the target, the most evident first."""
+"""Places that seem to hold the target of a search, from which closer looks are chosen."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.belief.observers.any_of import class_meant
 from semfov.belief.verification import closer_features
-from semfov.decision.evidence import strength, strongest
+from semfov.decision.closer_look import CloserLook
+from semfov.decision.evidence import cell_of, strength, strongest
+from semfov.decision.rule import place_known
 from semfov.detection.detections import Detections
-from semfov.episode import Forgetting
+from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou
 
 SAME = 0.5
@@ -19,22 +24,129 @@ SAME = 0.5
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
 _MOST_LOOKS = 1000  # largest number of looks at a stream whose detections are kept
 
+Look = TypeVar("Look")
+"""A look of a search, with what is known after it."""
+
+CloseUp = Callable[[Tensor], Detections]
+"""Looks closely at a box `(4,)`; gives the detections, a batch of one (`semfov.Eye.close_up`)."""
+
 
 @dataclass(frozen=True)
 class CandidatePlace:
     """A place that seems to hold the target.
 
     Attributes:
-        cell: the cell.
         box: `(4,)`, box of the detection with the strongest evidence there.
-        evidence: that evidence (`strongest`).
-        probability: probability that the cell holds the target.
+        evidence: that evidence: in a cell that of `strongest`; in a large picture the score of the detection.
+        probability: probability that the target is there.
+        cell: the cell; None in a large picture.
     """
 
-    cell: int
     box: Tensor
     evidence: float
     probability: float
+    cell: int | None = None
+
+
+class CandidatePlaces(ABC, Generic[Look]):
+    """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
+
+    Args:
+        forgetting: forgetting between frames; None forgets nothing.
+    """
+
+    def __init__(self, forgetting: Forgetting | None = None) -> None:
+        self.forgetting = Forgetting() if forgetting is None else forgetting
+
+    @abstractmethod
+    def see(self, look: Look) -> None:
+        """Take in a look of the search."""
+
+    @property
+    @abstractmethod
+    def detections(self) -> Detections:
+        """Detections of the last look, a batch of one."""
+
+    @property
+    @abstractmethod
+    def target(self) -> int:
+        """Class that closer looks are made for, 1..K."""
+
+    @property
+    @abstractmethod
+    def presence(self) -> float:
+        """Probability that the picture holds the target, after the last look."""
+
+    @property
+    @abstractmethod
+    def left(self) -> float:
+        """Value of the best look that is left, after the last look."""
+
+    @abstractmethod
+    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
+        """Find the place that is to be looked at closely now.
+
+        Args:
+            least: least probability of a place.
+            last: whether no other look follows.
+
+        Returns:
+            The most evident place that was not examined; None if it is not yet to be examined, or there is none.
+        """
+
+    @abstractmethod
+    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
+        """Do not list a candidate again, nor others at its place.
+
+        Args:
+            candidate: the candidate.
+            box: `(4,)`, the box of the target in the closer look.
+        """
+
+    @abstractmethod
+    def record(self, box: Tensor, place: float, presence: float) -> CloserLook:
+        """Make the record of the last closer look.
+
+        Args:
+            box: `(4,)`, the box of the target in it.
+            place: probability that the target is there.
+            presence: probability that the picture holds the target.
+
+        Returns:
+            The record.
+        """
+
+    def examine(self, candidate: CandidatePlace, close_up: CloseUp) -> tuple[Tensor, Tensor]:
+        """Look closely at a candidate, and dismiss it.
+
+        Args:
+            candidate: the candidate.
+            close_up: looks closely at a box.
+
+        Returns:
+            The features of the closer look `(7,)`, and the box of the target in it `(4,)` (`closer_features`).
+        """
+        features, box = closer_features(
+            self.presence,
+            candidate.probability,
+            candidate.evidence,
+            close_up(candidate.box),
+            candidate.box,
+            self.target,
+        )
+        self.dismiss(candidate, box)
+        return features, box
+
+    def wait(self) -> None:
+        """Let a frame pass."""
+
+    def move(self, look: CloserLook, box: Tensor) -> CloserLook:
+        """The record of a closer look whose target has moved to another box."""
+        return replace(look, box=box)
+
+    def probability(self, look: CloserLook) -> float:
+        """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
+        raise NotImplementedError(f"{type(self).__name__} has no belief towards which closer looks could fade")
 
 
 @dataclass(frozen=True)
@@ -46,30 +158,80 @@ class _Dismissed:
     cells: Tensor
 
 
-class CandidatePlaces:
-    """Places that seem to hold the target of one search, the most evident first, each listed once.
+class CandidateCells(CandidatePlaces[Step]):
+    """Cells that seem to hold the target of one search.
 
     A candidate is the cell with the largest product of probability and evidence. Detections that overlap a box that was
-    examined by half, and the cells that it covers, are left out.
+    examined by half, and the cells that it covers, are left out. A place is due when a fixated cell is nearly as
+    probable as the most probable one (`place_known`), or when no other look follows.
 
     In a scene that changes, evidence of earlier frames counts less, and places that were examined are listed again when
     half of the evidence is left (`semfov.episode.Forgetting`).
 
     Args:
         grid: the cells.
+        target: class 1..K that is searched for.
         forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
-    def __init__(self, grid: Grid, forgetting: Forgetting | None = None) -> None:
-        self.grid = grid
-        self.forgetting = Forgetting() if forgetting is None else forgetting
+    def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:
+        super().__init__(forgetting)
+        self.grid, self._target = grid, target
         self._frame = 0
         self._looks: list[tuple[int, Detections]] = []  # with their frames
         self._dismissed: list[_Dismissed] = []
 
-    def see(self, look: Detections) -> None:
-        """Add the detections of a look, a batch of one."""
-        self._looks.append((self._frame, look))
+    _step: Step
+
+    def see(self, look: Step) -> None:
+        """Take in a step of the search."""
+        self._step = look
+        self._looks.append((self._frame, look.detections))
+
+    @property
+    def detections(self) -> Detections:
+        """Detections of the last look."""
+        return self._looks[-1][1]
+
+    @property
+    def target(self) -> int:
+        """Class that closer looks are made for; in a search for several classes the most probable one."""
+        return class_meant(self._step.belief, self._target)
+
+    @property
+    def presence(self) -> float:
+        """Probability that the image holds the target."""
+        return float(self._step.belief.presence(self._target))
+
+    @property
+    def left(self) -> float:
+        """Largest probability of a cell that was not fixated, given that no fixated cell holds the target."""
+        return float(self._step.belief.chance(self._target).masked_fill(self._step.visited, 0).amax())
+
+    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
+        """The most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
+        cells = self._open(self._step.belief.probability(self._target)[0])
+        if not (last or bool(place_known(cells, self._step.visited[0], least))):
+            return None
+        looks, target = self._left(), self.target
+        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
+        value = cells * shown.amax(0)
+        cell = int(value.argmax())
+        evidence, box = strongest(looks, self.grid, cell, target)
+        if box is None or float(value[cell]) <= 0 or float(cells[cell]) < least:
+            return None
+        return CandidatePlace(box, evidence, float(cells[cell]), cell)
+
+    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
+        """Leave out the detections of both boxes, and the cells that they cover."""
+        boxes = torch.stack([candidate.box, box])
+        covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
+        covered[candidate.cell] = True
+        self._dismissed.append(_Dismissed(self._frame, boxes, covered))
+
+    def record(self, box: Tensor, place: float, presence: float) -> CloserLook:
+        """Make the record of the last closer look, after the last fixation."""
+        return CloserLook(self._step.shift, self.target, cell_of(box, self.grid), box, place, presence)
 
     def wait(self) -> None:
         """Let a frame pass: drop looks, and list places again, of which less than half the evidence is left."""
@@ -78,62 +240,19 @@ class CandidatePlaces:
         self._looks = [(frame, look) for frame, look in self._looks[-_MOST_LOOKS:] if frame >= oldest]
         self._dismissed = [place for place in self._dismissed if place.frame >= oldest]
 
-    def next(self, cells: Tensor, target: int) -> CandidatePlace | None:
-        """Find the most evident place that was not examined.
+    def move(self, look: CloserLook, box: Tensor) -> CloserLook:
+        """The record of a closer look whose target has moved to another box, and its cell."""
+        return replace(look, box=box, cell=cell_of(box, self.grid))
 
-        Args:
-            cells: `(X·Y,)`, probability of the target in each cell.
-            target: class 1..K.
+    def probability(self, look: CloserLook) -> float:
+        """Present probability that the target is in the cell of a closer look."""
+        return float(self._step.belief.probability(self._target)[0, look.cell])
 
-        Returns:
-            The candidate; None if no detection that could be the target is left.
-        """
-        cells, looks = self.open(cells), self._left()
-        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
-        value = cells * shown.amax(0)
-        cell = int(value.argmax())
-        evidence, box = strongest(looks, self.grid, cell, target)
-        return (
-            None if box is None or float(value[cell]) <= 0 else CandidatePlace(cell, box, evidence, float(cells[cell]))
-        )
-
-    def open(self, cells: Tensor) -> Tensor:
+    def _open(self, cells: Tensor) -> Tensor:
         """The probabilities, with 0 for the cells that were examined."""
         for place in self._dismissed:
             cells = cells.masked_fill(place.cells, 0)
         return cells
-
-    def examine(
-        self, candidate: CandidatePlace, presence: float, close_up: Callable[[Tensor], Detections], target: int
-    ) -> tuple[Tensor, Tensor]:
-        """Look closely at a candidate, and dismiss it.
-
-        Args:
-            candidate: the candidate.
-            presence: probability that the image holds the target.
-            close_up: looks closely at a box `(4,)`.
-            target: class 1..K.
-
-        Returns:
-            The features of the closer look `(7,)`, and the box of the target in it `(4,)` (`closer_features`).
-        """
-        features, box = closer_features(
-            presence, candidate.probability, candidate.evidence, close_up(candidate.box), candidate.box, target
-        )
-        self.dismiss(candidate, box)
-        return features, box
-
-    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Do not list a candidate again, nor others at its place.
-
-        Args:
-            candidate: the candidate.
-            box: `(4,)`, the box of the target in the closer look.
-        """
-        boxes = torch.stack([candidate.box, box])
-        covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
-        covered[candidate.cell] = True
-        self._dismissed.append(_Dismissed(self._frame, boxes, covered))
 
     def _left(self) -> list[Detections]:
         """The looks with faded scores, without the detections of objects that were examined."""

@@ -1,143 +1,161 @@
 """Verification of the target by closer looks, before a search decides."""
 
-from collections.abc import Callable
+import math
+from dataclasses import dataclass, replace
+from typing import Generic
 
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
-from semfov.belief.grid import Grid
-from semfov.belief.observers.any_of import class_meant
 from semfov.belief.target_evidence import Thresholds
-from semfov.belief.verification import Verification
-from semfov.decision.candidates import CandidatePlace, CandidatePlaces
+from semfov.belief.verification import MATCHED, Verification, match
+from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, CloseUp, Look
 from semfov.decision.closer_look import CloserLook
-from semfov.decision.evidence import cell_of
-from semfov.decision.rule import OUTCOMES, Decision, place_known, surely, verified
+from semfov.decision.rule import OUTCOMES, Decision, surely, verified
 from semfov.detection.detections import Detections
-from semfov.episode import Forgetting, Step
+from semfov.episode import Step
 from semfov.errors import check, check_whole
+from semfov.observation.matching import box_iou
 
 MOST = 2
 """Default for the largest number of closer looks in a search."""
 
+_SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
+_FLOOR = 1e-6
 
-class Examiner:
-    """Looks closely at the places of one search that seem to hold the target.
 
-    `Verifier` does it in a picture, and `semfov.decision.LiveVerifier` in a stream of frames.
+@dataclass(frozen=True)
+class Verdict:
+    """What a closer look has shown, some frames ago.
 
-    Args:
-        model: gives the probabilities after closer looks.
-        grid: the cells.
-        target: class 1..K.
-        thresholds: see `Verification`; None takes those of the model.
-        most: largest number of closer looks.
-        forgetting: forgetting between frames; None forgets nothing.
-
-    Raises:
-        InputError: no thresholds are given and the model has none, or `most` is out of range.
+    Attributes:
+        look: the closer look; its box and its cell follow the target (`follow`).
+        age: number of frames since then.
     """
 
-    def __init__(
-        self,
-        model: Verification,
-        grid: Grid,
-        target: int,
-        thresholds: Thresholds | None,
-        most: int,
-        forgetting: Forgetting | None = None,
-    ) -> None:
-        thresholds = model.thresholds if thresholds is None else thresholds
-        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
-        assert thresholds is not None
-        self.model, self.target, self.thresholds = model, target, thresholds
-        check_whole(most, "most", 1, 100)
-        self.most = most
-        self.candidates = CandidatePlaces(grid, forgetting)
-
-    def over(self, step: Step) -> bool:
-        """Whether no cell is worth a further fixation after a step of one search."""
-        left = step.belief.chance(self.target).masked_fill(step.visited, 0).amax()
-        return float(left) < self.thresholds.give_up
-
-    def due(self, step: Step, *, over: bool) -> CandidatePlace | None:
-        """Find the place that is to be looked at closely after a step.
-
-        Args:
-            step: a step of one search.
-            over: whether no further fixation follows. Otherwise the most probable place must have been fixated.
-
-        Returns:
-            The place; None if none is probable enough.
-        """
-        cells, least = step.belief.probability(self.target)[0], self.thresholds.place
-        if not (over or bool(place_known(self.candidates.open(cells), step.visited[0], least))):
-            return None
-        candidate = self.candidates.next(cells, class_meant(step.belief, self.target))
-        return None if candidate is None or candidate.probability < least else candidate
-
-    def examine(self, step: Step, candidate: CandidatePlace, close_up: Callable[[Tensor], Detections]) -> CloserLook:
-        """Look closely at a place.
-
-        Args:
-            step: the last step of the search.
-            candidate: the place.
-            close_up: looks closely at a box `(4,)` (`semfov.Eye.close_up`).
-
-        Returns:
-            The closer look.
-        """
-        presence, target = float(step.belief.presence(self.target)), class_meant(step.belief, self.target)
-        features, box = self.candidates.examine(candidate, presence, close_up, target)
-        place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        return CloserLook(step.shift, target, cell_of(box, self.candidates.grid), box, place, presence)
+    look: CloserLook
+    age: int = 0
 
 
-class Verifier(Examiner):
-    """Decides one search, with closer looks at the places that seem to hold the target.
+class Verifier(Generic[Look]):
+    r"""Decides one search, with closer looks at the places that seem to hold the target.
 
-    When a fixated cell is probably the target's, or when no cell is worth a further fixation, the most evident place is
-    looked at closely. The search ends at once if the target is there with a probability halfway between `confirm`
-    and 1, or more (`surely`). Otherwise it goes on, until no cell is worth a fixation, or `most` closer looks were
-    made. Then it has found the target at the best of the examined places, if that is probable enough. If not, the
-    target is absent or the search undecided, by the probability that the image holds it.
+    After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
+    it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
+    and 1, or more (`surely`). Otherwise it goes on, until no look is worth a pass, or `most` closer looks were made.
+    Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
+    absent or the search undecided, by the probability that the picture holds it (`verified`).
+
+    The candidates are cells of a grid (`CandidateCells`) or boxes in a large picture
+    (`semfov.zoom.closer.CandidateBoxes`). Closer looks may follow a look at once (`look_closely`), or take frames of
+    their own in a stream (`look`). The probabilities of a closer look then fade towards the belief. With the rate r of
+    the candidates' `Forgetting`, after a frames
+
+    .. math:: \operatorname{logit} P_a = e^{-ra} \operatorname{logit} P_0 + (1 - e^{-ra}) \operatorname{logit} B
+
+    where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
+    place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
+    place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
+    and the boxes of the verdicts follow the detections of each look (`follow`).
 
     Args:
         model: gives the probabilities after closer looks.
-        close_up: looks closely at a box `(4,)` (`semfov.Eye.close_up`).
-        grid: the cells.
-        target: class 1..K.
+        places: source of candidates.
+        close_up: looks closely at a box `(4,)`; gives the detections, a batch of one.
         thresholds: see `Verification`; None takes those of the model.
-        most: largest number of closer looks.
+        most: largest number of closer looks; in a scene that changes, in :math:`\ln 2 / r` frames.
+
+    Attributes:
+        verdicts: the closer looks that are not forgotten, in order.
+        candidate: the place that is to be looked at closely now; None if there is none.
 
     Raises:
         InputError: no thresholds are given and the model has none, or `most` is out of range.
 
     Example::
 
-        verifier = Verifier(Verification.from_pretrained("yolox-nano"), partial(eye.close_up, image), grid, target)
+        places, close_up = CandidateCells(grid, target), partial(eye.close_up, image)
+        verifier = Verifier(Verification.from_pretrained("yolox-nano"), places, close_up)
         for step in rollout(looks, observer, policy, start, choice, most=31, ends=lambda step: verifier(step) > 0):
             ...
-        print(verifier.conclude(step), verifier.looks)
+        print(verifier.conclude(), verifier.looks)
     """
 
     def __init__(
         self,
         model: Verification,
-        close_up: Callable[[Tensor], Detections],
-        grid: Grid,
-        target: int,
+        places: CandidatePlaces[Look],
+        close_up: CloseUp,
         thresholds: Thresholds | None = None,
         most: int = MOST,
     ) -> None:
-        super().__init__(model, grid, target, thresholds, most)
-        self.close_up = close_up
-        self.looks: list[CloserLook] = []
-        self._outcome = 0
+        thresholds = model.thresholds if thresholds is None else thresholds
+        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
+        assert thresholds is not None
+        check_whole(most, "most", 1, 100)
+        self.model, self.places, self.close_up = model, places, close_up
+        self.thresholds, self.most = thresholds, most
+        self.verdicts: list[Verdict] = []
+        self.candidate: CandidatePlace | None = None
+        self._last = False
 
-    def __call__(self, step: Step) -> Tensor:
-        """Decide whether the search ends with a step. Call it once for every step, in order.
+    @property
+    def looks(self) -> list[CloserLook]:
+        """The closer looks, in order."""
+        return [verdict.look for verdict in self.verdicts]
+
+    def wait(self) -> None:
+        """Let the time of a frame pass. In a stream, call it before every frame."""
+        self.places.wait()
+        aged = (replace(verdict, age=verdict.age + 1) for verdict in self.verdicts)
+        self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
+
+    def see(self, look: Look, *, last: bool = False) -> None:
+        """Take in a look of the search, and choose the place that is to be looked at closely.
+
+        Args:
+            look: the look.
+            last: whether no other look can follow.
+        """
+        self.places.see(look)
+        if self.places.forgetting.rate:
+            self.verdicts = [self._followed(verdict) for verdict in self.verdicts]
+        self._choose(last=last)
+
+    def look(self) -> CloserLook:
+        """Look closely at the candidate, and choose the next one.
+
+        Returns:
+            The closer look.
+        """
+        assert self.candidate is not None
+        features, box = self.places.examine(self.candidate, self.close_up)
+        with torch.no_grad():
+            place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        look = self.places.record(box, place, presence)
+        # A place that was free to be examined again has a new verdict now.
+        self.verdicts = [old for old in self.verdicts if self._recent(old) or not _same(old.look, look)]
+        self.verdicts.append(Verdict(look))
+        self._choose(last=self._last)
+        return look
+
+    def look_closely(self, room: float = math.inf) -> list[CandidatePlace]:
+        """Make all closer looks that are due.
+
+        Args:
+            room: number of passes of the detector that are left.
+
+        Returns:
+            The places that were looked at, in order.
+        """
+        examined: list[CandidatePlace] = []
+        while self.candidate is not None and len(examined) < room:
+            examined.append(self.candidate)
+            self.look()
+        return examined
+
+    def __call__(self: "Verifier[Step]", step: Step) -> Tensor:
+        """Decide whether a search ends with a step, after the closer looks. Call it once for every step, in order.
 
         Args:
             step: a step of one search.
@@ -145,48 +163,137 @@ class Verifier(Examiner):
         Returns:
             `(1,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
         """
-        self.candidates.see(step.detections)
-        self._outcome = self._verify(step, over=self.over(step))
-        return torch.full_like(step.cell, self._outcome)
+        self.see(step)
+        self.look_closely()
+        return torch.full_like(step.cell, self.outcome())
 
-    def conclude(self, step: Step) -> Decision:
-        """Make the decision of the search.
+    @property
+    def over(self) -> bool:
+        """Whether no look of the search is worth a pass, or all closer looks were made."""
+        return self.places.left < self.thresholds.give_up or self._spent
 
-        Args:
-            step: the last step. If the search did not end with it, all its fixations are spent: what is left of closer
-                looks is made now.
+    def outcome(self) -> int:
+        """Decide whether the search ends.
+
+        Returns:
+            0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+        """
+        return verified(self._chances, self.presence, self.thresholds.confirm, over=self.over)
+
+    def conclude(self) -> Decision:
+        """Make the decision of a search that is over.
+
+        If it did not end, all its looks are spent: what is left of closer looks is made now.
 
         Returns:
             The decision.
         """
-        outcome = self._outcome or self._verify(step, over=True)
-        presence = self._presence(step.belief)
-        if OUTCOMES[outcome] != "found":
-            return Decision(OUTCOMES[outcome], presence)
-        best = self.best()
-        return Decision("found", max(presence, best.place), best.cell, best.box, best.place)
+        if not self.outcome():
+            self._choose(last=True)
+            self.look_closely()
+        return self.decision(over=True)
 
-    def _verify(self, step: Step, *, over: bool) -> int:
-        """Make the closer looks that are due after a step, and return the outcome."""
-        while len(self.looks) < self.most:
-            candidate = self.due(step, over=over)
-            if candidate is None:
-                break
-            self.looks.append(self.examine(step, candidate, self.close_up))
-            if self.looks[-1].place >= surely(self.thresholds.confirm):
-                break
-        over = over or len(self.looks) >= self.most
-        places = [look.place for look in self.looks]
-        return verified(places, self._presence(step.belief), self.thresholds.confirm, over=over)
+    def decision(self, *, over: bool | None = None) -> Decision:
+        """Make the decision as it stands after the last look.
 
-    def best(self) -> CloserLook:
-        """The closer look with the largest probability of the place.
+        Args:
+            over: whether the search is over; None: it is if no look is worth a pass, and no place is left to examine.
 
         Returns:
-            The closer look; there must be at least one.
+            `found` if the probability of a place is at least `confirm`; otherwise `absent` or `undecided` for a search
+            that is over, and `undecided` before that.
         """
-        return max(self.looks, key=lambda look: look.place)
+        over = self.candidate is None and self.over if over is None else over
+        chances, presence = self._chances, self.presence
+        outcome = OUTCOMES[verified(chances, presence, self.thresholds.confirm, over=True)]
+        if outcome != "found":
+            return Decision(outcome if over else "undecided", presence)
+        place, best = max(chances), self.best
+        return Decision("found", max(presence, place), best.cell, best.box, place)
 
-    def _presence(self, belief: Belief) -> float:
-        """Probability that the image holds the target: the largest after a closer look, or that of the belief."""
-        return max((look.presence for look in self.looks), default=float(belief.presence(self.target)))
+    @property
+    def presence(self) -> float:
+        """Probability that the picture holds the target: the largest after a closer look, or that without them."""
+        without = self.places.presence
+        recent = (each for each in self.verdicts if self._recent(each))
+        return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
+
+    @property
+    def best(self) -> CloserLook:
+        """The closer look with the largest probability of the place; there must be one."""
+        return max(zip(self._chances, self.looks, strict=True), key=lambda pair: pair[0])[1]
+
+    def _choose(self, *, last: bool) -> None:
+        """Choose the place that is to be looked at closely."""
+        self._last = last
+        recent = [chance for chance, each in zip(self._chances, self.verdicts, strict=True) if self._recent(each)]
+        sure = any(chance >= surely(self.thresholds.confirm) for chance in recent)
+        last = last or self.places.left < self.thresholds.give_up
+        self.candidate = None if self._spent or sure else self.places.due(self.thresholds.place, last=last)
+
+    @property
+    def _spent(self) -> bool:
+        """Whether all closer looks were made."""
+        return sum(self._recent(each) for each in self.verdicts) >= self.most
+
+    @property
+    def _chances(self) -> list[float]:
+        """For each verdict, the probability that the target is still there."""
+        return [self._chance(verdict) for verdict in self.verdicts]
+
+    def _chance(self, verdict: Verdict) -> float:
+        """Probability that the target is still at the place of a closer look."""
+        look, keep = verdict.look, self.places.forgetting.keep
+        if keep**verdict.age == 1:
+            return look.place
+        return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
+
+    def _followed(self, verdict: Verdict) -> Verdict:
+        """The verdict at the place to which a look has followed its target."""
+        look = verdict.look
+        return replace(verdict, look=self.places.move(look, follow(look.box, self.places.detections, look.target)))
+
+    def _recent(self, verdict: Verdict) -> bool:
+        """Whether at least half of the evidence of a closer look is left."""
+        return verdict.age <= self.places.forgetting.span
+
+    def _faded(self, before: float, now: float, age: int) -> float:
+        """A probability that fades towards that of the belief."""
+        weight = self.places.forgetting.keep**age
+        if weight == 1:
+            return before
+        odds, present = torch.tensor([before, now], dtype=torch.float64).logit(_FLOOR)
+        return float((weight * odds + (1 - weight) * present).sigmoid())
+
+
+def follow(box: Tensor, seen: Detections, target: int) -> Tensor:
+    """Move the box of a target to the middle of the detection that best shows it (`semfov.belief.verification.match`).
+
+    The box keeps its size, because a closer look measures it better than a look of the fovea.
+
+    Args:
+        box: `(4,)`, the box.
+        seen: detections of a look, a batch of one.
+        target: class 1..K.
+
+    Returns:
+        The box `(4,)`, unmoved if no detection overlaps it by `MATCHED`.
+
+    >>> seen = Detections(torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
+    >>> follow(torch.tensor([0.0, 0.0, 8.0, 8.0]), seen, 1)
+    tensor([ 3.,  0., 11.,  8.])
+    """
+    shown = seen.mask[0]
+    boxes, scores = seen.boxes[0][shown], seen.scores[0][shown, target]
+    if not len(boxes):
+        return box
+    best, overlap = match(boxes, scores, box)
+    if float(overlap[best]) < MATCHED:
+        return box
+    shift = (boxes[best] - box).view(2, 2).mean(0)
+    return box + shift.repeat(2)
+
+
+def _same(one: CloserLook, other: CloserLook) -> bool:
+    """Whether two closer looks show the same place of a scene that changes."""
+    return one.cell == other.cell or float(box_iou(one.box[None], other.box[None])) >= SAME

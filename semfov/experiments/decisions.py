@@ -17,7 +17,7 @@ from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import Verifier, conclude, confirms, decide, decide_by_price
+from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
 from semfov.errors import InputError, check
@@ -108,13 +108,13 @@ class DecisionRun(Run):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(self, close_up: CloseUps, grid: Grid, target: int) -> Verifier:
+    def _verifier(self, close_up: CloseUps, grid: Grid, target: int) -> Verifier[Step]:
         """The closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
         thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
-        return Verifier(self.verification, close_up, grid, target, thresholds, config.closer)
+        return Verifier(self.verification, CandidateCells(grid, target), close_up, thresholds, config.closer)
 
     def _published(self) -> FovealObservationModel | None:
         """The observation model of the published belief; None if the settings name none and none is shipped."""
@@ -180,7 +180,7 @@ class DecisionRun(Run):
                     steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
                     last, seen = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
-                        decision = verifier.conclude(last)
+                        decision = verifier.conclude()
                     else:
                         # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                         place = int(last.cell) if judge is at_the_gaze else None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import Verifier, conclude, decide, surely
+from semfov.decision import OUTCOMES, CandidateCells, Verifier, conclude, decide, verified
 from semfov.episode import Step
 from semfov.experiments.progress import track
 from semfov.training.closer_looks import Photograph, Sought, search
@@ -47,11 +47,13 @@ class Verified:
 
     def found(self, confirm: float) -> Ended:
         """Return the end of the search at a threshold."""
-        for (place, right), end in zip(self.places, self.ends, strict=True):
-            if place >= surely(confirm):
-                return right, end
-        place, right = max(self.places, default=(0.0, False))
-        return (right if place >= confirm else None), self.looks
+        chances = [chance for chance, _ in self.places]
+        for number, end in enumerate(self.ends, 1):
+            if verified(chances[:number], self.presence, confirm, over=False):
+                return self.places[number - 1][1], end
+        if OUTCOMES[verified(chances, self.presence, confirm, over=True)] != "found":
+            return None, self.looks
+        return self.places[chances.index(max(chances))][1], self.looks
 
 
 def verify(
@@ -74,9 +76,9 @@ def verify(
         for sought in photograph.sought:
             # Decisions do not move the gaze, so all of them are made along the same looks.
             steps = list(search(photograph, sought, observer, config.looks))
-            verifier = Verifier(model, photograph.close_up, photograph.grid, sought.target, always)
+            verifier = Verifier(model, CandidateCells(photograph.grid, sought.target), photograph.close_up, always)
             end = next((number for number, step in enumerate(steps, 1) if int(verifier(step))), len(steps))
-            decision = verifier.conclude(steps[end - 1])
+            decision = verifier.conclude()
             places = tuple((look.place, bool(sought.goal[look.cell])) for look in verifier.looks)
             yield Verified(
                 photograph=photograph.number,

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import FEATURES, Verification
-from semfov.decision import CandidatePlaces, cell_of
+from semfov.decision import CandidateCells, cell_of
 from semfov.errors import DataError
 from semfov.experiments.progress import track
 from semfov.training.closer_looks import Photograph, search
@@ -115,20 +115,19 @@ def examine(seen: Sequence[Photograph], evidence: TargetEvidence, config: FitVer
     observer = Target(evidence)
     for photograph in track(seen, "looking", "photograph"):
         for sought in (each for each in photograph.sought if not each.spare):
-            looks = []
+            steps = []
             for step in search(photograph, sought, observer, config.looks):
-                looks.append(step.detections)
-                if len(looks) not in AFTER:
+                steps.append(step)
+                if len(steps) not in AFTER:
                     continue
-                candidates, cells = CandidatePlaces(photograph.grid), step.belief.probability(sought.target)[0]
-                for look in looks:
-                    candidates.see(look)
+                candidates = CandidateCells(photograph.grid, sought.target)
+                for each in steps:
+                    candidates.see(each)
                 for _ in range(_EACH):
-                    candidate = candidates.next(cells, sought.target)
-                    if candidate is None or candidate.probability < _LEAST:
+                    candidate = candidates.due(_LEAST, last=True)
+                    if candidate is None:
                         break
-                    presence = float(step.belief.presence(sought.target))
-                    features, box = candidates.examine(candidate, presence, photograph.close_up, sought.target)
+                    features, box = candidates.examine(candidate, photograph.close_up)
                     right = bool(sought.goal[cell_of(box, photograph.grid)])
                     rows.append((features, right, sought.present, photograph.number % config.folds))
         photograph.close()

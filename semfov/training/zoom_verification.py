@@ -12,14 +12,15 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
-from semfov.decision import MOST, OUTCOMES, SAME, settle
+from semfov.decision import OUTCOMES, SAME, Verifier, settle
+from semfov.detection.detections import Detections
 from semfov.experiments.zoom_store import StoredGlances
 from semfov.observation.matching import box_iou
 from semfov.training.verification_decisions import Ended, Verified, choose_confirm
 from semfov.training.verification_fit import Examined, FittedVerification, fit
 from semfov.training.verification_report import report
 from semfov.training.zoom_decision import searches_of
-from semfov.zoom.closer import Suspects, ZoomVerifier
+from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
 
@@ -82,6 +83,10 @@ class Turned:
     ahead: float
     box: Tensor | None
 
+    def look(self, number: int) -> WindowLook:
+        """The look for a verifier, with the number of looks up to it."""
+        return WindowLook(self.glance.detections, number, self.presence, self.best, self.ahead)
+
 
 @dataclass(frozen=True)
 class Sought:
@@ -105,6 +110,10 @@ class Sought:
     def present(self) -> bool:
         """Whether the mosaic holds the class."""
         return len(self.boxes) > 0
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+        return look_closely(self.looks, box).detections
 
     def right(self, box: Tensor) -> bool:
         """Whether a box `(4,)` is that of an annotated object of the class."""
@@ -153,14 +162,14 @@ def examine(searches: Sequence[Sought]) -> Examined | None:
     rows: list[tuple[Tensor, bool, bool, int]] = []
     for sought in searches:
         for count in (each for each in AFTER if each <= len(sought.turns)):
-            suspects, last = Suspects(sought.looks, sought.target), sought.turns[count - 1]
-            for turn in sought.turns[:count]:
-                suspects.see(turn.glance)
+            boxes = CandidateBoxes(sought.target, _LEAST)
+            for number, turn in enumerate(sought.turns[:count], 1):
+                boxes.see(turn.look(number))
             for _ in range(_EACH):
-                suspect = suspects.next(last.presence, last.best)
-                if suspect is None or suspect.probability < _LEAST:
+                candidate = boxes.due(_LEAST, last=True)
+                if candidate is None:
                     break
-                _, features, box = suspects.examine(suspect, last.presence)
+                features, box = boxes.examine(candidate, sought.close_up)
                 rows.append((features, sought.right(box), sought.present, 0))
     if len({right for _, right, _, _ in rows}) < 2:
         return None
@@ -187,15 +196,13 @@ def verify(
     give_up, likely = evidence.thresholds.give_up, evidence.thresholds.confirm
     always = Thresholds(1.0, give_up, config.place)
     for sought in searches:
-        verifier = ZoomVerifier(model, sought.looks, sought.target, always, likely, MOST)
-        count, presence = 0, 0.0
+        verifier, count = Verifier(model, CandidateBoxes(sought.target, likely), sought.close_up, always), 0
         for turn in sought.turns:
-            count, presence = count + 1, turn.presence
-            verifier.suspects.see(turn.glance)
-            room, over = config.passes - count, turn.ahead < give_up
-            if turn.box is not None:
-                count += len(verifier(presence, turn.best, count, room, over=over or room <= 1))
-            if over or count >= config.passes or len(verifier.looks) == MOST:
+            count += 1
+            room = config.passes - count
+            verifier.see(turn.look(count), last=room <= 1)
+            count += len(verifier.look_closely(room))
+            if verifier.over or count >= config.passes:
                 break
         yield Verified(
             photograph=sought.mosaic,
@@ -203,7 +210,7 @@ def verify(
             spare=False,
             places=tuple((look.place, sought.right(look.box)) for look in verifier.looks),
             ends=tuple(look.number + 1 for look in verifier.looks if look.number is not None),
-            presence=verifier.presence(presence),
+            presence=verifier.presence,
             looks=count,
             unverified=unverified(sought, evidence.thresholds),
         )

@@ -4,12 +4,14 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import MOST, OUTCOMES, Decision, settle
+from semfov.decision import MOST, OUTCOMES, Decision, Verifier, settle
+from semfov.detection.detections import Detections
 from semfov.paths.endings import Ending
 from semfov.zoom.belief import Rates, ZoomBelief
-from semfov.zoom.closer import ZoomVerifier
+from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.objects import merge
@@ -116,7 +118,7 @@ def search(
     """Search a picture for one object of a class and decide whether it is there.
 
     Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
-    such a place (`semfov.zoom.closer.ZoomVerifier`). Without closer looks it is `found` when the picture holds it with
+    such a place (`semfov.decision.Verifier`). Without closer looks it is `found` when the picture holds it with
     a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
 
     When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
@@ -139,13 +141,19 @@ def search(
         The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
-    verifier, model = None, evidence.verification
-    if closer and model is not None and model.thresholds is not None:
-        verifier = ZoomVerifier(model, glances, target, model.thresholds.changed(confirm), thresholds.confirm, closer)
-    else:
-        thresholds = thresholds.changed(confirm)
     seen: list[Glance] = []
     values: list[float] = []
+
+    def close_up(box: Tensor) -> Detections:
+        seen.append(look_closely(glances, box))
+        return seen[-1].detections
+
+    verifier, model = None, evidence.verification
+    if closer and model is not None and model.thresholds is not None:
+        places, at = CandidateBoxes(target, thresholds.confirm), model.thresholds.changed(confirm, thresholds.give_up)
+        verifier = Verifier(model, places, close_up, at, closer)
+    else:
+        thresholds = thresholds.changed(confirm)
     tally: Tally | None = None
     ended, presence = 0, None
     for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
@@ -153,34 +161,27 @@ def search(
         tally.add(glance)
         seen.append(glance)
         values.append(value)
-        if verifier is not None:
-            verifier.suspects.see(glance)
-        presence, over = None, ahead < thresholds.give_up
-        if tally.looked or over:  # otherwise no probability ends the search
+        presence = None
+        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
             presence = tally.presence(ahead)
             if verifier is None:
                 state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
                 ended = int(settle(*state, thresholds))
             else:
-                room = passes - len(seen)
-                last = over or ahead == 0 or room <= 1
-                for look, chance in verifier(presence, tally.best, len(seen), room, over=last):
-                    seen.append(look)
-                    values.append(chance)
-                ended = verifier.outcome(presence, over=over)
+                room, look = passes - len(seen), WindowLook(glance.detections, len(seen), presence, tally.best, ahead)
+                verifier.see(look, last=ahead == 0 or room <= 1)
+                values += [place.probability for place in verifier.look_closely(room)]
+                ended = verifier.outcome()
         if ended or len(seen) == passes:
             break
     assert tally is not None
-    presence = tally.presence(ahead) if presence is None else presence
-    box, place = (tally.box if OUTCOMES[ended] == "found" else None), None
-    if verifier is not None:
-        if not ended and OUTCOMES[verifier.outcome(presence, over=True)] == "found":
-            ended = OUTCOMES.index("found")
-        presence = verifier.presence(presence)
-        if OUTCOMES[ended] == "found":
-            best = verifier.best()
-            presence, box, place = max(presence, best.place), best.box, best.place
-    ending: Ending = "decision" if ended else "passes" if len(seen) == passes else "windows"
+    if verifier is not None and verifier.looks:
+        decision = verifier.decision(over=ended > 0)
+    else:
+        presence = tally.presence(ahead) if presence is None else presence
+        decision = Decision(OUTCOMES[ended], presence, None, tally.box if OUTCOMES[ended] == "found" else None)
+    decided = ended > 0 or decision.outcome == "found"
+    ending: Ending = "decision" if decided else "passes" if len(seen) == passes else "windows"
     return ZoomPath(
         lattice=glances.lattice,
         classes=classes,
@@ -188,7 +189,7 @@ def search(
         glances=tuple(seen),
         values=tuple(values),
         objects=merge(seen, target),
-        decision=Decision(OUTCOMES[ended], presence, None, box, place),
+        decision=decision,
         ending=ending,
         closer=() if verifier is None else tuple(verifier.looks),
     )

@@ -12,7 +12,7 @@ from semfov import ActivePerception, Detections, Eye, Foveation
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import LiveVerifier
+from semfov.decision import CandidateCells, Verifier
 from semfov.detection import Candidates, Detector
 from semfov.episode import Forgetting
 from semfov.errors import InputError
@@ -160,7 +160,7 @@ def test_evidence_fades_in_the_frame_of_a_closer_look_too():
 
 def verifier(scores, rate, **options):
     closer = Closer(scores)
-    return LiveVerifier(Told(), GRID, 1, Forgetting(rate), AT, **options), closer
+    return Verifier(Told(), CandidateCells(GRID, 1, Forgetting(rate)), closer, AT, **options), closer
 
 
 def faded(told, here, weight):
@@ -171,18 +171,18 @@ def faded(told, here, weight):
 
 def test_the_verdict_fades_towards_the_belief():
     rate = 0.1
-    judge, closer = verifier({5: SURE}, rate)
+    judge, _ = verifier({5: SURE}, rate)
     judge.see(step(0, {5: 0.6}, [5], 0.5, look(5)))
     judge.wait()
-    told = judge.look(step(0, {5: 0.6}, [5], 0.5), closer)
+    told = judge.look()
     assert (told.place, told.presence) == (pytest.approx(0.9), pytest.approx(0.45, abs=0.5))
-    assert judge.decision(step(0, {5: 0.6}, [5], 0.5)).place == told.place
+    assert judge.decision().place == told.place
     for age in range(1, 12):
         now = step(age, {5: 0.3}, [5], 0.2)
         judge.wait()
         judge.see(now)
         place = faded(told.place, 0.3, math.exp(-rate * age))
-        decision = judge.decision(now)
+        decision = judge.decision()
         presence = faded(told.presence, 0.2, math.exp(-rate * age)) if age < math.log(2) / rate else 0.2
         assert (decision.outcome == "found") == (place >= 0.7)
         assert decision.place == (pytest.approx(place, abs=1e-5) if place >= 0.7 else None)
@@ -193,10 +193,10 @@ def test_the_verdict_fades_towards_the_belief():
 def test_a_found_target_is_followed_in_a_scene_that_changes():
     """Box and cell follow the detections; without forgetting, and without a detection, they stay."""
     for rate in (0.05, 0.0):
-        judge, closer = verifier({5: SURE}, rate)
+        judge, _ = verifier({5: SURE}, rate)
         judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
         judge.wait()
-        judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+        judge.look()
         box = torch.tensor(box_of(5))
         for shift in (8.0, 16.0, 24.0, 32.0):
             judge.wait()
@@ -212,32 +212,32 @@ def test_a_found_target_is_followed_in_a_scene_that_changes():
                 Detections(torch.stack([wide, other])[None], scores, torch.ones(1, 2).bool()),
             )
             judge.see(now)
-        decision = judge.decision(now)
+        decision = judge.decision()
         expected = box + (torch.tensor([32.0, 0.0, 32.0, 0.0]) if rate else 0.0)
         torch.testing.assert_close(decision.box, expected)
         assert decision.cell == (6 if rate else 5)
         judge.wait()
         judge.see(step(2, {5: 0.6, 6: 0.6}, [5], 0.9, look(11)))
-        torch.testing.assert_close(judge.decision(now).box, expected)
+        torch.testing.assert_close(judge.decision().box, expected)
 
 
 def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
-    judge, closer = verifier({5: 0.4}, 0.1)
+    judge, _ = verifier({5: 0.4}, 0.1)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
-    judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+    judge.look()
     for number in range(1, 20):
         judge.wait()
         now = step(number, {5: 0.99}, [0], 0.99)
         judge.see(now)
-        assert judge.decision(now).outcome != "found"
+        assert judge.decision().outcome != "found"
     assert not judge.verdicts
 
 
 @pytest.mark.parametrize(("rate", "free"), [(0.1, 7), (0.3, 3), (0.0, None)])
 def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, free):
     """ln 2 / 0.1 = 6.9 frames and ln 2 / 0.3 = 2.3 frames; without forgetting never."""
-    judge, closer = verifier({5: 0.4}, rate)
+    judge, _ = verifier({5: 0.4}, rate)
     examined = []
     for number in range(20):
         judge.wait()
@@ -245,7 +245,7 @@ def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, fr
         if judge.candidate is None:
             judge.see(now)
         else:
-            judge.look(now, closer)
+            judge.look()
             examined.append(number)
     assert examined[0] == 1
     # The place is free in this frame, which is a look; the frame after it is a closer look.
@@ -258,22 +258,22 @@ def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
     judge, closer = verifier({5: SURE}, 0.3)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
-    judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+    judge.look()
     closer.scores[5] = 0.4
     for number in range(1, 4):
         judge.wait()
         now = step(number, {5: 0.95}, [5], 0.9, look(5))
         judge.see(now)
-        assert judge.decision(now).outcome == "found"
+        assert judge.decision().outcome == "found"
     judge.wait()
-    judge.look(now, closer)
-    assert judge.decision(now).outcome != "found"
+    judge.look()
+    assert judge.decision().outcome != "found"
     assert [each.look.place for each in judge.verdicts] == [pytest.approx(0.4)]
 
 
 def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgotten():
     for most in (1, 2):
-        judge, closer = verifier(dict.fromkeys(range(12), 0.3), 0.1, most=most)
+        judge, _ = verifier(dict.fromkeys(range(12), 0.3), 0.1, most=most)
         closely = []
         for number in range(60):
             judge.wait()
@@ -282,27 +282,27 @@ def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgo
             if judge.candidate is None:
                 judge.see(now)
             else:
-                judge.look(now, closer)
+                judge.look()
         # A closer look counts for 6 frames after its own.
         assert max(sum(closely[begin : begin + 7]) for begin in range(54)) == most
         assert sum(closely) >= 6 * most
 
 
 def test_no_other_place_is_examined_while_one_is_surely_known():
-    judge, closer = verifier({5: SURE, 7: 0.8}, 0.1)
+    judge, _ = verifier({5: SURE, 7: 0.8}, 0.1)
     both = step(0, {5: 0.6, 7: 0.6}, [5, 7], 0.9, look(5, 7))
     judge.see(both)
     judge.wait()
-    judge.look(both, closer)
+    judge.look()
     assert judge.candidate is None
-    less, other = verifier({5: 0.8, 7: 0.75}, 0.1)
+    less, _ = verifier({5: 0.8, 7: 0.75}, 0.1)
     less.see(both)
     less.wait()
-    less.look(both, other)
+    less.look()
     assert less.candidate is not None
     less.wait()
-    less.look(both, other)
-    assert less.decision(both).cell == 5
+    less.look()
+    assert less.decision().cell == 5
 
 
 def test_recent_detections_count_more_as_evidence():
@@ -355,15 +355,15 @@ def test_thresholds_are_those_of_the_verification_unless_given():
 
 
 def test_examined_places_are_worth_a_frame_also_when_no_cell_is_worth_a_look():
-    judge, closer = verifier({9: 0.95}, 0.1)
+    judge, _ = verifier({9: 0.95}, 0.1)
     now = step(0, {9: 0.4}, [0], 0.6, look(9))
     now = SimpleNamespace(**{**vars(now), "visited": torch.ones(1, 12, dtype=torch.bool)})
     judge.see(now)
     assert judge.candidate.cell == 9
-    assert judge.decision(now).outcome == "undecided"
+    assert judge.decision().outcome == "undecided"
     judge.wait()
-    judge.look(now, closer)
-    assert judge.decision(now).cell == 9
+    judge.look()
+    assert judge.decision().cell == 9
 
 
 def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():
@@ -376,4 +376,4 @@ def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():
         judge.wait()
         now = step(0, cells, [0], presence, Detections.empty(1, 3))
         judge.see(now)
-        assert judge.decision(now).outcome == outcome
+        assert judge.decision().outcome == outcome

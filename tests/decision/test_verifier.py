@@ -8,7 +8,7 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import CandidatePlaces, Verifier
+from semfov.decision import CandidateCells, Verifier
 from semfov.errors import InputError
 from tests.belief.test_verification import overlap
 from tests.decision.test_rule import Known, random_looks
@@ -69,7 +69,7 @@ class Closer:
 
 def verifier(scores, **options):
     closer = Closer(scores)
-    return Verifier(Told(), closer, GRID, 1, options.pop("thresholds", AT), **options), closer
+    return Verifier(Told(), CandidateCells(GRID, 1), closer, options.pop("thresholds", AT), **options), closer
 
 
 def test_a_sure_closer_look_ends_the_search_with_its_place():
@@ -78,7 +78,7 @@ def test_a_sure_closer_look_ends_the_search_with_its_place():
     assert closer.cells == []
     last = step(1, {5: 0.6}, [0, 5], 0.9, look(5))
     assert int(judge(last)) == 1
-    decision = judge.conclude(last)
+    decision = judge.conclude()
     assert (decision.outcome, decision.cell, closer.cells) == ("found", 5, [5])
     assert decision.place == pytest.approx(0.9)
     assert decision.box.tolist() == box_of(5)
@@ -92,7 +92,7 @@ def test_between_confirm_and_sure_the_search_goes_on_and_takes_the_best_place():
     last = step(1, {5: 0.6, 7: 0.5, 2: 0.45}, [5, 7, 2], 0.9)
     assert int(judge(last)) == 1  # all three closer looks are made
     assert closer.cells == [5, 7, 2]
-    decision = judge.conclude(last)
+    decision = judge.conclude()
     assert (decision.cell, decision.outcome) == (7, "found")
     assert [each.place for each in judge.looks] == pytest.approx([0.75, 0.8, 0.4])
     assert [each.fixation for each in judge.looks] == [0, 1, 1]
@@ -105,7 +105,7 @@ def test_without_a_confirmed_place_the_presence_decides(presence, outcome):
     # No other cell is worth a look.
     assert int(judge(last)) > 1
     assert closer.cells == [5]
-    decision = judge.conclude(last)
+    decision = judge.conclude()
     assert decision.outcome == outcome
     assert (decision.cell, decision.box, decision.place) == (None, None, None)
     assert decision.probability == pytest.approx(judge.looks[0].presence)
@@ -116,7 +116,7 @@ def test_a_search_that_gives_up_examines_what_is_probable_enough_even_if_not_fix
     last = step(0, {9: 0.4, 3: 0.2}, [0], 0.6, look(9, 3))
     assert int(judge(last)) == 1
     assert closer.cells == [9]
-    assert judge.conclude(last).cell == 9
+    assert judge.conclude().cell == 9
 
 
 def test_places_less_probable_than_the_threshold_are_not_examined():
@@ -124,7 +124,7 @@ def test_places_less_probable_than_the_threshold_are_not_examined():
     last = step(0, {9: 0.4}, [9], 0.6, look(9))
     assert int(judge(last)) > 1
     assert closer.cells == []
-    assert judge.conclude(last).probability == pytest.approx(0.6)
+    assert judge.conclude().probability == pytest.approx(0.6)
 
 
 def test_when_the_shifts_are_spent_what_is_left_of_closer_looks_is_made():
@@ -132,7 +132,7 @@ def test_when_the_shifts_are_spent_what_is_left_of_closer_looks_is_made():
     last = step(0, {5: 0.5, 7: 0.4}, [5], 0.8, look(5, 7))
     assert int(judge(last)) == 0
     assert closer.cells == [5]
-    assert judge.conclude(last).cell == 7
+    assert judge.conclude().cell == 7
     assert closer.cells == [5, 7]
 
 
@@ -155,13 +155,18 @@ def test_a_wrong_setting_is_named():
 def test_candidates_come_in_the_order_of_a_loop(seed):
     """Cells by probability times the best score and footprint; what was examined is left out, in later looks too."""
     looks, chances = random_looks(3, 5, seed), torch.rand(12, generator=torch.Generator().manual_seed(seed))
-    candidates, free, examined = CandidatePlaces(GRID), set(range(12)), []
+    candidates, free, examined = CandidateCells(GRID, 2), set(range(12)), []
+    probable = Known(chances[None], torch.ones(1), chances[None])
+
+    def see(detections):
+        candidates.see(SimpleNamespace(belief=probable, visited=torch.zeros(1, 12).bool(), detections=detections))
+
     for number in range(2):
-        candidates.see(looks[number : number + 1])
+        see(looks[number : number + 1])
     weight = GRID.footprint(looks.boxes, "soft")
     for turn in range(4):
         if turn == 1:
-            candidates.see(looks[2:])
+            see(looks[2:])
         value, place = 0.0, None
         for cell in sorted(free):
             for one in range(2 + (turn > 0)):
@@ -173,7 +178,7 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
                     evidence = float(weight[one, other, cell] * looks.scores[one, other, 2])
                     if evidence * float(chances[cell]) > value * (1 + 1e-6):
                         value, place = evidence * float(chances[cell]), cell
-        candidate = candidates.next(chances, 2)
+        candidate = candidates.due(0.0, last=True)
         if place is None:
             assert candidate is None
             break
@@ -185,4 +190,6 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
         covered = GRID.footprint(torch.stack([candidate.box, closer]), "soft").amax(0)
         free -= {cell for cell in range(12) if cell == place or float(covered[cell]) >= 0.5}
         examined += [candidate.box, closer]
-    assert candidates.next(torch.zeros(12), 2) is None
+    probable = Known(torch.zeros(1, 12), torch.ones(1), chances[None])
+    see(looks[:1])
+    assert candidates.due(0.0, last=True) is None

@@ -9,12 +9,12 @@ import torch
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
-from semfov.decision import OUTCOMES
+from semfov.decision import OUTCOMES, Verifier
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError
 from semfov.io.storage import read, write
 from semfov.zoom import GlimpseEvidence, Lattice, ZoomAgent, ZoomEye
-from semfov.zoom.closer import Suspects, ZoomVerifier, closer_window
+from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
 from semfov.zoom.glances import Glance, Glances, on_lattice
 from tests.zoom.conftest import Squares
 
@@ -93,23 +93,46 @@ def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(
 
 def test_the_strongest_detection_is_examined_first_and_each_place_once():
     glances = Scripted([0.9, 0.1, 0.5], side=27.0)  # the boxes of closer looks overlap the others by less than half
-    suspects = Suspects(glances, 1)
-    suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]))
-    suspects.see(seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]))
+    candidates, closely = CandidateBoxes(1, 0.0), []
+    looks = [
+        seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]),
+        seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
+    ]
+    for number, look in enumerate(looks, 1):
+        candidates.see(WindowLook(look.detections, number, 0.9, 0.95, 0.5))
+
+    def close_up(box):
+        closely.append(look_closely(glances, box).detections)
+        return closely[-1]
+
     examined = []
-    while (suspect := suspects.next(0.9, 0.95)) is not None:
-        odds = [math.log(p / (1 - p)) for p in (0.9, suspect.score, 0.95)]
-        assert suspect.probability == pytest.approx(1 / (1 + math.exp(odds[2] - odds[0] - odds[1])), abs=1e-5)
-        glance, features, box = suspects.examine(suspect, 0.9)
-        expected, at = closer_features(0.9, suspect.probability, suspect.score, glance.detections, suspect.box, 1)
+    while (candidate := candidates.due(0.0, last=True)) is not None:
+        odds = [math.log(p / (1 - p)) for p in (0.9, candidate.evidence, 0.95)]
+        assert candidate.probability == pytest.approx(1 / (1 + math.exp(odds[2] - odds[0] - odds[1])), abs=1e-5)
+        features, box = candidates.examine(candidate, close_up)
+        expected, at = closer_features(0.9, candidate.probability, candidate.evidence, closely[-1], candidate.box, 1)
         assert features.tolist() == expected.tolist()
         assert box.tolist() == at.tolist()
-        examined.append((suspect.score, *suspect.box[:2].tolist()))
+        examined.append((candidate.evidence, *candidate.box[:2].tolist()))
     # The others overlap examined places by half, or have a score below 0.1.
     assert [tuple(round(n, 4) for n in each) for each in examined] == [(0.8, 500, 500), (0.6, 100, 100)]
     assert glances.windows == [
         closer_window(LATTICE, torch.tensor(b)) for b in ([500.0, 500, 540, 540], [100.0, 100, 140, 140])
     ]
+
+
+def verifier(model, scores):
+    """A verifier of the target in class 1, with at most two closer looks."""
+    glances = Scripted(scores)
+    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(glances, box).detections, AT)
+
+
+def look(number, presence, left, *boxes):
+    """A look of a search that shows the target in some boxes with a score of 0.8."""
+    return WindowLook(seen(list(boxes), [0.8] * len(boxes)).detections, number, presence, 0.8, left)
+
+
+ONE, OTHER = [100.0, 100, 140, 140], [500.0, 500, 540, 540]
 
 
 @pytest.mark.parametrize(
@@ -123,27 +146,27 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
     ],
 )
 def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcome):
-    verifier = ZoomVerifier(FromScore(presence), Scripted(scores), 1, AT, 0.7, 2)
-    verifier.suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540]], [0.8, 0.8]))
-    made = verifier(0.9, 0.8, 5, 9, over=over)
-    assert [look.number for look in verifier.looks] == list(range(5, 5 + count))
-    assert [round(look.place, 4) for look in verifier.looks] == scores
-    assert [round(chance, 4) for _, chance in made] == [0.9] * count
-    assert OUTCOMES[verifier.outcome(0.99, over=over)] == outcome
-    assert verifier.presence(0.99) == pytest.approx(presence)
-    assert verifier.best().place == pytest.approx(max(scores))
+    judge = verifier(FromScore(presence), scores)
+    judge.see(look(5, 0.9, 0.0 if over else 0.5, ONE, OTHER))
+    made = judge.look_closely(9)
+    assert [each.number for each in judge.looks] == list(range(5, 5 + count))
+    assert [round(each.place, 4) for each in judge.looks] == scores
+    assert [round(each.probability, 4) for each in made] == [0.9] * count
+    assert OUTCOMES[judge.outcome()] == judge.decision(over=True).outcome == outcome
+    assert judge.presence == pytest.approx(presence)
+    assert judge.best.place == pytest.approx(max(scores))
 
 
 def test_improbable_places_are_examined_only_at_the_end():
     for chance, over, count in ((0.69, False, 0), (0.71, False, 2), (0.21, True, 2), (0.19, True, 0)):
-        verifier = ZoomVerifier(FromScore(), Scripted([0.1, 0.1]), 1, AT, 0.7, 2)
-        verifier.suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540]], [0.8, 0.8]))
-        assert len(verifier(chance, 0.8, 1, 9, over=over)) == count
-        assert OUTCOMES[verifier.outcome(chance, over=False)] == ("absent" if count else "undecided")
-        assert verifier.outcome(chance, over=False) == (2 if count else 0)
-    none_left = ZoomVerifier(FromScore(), Scripted([0.1, 0.1]), 1, AT, 0.7, 2)
-    none_left.suspects.see(seen([[100.0, 100, 140, 140]], [0.8]))
-    assert none_left(0.9, 0.8, 24, 0, over=True) == []
+        judge = verifier(FromScore(), [0.1, 0.1])
+        judge.see(look(1, chance, 0.5, ONE, OTHER), last=over)
+        assert len(judge.look_closely(9)) == count
+        assert judge.outcome() == (2 if count else 0)
+        assert judge.decision(over=count > 0).outcome == ("absent" if count else "undecided")
+    none_left = verifier(FromScore(), [0.1, 0.1])
+    none_left.see(look(24, 0.9, 0.0, ONE))
+    assert none_left.look_closely(0) == []
 
 
 def test_a_search_looks_closely_before_it_finds(detector, picture):
