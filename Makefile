@@ -9,13 +9,14 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test test-all test-quick coverage mutation docs lint types constraints clean
+.PHONY: help setup search test lab test-all test-quick coverage mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
-	@echo "make test        set up, then lint, types, tests and the site"
+	@echo "make test        set up, then lint, types and the tests of the library"
+	@echo "make lab         the tests of studies, fits for studies, benchmarks and the site"
 	@echo "make test-quick  the tests that take no more than a second each"
-	@echo "make test-all    as make test, with the tests that repeat others at length"
+	@echo "make test-all    all of these, with the tests that repeat others at length"
 	@echo "make coverage    the tests, and which lines and branches they reach"
 	@echo "make mutation    change the library's formulas one by one, and list the changes that no test notices (hours)"
 	@echo "make docs        set up, then build the site in build/site"
@@ -42,9 +43,12 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
-# tests/docs builds the site.
 test: lint types
-	$(PYTEST)
+	$(PYTEST) -m "not lab and not long"
+
+# Some of these tests build the site.
+lab: $(STAMP)
+	$(PYTEST) -m "lab and not long"
 
 test-all: lint types
 	$(PYTEST) -m ""

@@ -22,9 +22,10 @@ from benchmarks.machine import describe
 from benchmarks.tables import RESULTS, number, table, write
 from benchmarks.timing import Run, Spread, clock_for, interleaved
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, Scenery, open_scenery
+from semfov.gaze.policies import Task
 
 STEPS = 20
-WORLDS = {
+WORLDS: dict[str, tuple[Task, str, tuple[int, int]]] = {
     "search, recommended": ("search", "recommended", (64, 256)),
     "search, Kaplan's rule": ("search", "non-predictive-raw", (64, 256)),
     "exploration, recommended": ("exploration", "recommended", (8, 32)),

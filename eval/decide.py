@@ -41,7 +41,7 @@ from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.scene_run import finish, gather
-from semfov.experiments.settings import Positive, Workers
+from semfov.experiments.settings import Workers
 from semfov.experiments.summary import announce, sensing
 from semfov.experiments.tables import mean, share, table
 from semfov.io.files import write_text
@@ -60,8 +60,6 @@ class DecideConfig(DecidingConfig):
         sensor: the foveal sensor.
         belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
         protocol: the protocol; `shifts` and `seed` are used.
-        prices: prices of a look in right decisions; for each price there are additional searches, which end when
-            further looks are not worth their price.
         out: folder for tables, records and the figure.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         workers: number of processes (None: one per CPU core).
@@ -74,7 +72,6 @@ class DecideConfig(DecidingConfig):
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
-    prices: tuple[Positive, ...] = (0.002, 0.005, 0.01, 0.02, 0.05)
     out: Path = Path("runs/decide")
     cache: Path | None = None
     workers: Workers | None = None
@@ -91,13 +88,11 @@ def search_and_decide(config: DecideConfig) -> None:
     records, _ = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
-    text = summary(records, sensing(run), config.prices)
+    text = summary(records, sensing(run))
     files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for name, content in files.items():
         write_text(config.out / name, content)
-    # Searches that differ only in the price of a look are left out, to keep the figure readable.
-    scores, there = probabilities([record for record in records if not record["policy"].startswith("price")])
-    picture = save_figure(plot_roc(scores, there), config.out / "roc.png")
+    picture = save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")
     announce(text, [*(config.out / name for name in files), picture])
 
 
@@ -112,7 +107,7 @@ def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], t
     return told, torch.tensor([record["present"] for record in first])
 
 
-def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> str:
+def summary(records: Sequence[Record], sensed: str) -> str:
     """The tables, as Markdown."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
@@ -157,10 +152,9 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             "",
             f"Decisions in %, and mean numbers of looks.{closely} `place right`: the target overlaps the reported "
             "cell, in % of the searches that report one. `expected`: mean probability of these places by closer "
-            "looks, in %. Searches in rows with a price end when further looks are not worth that price, in right "
-            "decisions per look. In the row with a detection at the gaze, a search ends when such a detection has a "
-            "score of 0.5 or more. All other searches end at thresholds. The threshold of the sharp look's score is "
-            f"chosen so that it has as many hits as {names[0]}.",
+            "looks, in %. In the row with a detection at the gaze, a search ends when such a detection has a score of "
+            "0.5 or more. All other searches end at thresholds. The threshold of the sharp look's score is chosen so "
+            f"that it has as many hits as {names[0]}.",
             "",
             *table(decided),
             "",
@@ -168,7 +162,6 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             "",
             *table([["", *LANDINGS], *landings(groups)]),
             "",
-            *values(groups, prices),
         ]
     )
 
@@ -200,31 +193,6 @@ def landings(groups: dict[str, list[Record]]) -> list[list[str]]:
         [name, *landing_cells([(each["landing"], each["landing_seen"]) for each in group])]
         for name, group in landed.items()
     ]
-
-
-def values(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]:
-    """Table of the mean value of a search that ends by thresholds, and of one that ends by the price of looks."""
-    if not prices:
-        return []
-    head = ["price of a look", "by thresholds", "by price"]
-    rows = [head]
-    for price in prices:
-        names = (AGENT, f"price {price:g}")
-        rows.append([f"{price:g}", *(f"{utility(groups[name], price):.4f}" for name in names)])
-    return [
-        "Mean value of a search: 1 if its decision is right, else 0, minus the price of its looks. An undecided search "
-        "is not right.",
-        "",
-        *table(rows),
-        "",
-    ]
-
-
-def utility(records: Sequence[Record], price: float) -> float:
-    """Mean value of searches: 1 for a right decision, minus the price of the looks."""
-    right = [record["outcome"] == ("found" if record["present"] else "absent") for record in records]
-    looks = [record["looks"] for record in records]
-    return sum(each - price * count for each, count in zip(right, looks, strict=True)) / len(records)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

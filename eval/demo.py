@@ -85,8 +85,6 @@ class DemoConfig(Settings):
             enlarged to the detector's input; 0: none. In a video or from a camera, a closer look takes the place of a
             look, and the number holds for the time until half of the belief has faded. In a large picture each takes
             one of the passes.
-        price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
-            ends by thresholds).
         until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
             (none: 0.1 if the map was learned; 0: never). In a large picture, price in objects: it ends when no window
             is expected to show this many new objects (none: 0.01).
@@ -114,7 +112,6 @@ class DemoConfig(Settings):
     confirm: Share | None = None
     give_up: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST
-    price: Weight | None = None
     until: Weight | None = None
     seed: Seed = 0
     frames: Annotated[int, Range(1, 10**9)] | None = None
@@ -225,7 +222,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> ZoomPath:
         path = agent.search(picture.image, config.target, passes=passes, closer=config.closer, **chosen(given))
     width, height = path.lattice.size
     print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.summary()}")
-    unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
+    unused = [name for name in ("sensor", "start") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")
     closer = {look.number: f"; closer look: p {look.place:.3f} there" for look in path.closer}
@@ -253,7 +250,7 @@ def open_live(config: DemoConfig) -> Stream | None:
     source = config.camera if config.photo is None else config.photo if is_video(config.photo) else None
     if source is None:
         return None
-    for name in ("shifts", "price", "until", "report"):
+    for name in ("shifts", "until", "report"):
         value = getattr(config, name)
         check(value is None, name, "none for a video or a camera, which ends with its --frames", value)
     return open_stream(source, config.frames)
@@ -305,7 +302,7 @@ def look_at(
             shifts = 20 if config.shifts is None else config.shifts
             return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
         shifts = 30 if config.shifts is None else config.shifts
-        common |= {"confirm": config.confirm, "give_up": config.give_up, "price": config.price}
+        common |= {"confirm": config.confirm, "give_up": config.give_up}
         common["closer"] = config.closer
         target = wanted if wanted and len(wanted) > 1 else config.target
         return agent.search(picture.image, target, shifts=shifts, **common)

@@ -115,7 +115,6 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "presence": partial(told_table, "decisions.md", 0),
     "decisions": partial(told_table, "decisions.md", 1),
     "landings": partial(told_table, "decisions.md", 2),
-    "prices": partial(told_table, "decisions.md", 3),
     "by-looks": partial(told_table, "beliefs.md", 0),
     "by-distance": partial(told_table, "beliefs.md", 1),
     "paired-map": paired_maps,

@@ -204,7 +204,6 @@ class ActivePerception(nn.Module):
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        price: float | None = None,
         closer: int = MOST,
     ) -> Scanpath:
         """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
@@ -238,8 +237,6 @@ class ActivePerception(nn.Module):
             give_up: probability below which a cell is not worth a look; None takes the threshold of the model.
             closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. 0 decides from
                 the foveated looks alone, as does an agent without a model of verification.
-            price: price of a look, as a share of the value of a right decision; the search then ends when further looks
-                are not worth their price, instead of by thresholds (`semfov.decision.decide_by_price`).
 
         Returns:
             The scanpath, with its decision.
@@ -251,22 +248,18 @@ class ActivePerception(nn.Module):
         strategy, index, wanted = self.searching.sought(target, self.classes)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
-        check(price is None or (is_number(price) and price >= 0), "price", "0 or more, or None", price)
         image, grid = self._frame(image)
         goal = None if boxes is None else goal_cells(boxes, grid, image)
         chosen = strategy.observer.thresholds
-        if price is not None and (chosen is None or confirm is not None or give_up is not None):
-            case = "for an agent without thresholds" if chosen is None else "together with confirm or give_up"
-            raise InputError(f"price: expected None {case}, got {price}; the recommended agent takes one of them")
         thresholds = None if chosen is None else chosen.changed(confirm, give_up)
         outcome: Callable[[Step], Tensor]
         verifier, model = None, self._verification(closer)
-        if model is not None and model.thresholds is not None and goal is None and price is None:
+        if model is not None and model.thresholds is not None and goal is None:
             at = model.thresholds.changed(confirm, give_up)
             places, close_up = CandidateCells(grid, index), partial(self.eye.close_up, image)
             outcome = verifier = Verifier(model, places, close_up, at, closer)
         else:
-            outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
+            outcome = outcome_of(wanted, grid, goal, thresholds, 0.5 if confirm is None else confirm)
         scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
         index = class_meant(last.belief, index)
         scanpath = replace(scanpath, found=ended == 1, target=index)

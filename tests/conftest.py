@@ -28,14 +28,20 @@ def pytest_configure() -> None:
 
 RUNS = {"finished", "fitted", "home", "trained", "whole"}
 """Fixtures that run a command to its end."""
+LAB = {"lab", "eval", "experiments", "train", "training"}
+"""Folders of tests of the laboratory: studies, the fits that only studies need, benchmarks."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests as slow if they use a fixture that runs a whole command."""
+    """Mark tests of the laboratory and of the built site, and as slow those that use a fixture that runs a command."""
+    here = Path(__file__).parent
     for item in items:
-        if isinstance(item, pytest.Function) and RUNS & set(item.fixturenames):
+        fixtures = set(item.fixturenames) if isinstance(item, pytest.Function) else set()
+        if RUNS & fixtures:
             item.add_marker(pytest.mark.slow)
+        if "site" in fixtures or (item.path.is_relative_to(here) and item.path.relative_to(here).parts[0] in LAB):
+            item.add_marker(pytest.mark.lab)
 
 
 @pytest.fixture(

@@ -24,6 +24,7 @@ from PIL import Image
 
 import semfov
 from semfov.detection.weights import fetch
+from tests.colours import SMALL, write_network, write_photographs
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -67,16 +68,13 @@ def test_the_three_commands_for_a_custom_detector_run(tmp_path, run):
     """As printed, except for a smaller fit and a detector of colours instead of cups."""
     assert [COMMANDS[line][2] for line in OWN] == ["train.fit_detector", "eval.demo", "eval.search"]
     assert all(line in (ROOT / "docs/detectors.md").read_text() for line in OWN)
-    spec = importlib.util.spec_from_file_location("colours", ROOT / "tests/training/test_fit_detector.py")
-    colours = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(colours)
-    colours.write_network(tmp_path / "mine.onnx")
+    write_network(tmp_path / "mine.onnx")
     for name, instances in (("PHOTOS", "instances.json"), ("OTHERS", "others.json")):
         (tmp_path / name).mkdir()
-        colours.write_photographs(tmp_path / name).rename(tmp_path / instances)
+        write_photographs(tmp_path / name).rename(tmp_path / instances)
     Image.open(tmp_path / "OTHERS/3.png").convert("RGB").save(tmp_path / "PHOTO.jpg")
     fit, demo, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
-    assert written_files(run([*fit, *colours.SMALL], tmp_path, tmp_path / "cache"), tmp_path)
+    assert written_files(run([*fit, *SMALL], tmp_path, tmp_path / "cache"), tmp_path)
     assert "“red”" in run(demo, tmp_path, tmp_path / "cache")
     few = ["--data.min_instances", "0", "--data.limit", "1"]
     assert written_files(run([*search, *few], tmp_path, tmp_path / "cache"), tmp_path)

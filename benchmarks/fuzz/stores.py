@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks.fuzz.models import changed
 from benchmarks.fuzz.runner import choose, draw_rng
 from semfov.experiments.parts import Parts
-from semfov.experiments.store import DetectionStore
+from semfov.experiments.store import cell_store
 from semfov.io import storage
 
 RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]
@@ -57,15 +57,16 @@ def part_files(data: st.DataObject) -> str:
 
 
 def look_files(data: st.DataObject) -> str:
-    """`DetectionStore.load`: the stored detections bit for bit, or None."""
+    """`LookStore.load`: the stored looks bit for bit, or none."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
-        store = DetectionStore(Path(folder), {"detector": "toy"}, 2, 1, 3)
+        store = cell_store(Path(folder), {"detector": "toy"}, 2, 1, 3)
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         whole = {
             "boxes": torch.rand(3, 4, generator=generator) * 30,
             "scores": torch.rand(3, 3, generator=generator).softmax(-1),
             "count": torch.tensor([1, 2]),
+            "actions": torch.tensor([[0.0, 0, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=torch.float64),
         }
         store.write("a" * 64, whole)
         path = store.path("a" * 64)
@@ -78,7 +79,8 @@ def look_files(data: st.DataObject) -> str:
             kinds = (torch.bfloat16, torch.float16, torch.float64, torch.int32, torch.uint8, torch.bool)
             tensors[name] = tensors[name].to(choose(data, kinds, "dtype"))
         elif damage == "value":
-            wrong = (-1, 10**6) if name == "count" else (torch.nan, torch.inf, *([-1, 2] if name == "scores" else []))
+            numbers = (torch.nan, torch.inf, *([-1, 2] if name == "scores" else []))
+            wrong = (-1, 10**6) if name == "count" else numbers
             tensors[name].view(-1)[0] = choose(data, wrong, "number")
         elif damage == "shape":
             shapes = (tensors[name][:1].clone(), tensors[name][None], tensors[name].new_zeros(0))
@@ -94,11 +96,11 @@ def look_files(data: st.DataObject) -> str:
         elif damage != "none":
             storage.write(path, tensors, record)
         found = store.load("a" * 64)
-    if found is None:
+    if not found:
         assert damage != "none"
         return "missing"
-    mask = found.mask
-    assert torch.equal(found.boxes[mask], whole["boxes"]), damage
-    assert torch.equal(found.scores[mask], whole["scores"]), damage
-    assert found.count.tolist() == [1, 2], damage
+    assert [*found] == [0, 1], damage
+    assert torch.cat([look.boxes[0] for look in found.values()]).equal(whole["boxes"]), damage
+    assert torch.cat([look.scores[0] for look in found.values()]).equal(whole["scores"]), damage
+    assert [int(look.count) for look in found.values()] == [1, 2], damage
     return "result"

@@ -50,17 +50,6 @@ print(absent)
 viz.plot_scanpath(absent)
 
 # %% [markdown]
-# ## The price of a look
-#
-# Instead of thresholds a look may have a price, relative to the value 1 of a right decision. The search continues as
-# long as further looks are expected to be worth their price, and then gives the more probable answer.
-
-# %%
-for price in (0.001, 0.01, 0.1):
-    priced = agent.search(scene.image, "cup", start=0, price=price)
-    print(f"price {price}: {priced.shifts} gaze shifts, {priced.decision.outcome}, {priced.decision.probability:.2f}")
-
-# %% [markdown]
 # Save a scanpath with `scanpath.save("search.safetensors")`, or make an animation with `scanpath.animate("search.gif")`.
 # A notebook shows a scanpath as an interactive page if it is the last value of a cell.
 #

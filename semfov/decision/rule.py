@@ -90,44 +90,6 @@ def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Threshold
     return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
 
 
-def decide_by_price(step: Step, target: int | Tensor, price: float) -> Tensor:
-    r"""Decide by the price of a look which searches end with this step.
-
-    A right decision has the value 1, and a look costs `price`. Let P be the probability that the image holds the
-    target. A decision now has the expected value :math:`\max(P, 1 - P)`. The next m looks would go to the remaining
-    cells with the highest probabilities p(x). They meet the target with probability :math:`U_m`, and it is then
-    certainly found:
-
-    .. math:: U_m = P \, \frac{\sum_{i \le m} p(x_i)}{\sum_x p(x)}, \qquad
-              V_m = U_m + \max(P - U_m, \; 1 - P) - \text{price} \sum_{i < m} (1 - U_i)
-
-    The search continues as long as, for any m, :math:`V_m` is greater than the value of a decision now. It ends with
-    the more probable answer. (Ross, 1969, *A problem in optimal search and stop*; here for a fixed order of cells.)
-
-    Args:
-        step: a step of searches, from `semfov.episode.rollout`.
-        target: class 1..K, or `(A,)` with one class for each search.
-        price: price of a look, as a share of the value of a right decision.
-
-    Returns:
-        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
-
-    Raises:
-        InputError: the price is negative or not finite.
-    """
-    check(0 <= price < math.inf, "price", "0 or more (a right decision counts 1)", price)
-    presence = step.belief.presence(target)[:, None]
-    cells = step.belief.probability(target)
-    left = cells.masked_fill(step.visited, 0).sort(-1, descending=True).values
-    met = presence * left.cumsum(-1) / cells.sum(-1, keepdim=True).clamp(min=1e-12)
-    before = torch.cat([torch.zeros_like(met[:, :1]), met[:, :-1]], -1)
-    paid = price * (1 - before).cumsum(-1)
-    value = met + torch.maximum(presence - met, 1 - presence) - paid
-    # The margin keeps rounding errors from continuing a search.
-    on = value.amax(-1) > torch.maximum(presence, 1 - presence)[:, 0] + 1e-6
-    return torch.where(on, 0, torch.where(presence[:, 0] >= 0.5, 1, 2))
-
-
 def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
     """Whether a fixated cell is nearly as probable as the most probable one, and at least as probable as `place`.
 
@@ -217,7 +179,6 @@ def outcome_of(
     wanted: Mapping[int, float],
     grid: Grid,
     goal: Tensor | None,
-    price: float | None,
     thresholds: Thresholds | None,
     confirm: float,
 ) -> Callable[[Step], Tensor]:
@@ -227,7 +188,6 @@ def outcome_of(
         wanted: for each class 1..K of the target, the probability that it is meant; the belief is about all of them.
         grid: the cells.
         goal: `(X·Y,)` boolean, cells on which a search ends; None ends it by a decision.
-        price: price of a look, to decide by (`decide_by_price`); None decides by thresholds.
         thresholds: thresholds of the belief; None lets a detection in the fixated cell confirm the target.
         confirm: least score of such a detection, times the probability that its class is meant.
 
@@ -239,8 +199,6 @@ def outcome_of(
     def outcome(step: Step) -> Tensor:
         if goal is not None:
             return goal[step.cell].long()
-        if price is not None:
-            return decide_by_price(step, first, price)
         if thresholds is not None:
             return decide(step, first, thresholds)
         seen = [

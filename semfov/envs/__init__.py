@@ -11,19 +11,19 @@ try:
 except ImportError:
     raise DataError('semfov.envs needs Gymnasium: pip install "semfov[envs]"') from None
 
-from semfov.envs.agents import MaskedRandom, PolicyAgent, Ran, run_agent
-from semfov.envs.environment import GazeEnv, GazeExplore, GazeSearch
+from semfov.envs.agents import MaskedRandom, PolicyAgent, Ran, ZoomPolicyAgent, run_agent
+from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv, ZoomExplore, ZoomSearch
 from semfov.envs.registration import register
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.wrappers import BeliefObservation, GlimpseObservation, VectorBeliefObservation
-from semfov.envs.zoom import ZoomEnv, ZoomExplore, ZoomPolicyAgent, ZoomSearch
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 
 register()
 
 __all__ = [
     "BeliefObservation",
+    "EpisodeEnv",
     "GazeEnv",
     "GazeExplore",
     "GazeSearch",

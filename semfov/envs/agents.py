@@ -12,12 +12,15 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.envs.environment import GazeEnv
-from semfov.envs.gazes import Gazes
+from semfov.envs.cells import CellGazes
+from semfov.envs.environment import GazeEnv, ZoomEnv
 from semfov.envs.vector import GazeVectorEnv
+from semfov.envs.windows import action_of
 from semfov.errors import InputError, check
 from semfov.experiments.search_protocol import Episode
+from semfov.experiments.zoom_orders import overview
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.zoom.policy import best_find, best_hit
 
 Cells = NDArray[np.int64]
 
@@ -54,7 +57,7 @@ class PolicyAgent:
         if not isinstance(inner, GazeEnv | GazeVectorEnv):
             raise InputError(f"env: expected a GazeEnv or a GazeVectorEnv, got {type(inner).__name__}")
         self._one = isinstance(inner, GazeEnv)
-        self._gazes: Gazes = inner.gazes
+        self._gazes: CellGazes = inner.gazes
         self._noise: dict[int, tuple[Any, Tensor]] = {}
 
     @torch.inference_mode()
@@ -71,7 +74,7 @@ class PolicyAgent:
 
     def _choose(self, scene: int, rows: Tensor) -> Tensor:
         gazes, scenery = self._gazes, self._gazes.scenery
-        grid, candidate = scenery.grid(scene), scenery.run.candidate(scenery.policy, scene)
+        grid, candidate = scenery.grid(scene), scenery.candidate(scene)
         targets = gazes.targets[rows]
         acquisition = candidate.acquisition(targets if bool(targets.any()) else None, grid, gazes.cell[rows])
         visited = gazes.memory.visited[rows]
@@ -85,6 +88,37 @@ class PolicyAgent:
         if row not in self._noise or self._noise[row][0] is not episode:
             self._noise[row] = episode, self._gazes.scenery.noise(episode)
         return self._noise[row][1]
+
+
+class ZoomPolicyAgent:
+    """The choice of windows of `semfov.zoom` as an agent.
+
+    Args:
+        env: a `ZoomEnv`, wrapped or not.
+
+    Raises:
+        InputError: the environment is of another kind.
+
+    Example::
+
+        env = gymnasium.make("semfov.envs:semfov/GazeSearch-v0", action="window")
+        agent = ZoomPolicyAgent(env)
+        observation, info = env.reset(seed=0)
+        observation, reward, terminated, truncated, info = env.step(agent(observation, info))
+    """
+
+    def __init__(self, env: Any) -> None:
+        inner = env.unwrapped
+        if not isinstance(inner, ZoomEnv):
+            raise InputError(f"env: expected a ZoomEnv, got {type(inner).__name__}")
+        self._gaze = inner.gazes
+
+    def __call__(self, observation: Any = None, info: Any = None) -> NDArray[np.float32]:
+        """Choose the next action; the whole picture again where no other window is expected to show anything."""
+        gaze, belief = self._gaze, self._gaze.belief
+        searching = gaze.task == "search"
+        choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
+        return action_of(gaze.glances.lattice, overview(gaze.glances) if choice is None else choice[0])
 
 
 class MaskedRandom:

@@ -1,8 +1,9 @@
-"""Search and exploration with a fovea that moves from cell to cell, one episode at a time."""
+"""The environments for `gymnasium.make`: one episode at a time, with cells or with windows as actions."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium
 import numpy as np
@@ -10,25 +11,142 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from semfov.envs.observation import (
-    GAZES,
-    Arrays,
-    belief_planes,
-    belief_space,
-    first,
-    glimpses,
-    infos_of,
-    observation_space,
-    observations_of,
-)
-from semfov.envs.rendering import Film
+from semfov.envs.cells import GAZES, CellGazes
+from semfov.envs.gazes import Arrays, Gazes
 from semfov.envs.scenery import Scenery, open_scenery
-from semfov.errors import InputError, check, check_whole
+from semfov.envs.windows import WindowGaze
+from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
+from semfov.errors import InputError, check
+
+Opened = TypeVar("Opened", Scenery, ZoomScenery)
+
+PRICES = {"search": 0.05, "exploration": 0.01}
+"""Cost of a look by default, for each task."""
 
 _ROW = torch.tensor([0])
 
 
-class GazeEnv(gymnasium.Env[Arrays, np.int64]):
+class EpisodeEnv(gymnasium.Env[Arrays, Any]):
+    """One episode at a time; base of `GazeEnv` and `ZoomEnv`, which differ in their actions.
+
+    Args:
+        gazes: a batch of one episode.
+        render_mode: `rgb_array` or None.
+
+    Attributes:
+        gazes: as given.
+
+    Raises:
+        InputError: `render_mode` is something else.
+
+    Example::
+
+        env = gymnasium.make("semfov.envs:semfov/GazeSearch-v0")
+        observation, info = env.reset(seed=0)
+        assert isinstance(env.unwrapped, EpisodeEnv)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
+    gazes: Gazes
+
+    def __init__(self, gazes: Gazes, render_mode: str | None = None) -> None:
+        check(render_mode in (None, "rgb_array"), "render_mode", "'rgb_array' or None", repr(render_mode))
+        self.gazes, self.render_mode = gazes, render_mode
+        self.observation_space: spaces.Dict = gazes.observation_space
+        self.action_space = gazes.action_space
+        self._over = True
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Arrays, Arrays]:
+        """Start an episode with its first look: from its start, or at the whole picture.
+
+        Args:
+            seed: of all random draws from now on; None continues the present generator.
+            options: `scene`, the index of a scene to draw an episode in. Also, where actions are cells, `episode`, an
+                episode of the protocol (`Scenery.episodes`); where they are windows, `target`, the index of a class to
+                search for in the scene. Without options an episode is drawn in any scene.
+
+        Returns:
+            The observation, and an info with `detections`, `passes` of the detector, `pixels` shown to it,
+            `action_mask` over the cells or windows, `result` and `scene`.
+
+        Raises:
+            InputError: an option is unknown, or the scene has nothing to look for.
+            DataError: no scene has anything to look for.
+        """
+        super().reset(seed=seed)
+        self.gazes.begin(_ROW, [self.gazes.choose(self.np_random, options or {})])
+        self._over = False
+        return self._observed()
+
+    def step(self, action: Any) -> tuple[Arrays, float, bool, bool, Arrays]:
+        """Move the gaze, and look.
+
+        Args:
+            action: a cell, from 0 to X·Y - 1; or `(x, y, magnification)`, each from 0 to 1.
+
+        Returns:
+            The observation, the reward, whether the episode is over because the task is done (`terminated`) or because
+            the looks are used up (`truncated`), and the info as from `reset`.
+
+        Raises:
+            InputError: there is no such action, or no episode is in progress.
+        """
+        chosen = self.gazes.action(action)
+        if self._over:
+            raise InputError("step: expected an episode in progress, got none; call reset first")
+        score = self.gazes.move(_ROW, chosen)
+        terminated, truncated = bool(score.terminated), bool(score.truncated)
+        self._over = terminated or truncated
+        observation, info = self._observed()
+        return observation, float(score.reward), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the last look: the scanpath, the foveated view and the belief, or the windows and found objects.
+
+        Returns:
+            RGB pixels `(H, W, 3)`; None where `render_mode` is None.
+        """
+        if self.render_mode is None or self.gazes.episodes[0] is None:
+            return None
+        return self.gazes.draw()
+
+    def close(self) -> None:
+        """Store the looks of an episode that is not over."""
+        self.gazes.close()
+
+    @property
+    def belief_space(self) -> spaces.Box:
+        """Space of `planes`."""
+        return self.gazes.belief_space
+
+    def planes(self) -> NDArray[np.float32]:
+        """The belief as planes over the scene.
+
+        Returns:
+            `(C, Y, X)`, float32 in [0, 1]. Where actions are cells: the probability of the target (in an exploration of
+            each class, background first), the cells that were fixated, and the cell of the gaze. Where they are
+            windows: the probability that closer looks find an object, and how closely each place was looked at.
+        """
+        found: NDArray[np.float32] = self.gazes.planes(_ROW)[0]
+        return found
+
+    def glimpse(self, side: int) -> NDArray[np.uint8]:
+        """The foveated image, or the image of the window, that the eye sees.
+
+        Args:
+            side: width and height in pixels.
+
+        Returns:
+            `(side, side, 3)`, RGB, uint8.
+        """
+        found: NDArray[np.uint8] = self.gazes.glimpses(_ROW, side)[0]
+        return found
+
+    def _observed(self) -> tuple[Arrays, Arrays]:
+        return _first(self.gazes.observe(_ROW)), _first(self.gazes.infos(_ROW))
+
+
+class GazeEnv(EpisodeEnv):
     """Base of `GazeSearch` and `GazeExplore`.
 
     An action is a cell to fixate. The observation has `gaze` (the fixated point as fractions of width and height),
@@ -56,9 +174,8 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         observation, reward, terminated, truncated, info = env.step(action)
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
     task: ClassVar[str]
-    default_price: ClassVar[float]
+    gazes: CellGazes
 
     def __init__(
         self,
@@ -71,73 +188,16 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        check(render_mode in (None, "rgb_array"), "render_mode", "'rgb_array' or None", repr(render_mode))
-        check(scenery is None or not options, "scenery", "no options of `open_scenery` beside it", ", ".join(options))
-        self.scenery = open_scenery(self.task, **options) if scenery is None else scenery
-        reward = {"price": self.default_price if price is None else price, "find": find}
-        self.gazes = GAZES[self.task](self.scenery, 1, **reward, together=False)
-        self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
-        self.observation_space = observation_space(self.scenery, self.task, belief=belief, glimpse=glimpse)
-        self.action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
-        self.render_mode = render_mode
-        self._film: Film | None = None
-        self._over = True
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Arrays, Arrays]:
-        """Start an episode with a look from its start.
-
-        Args:
-            seed: of all random draws from now on; None continues the present generator.
-            options: `episode`, an episode of the protocol (`Scenery.episodes`), or `scene`, the index of a scene to
-                draw an episode in. Without options an episode is drawn in any scene.
-
-        Returns:
-            The observation, and an info with `detections`, `passes` of the detector, `pixels` shown to it,
-            `action_mask`, `result` and `scene`.
-
-        Raises:
-            InputError: an option is unknown, or the scene has nothing to look for.
-        """
-        super().reset(seed=seed)
-        episode = choose(self.scenery, self.np_random, options or {})
-        self.gazes.begin(_ROW, [episode])
-        self._film = None if self.render_mode is None else Film(self.gazes)
-        self._over = False
-        return self._observed()
-
-    def step(self, action: np.int64) -> tuple[Arrays, float, bool, bool, Arrays]:
-        """Move the gaze to a cell, and look.
-
-        Args:
-            action: the cell, from 0 to X·Y - 1.
-
-        Returns:
-            The observation, the reward, whether the episode is over because the task is done (`terminated`) or because
-            the gaze shifts are used up (`truncated`), and the info as from `reset`.
-
-        Raises:
-            InputError: there is no such cell, or no episode is in progress.
-        """
-        check_whole(action, "action", 0, int(self.action_space.n) - 1)  # type: ignore[attr-defined]
-        if self._over:
-            raise InputError("step: expected an episode in progress, got none; call reset first")
-        moved = self.gazes.move(_ROW, torch.tensor([int(action)]))
-        if self._film is not None:
-            self._film.add()
-        terminated, truncated = bool(moved.terminated), bool(moved.truncated)
-        self._over = terminated or truncated
-        observation, info = self._observed()
-        return observation, float(moved.reward), terminated, truncated, info
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the last look: the scanpath, the foveated view, and the belief.
-
-        Returns:
-            RGB pixels `(H, W, 3)`; None where `render_mode` is None.
-        """
-        if self._film is None:
-            return None
-        return self._film.draw()
+        self.scenery = opened(scenery, open_scenery, options, self.task)
+        gazes = GAZES[self.task](
+            self.scenery,
+            price=PRICES[self.task] if price is None else price,
+            find=find,
+            belief=belief,
+            glimpse=glimpse,
+            pictures=render_mode is not None,
+        )
+        super().__init__(gazes, render_mode)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Mask of the cells that were not fixated, under the name that `sb3_contrib.MaskablePPO` expects.
@@ -145,40 +205,8 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         Returns:
             `(X·Y,)`, boolean.
         """
-        free: NDArray[np.bool_] = (~self.gazes.memory.visited[0]).numpy()
+        free: NDArray[np.bool_] = self.gazes.mask(_ROW)[0]
         return free
-
-    @property
-    def belief_space(self) -> spaces.Box:
-        """Space of `planes`."""
-        return belief_space(self.scenery, self.task)
-
-    def planes(self) -> NDArray[np.float32]:
-        """The belief as planes over the cells.
-
-        Returns:
-            `(C + 2, Y, X)`, float32 in [0, 1]: the probability of the target (in an exploration of each class,
-            background first), the cells that were fixated, and the cell of the gaze.
-        """
-        found: NDArray[np.float32] = belief_planes(self.gazes, _ROW)[0]
-        return found
-
-    def glimpse(self, side: int) -> NDArray[np.uint8]:
-        """The foveated image that the eye sees.
-
-        Args:
-            side: width and height in pixels.
-
-        Returns:
-            `(side, side, 3)`, RGB, uint8.
-        """
-        found: NDArray[np.uint8] = glimpses(self.gazes, _ROW, side)[0]
-        return found
-
-    def _observed(self) -> tuple[Arrays, Arrays]:
-        return first(observations_of(self.gazes, _ROW, **self.shown)), first(
-            infos_of(self.gazes, _ROW, detections=True)
-        )
 
 
 class GazeSearch(GazeEnv):
@@ -198,7 +226,6 @@ class GazeSearch(GazeEnv):
     """
 
     task = "search"
-    default_price = 0.05
 
 
 class GazeExplore(GazeEnv):
@@ -218,30 +245,109 @@ class GazeExplore(GazeEnv):
     """
 
     task = "exploration"
-    default_price = 0.01
 
 
-def choose(scenery: Scenery, random: np.random.Generator, options: dict[str, Any]) -> Any:
-    """The episode that the options of a reset ask for, or one at random.
+class ZoomEnv(EpisodeEnv):
+    """Base of `ZoomSearch` and `ZoomExplore`.
+
+    An action is `(x, y, magnification)`, each from 0 to 1: the middle of the window as fractions of width and height,
+    and the magnification from the whole picture (0) to the closest look (1), in equal steps of an octave. The eye looks
+    at the nearest window of `semfov.zoom.Lattice`. The first look of an episode is the whole picture.
 
     Args:
-        scenery: where the episode takes place.
-        random: generator to draw with.
-        options: `episode`, `scene`, or neither.
-
-    Returns:
-        The episode.
+        scenery: pictures and looks (`open_zoom_scenery`), which several environments may share; None opens one.
+        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        find: reward for finding the target, or all objects.
+        belief: whether observations contain the belief (`planes`).
+        grid: number of columns and rows of the belief's planes.
+        glimpse: side in pixels of the window's image that observations contain (`glimpse`); None leaves it out.
+        render_mode: `rgb_array` or None.
+        options: options of `open_zoom_scenery`, where no scenery is given.
 
     Raises:
-        InputError: an option is unknown, or the scene has nothing to look for.
+        InputError: an argument is out of range, or both a scenery and options are given.
+        DataError: the pictures or the weights of the detector cannot be read.
+
+    Example::
+
+        env = ZoomSearch(scenes="aerial/", targets=["person"], detector="yolox-nano")
+        observation, info = env.reset(seed=0)
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     """
-    unknown = options.keys() - {"episode", "scene"}
-    check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
-    if "episode" in options:
-        return options["episode"]
-    if "scene" in options:
-        check_whole(options["scene"], "scene", 0, len(scenery.run.scenes) - 1)
-        found = scenery.episodes(int(options["scene"]))
-        check(len(found) > 0, "scene", "a scene with objects to look for", options["scene"])
-        return found[random.integers(len(found))]
-    return scenery.draw(random)
+
+    task: ClassVar[str]
+    gazes: WindowGaze
+
+    def __init__(
+        self,
+        scenery: ZoomScenery | None = None,
+        *,
+        price: float | None = None,
+        find: float = 1.0,
+        belief: bool = False,
+        grid: tuple[int, int] = (10, 10),
+        glimpse: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        self.scenery = opened(scenery, open_zoom_scenery, options)
+        gazes = WindowGaze(
+            self.scenery,
+            self.task,
+            price=PRICES[self.task] if price is None else price,
+            find=find,
+            belief=belief,
+            grid=grid,
+            glimpse=glimpse,
+        )
+        super().__init__(gazes, render_mode)
+
+
+class ZoomSearch(ZoomEnv):
+    """Search a large picture for an object of a class: look closer until a look shows one.
+
+    The reward of a step is `find` if an object of the class is found (a box with a score of 0.1 and an overlap of 0.5),
+    minus `price`. The episode ends with the find, or after the largest number of looks.
+
+    Args:
+        scenery: this and all other arguments are those of `ZoomEnv`.
+
+    Example::
+
+        env = ZoomSearch(mosaics=2, targets=["cat"])
+        observation, info = env.reset(seed=0)
+        print(env.scenery.classes[observation["target"]], info["passes"])
+    """
+
+    task = "search"
+
+
+class ZoomExplore(ZoomEnv):
+    """Find all objects of a large picture.
+
+    The reward of a step is `find` times the increase of the fraction of objects that are found, minus `price`.
+
+    Args:
+        scenery: this and all other arguments are those of `ZoomEnv`.
+
+    Example::
+
+        env = ZoomExplore(mosaics=2)
+        observation, info = env.reset(seed=0)
+        print(info["result"])  # fraction of the objects that the whole picture shows
+    """
+
+    task = "exploration"
+
+
+def opened(scenery: Opened | None, open_it: Callable[..., Opened], options: dict[str, Any], *task: str) -> Opened:
+    """Take the scenery that is given, or open one; raises an error if both a scenery and options are given."""
+    expected = f"no options of `{open_it.__name__}` beside it"
+    check(scenery is None or not options, "scenery", expected, ", ".join(options))
+    return open_it(*task, **options) if scenery is None else scenery
+
+
+def _first(arrays: Arrays) -> Arrays:
+    """The first entry of each array."""
+    one = {name: _first(value) if isinstance(value, dict) else value[0] for name, value in arrays.items()}
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in one.items()}

@@ -1,29 +1,31 @@
-"""Episodes of the protocols, one look at a time: the common core of single and vectorised environments."""
+"""Episodes side by side that begin, move from look to look, and are observed and scored: what environments play."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import interpolate
 
-from semfov.belief.belief import Belief
-from semfov.belief.observers import Observer
 from semfov.detection.detections import Detections
-from semfov.envs.looks import SceneLooks
+from semfov.detection.detector import Detector
 from semfov.envs.scenery import Scenery
-from semfov.episode import Memory, attend
-from semfov.errors import check, check_number
-from semfov.experiments.search_protocol import Episode
-from semfov.metrics.exploration import count_right
+from semfov.envs.zoom_scenery import ZoomScenery
+from semfov.errors import check, check_number, check_whole
+
+Arrays = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Moved:
-    """The result of a gaze shift in n episodes.
+class Score:
+    """What a gaze shift brings in n episodes.
 
     Attributes:
         reward: `(n,)`, reward for what the look found, minus its price.
@@ -37,176 +39,189 @@ class Moved:
 
 
 class Gazes(ABC):
-    """A batch of episodes, each in a scene of its own.
+    """A batch of episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
 
-    Scenes are static, so a second look at a cell shows nothing new: it costs its price and changes nothing.
+    An environment only adds Gymnasium's interface. Scenes are static, so a second look at the same place shows nothing
+    new: it costs its price and changes nothing.
 
     Args:
         scenery: scenes, looks and belief.
         count: B, number of episodes at a time.
         price: cost of a look.
-        find: reward for finding the target, or for a complete map.
-        together: whether learned beliefs of all episodes are computed at once.
+        find: reward for finding the target, or for everything that is to be found.
+        belief: whether observations contain the belief (`planes`).
+        glimpse: side in pixels of the image that observations contain (`glimpses`); None leaves it out.
+        pictures: whether the looks of the first episode are kept for pictures (`draw`).
 
     Attributes:
-        episodes: episode of the protocol in each row; None before the first.
-        memory: beliefs and visited cells.
-        cell: `(B,)`, fixated cells.
+        episodes: episode in each row; None before the first.
+        targets: `(B,)`, class that each episode searches for; 0 in explorations.
         shift: `(B,)`, number of gaze shifts so far.
+        observation_space: space of the observations of one episode.
     """
 
-    memory: Memory
+    coordinates: ClassVar[int]
+    """Number of coordinates of a gaze."""
 
-    def __init__(self, scenery: Scenery, count: int, *, price: float, find: float, together: bool) -> None:
+    def __init__(
+        self,
+        scenery: Scenery | ZoomScenery,
+        count: int = 1,
+        *,
+        price: float,
+        find: float,
+        belief: bool = False,
+        glimpse: int | None = None,
+        pictures: bool = False,
+    ) -> None:
         check_number(price, "price", 0, 1e9)
         check_number(find, "find", 0, 1e9)
-        self.scenery, self.price, self.find = scenery, price, find
-        self.observer: Observer = scenery.together() if together else scenery.observer
-        self.looks = SceneLooks(scenery.open, self.observer, count)
+        self.scenery, self.price, self.find, self.pictures = scenery, price, find, pictures
+        self._side, self._begun = glimpse, False
         self.episodes: list[Any] = [None] * count
-        self.cell, self.shift = torch.zeros(2, count, dtype=torch.int64)
-        self.size = torch.zeros(count, 2)
-        self._targets = torch.zeros(count, dtype=torch.int64)
-        self._begun = False
+        self.targets, self.shift = torch.zeros(2, count, dtype=torch.int64)
+        entries: dict[str, spaces.Space[Any]] = {
+            "gaze": spaces.Box(0, 1, (self.coordinates,), np.float32),
+            "target": spaces.Discrete(len(scenery.classes)),
+            "step": spaces.Discrete(scenery.shifts + 1),
+        }
+        if belief:
+            entries["belief"] = self.belief_space
+        if glimpse is not None:
+            entries["glimpse"] = glimpse_space(glimpse)
+        self.observation_space = spaces.Dict(entries)
 
     @property
-    def belief(self) -> Belief:
-        """Belief after the last look of each episode."""
-        return self.memory.belief
+    @abstractmethod
+    def action_space(self) -> spaces.Space[Any]:
+        """Space of the actions of one episode."""
 
     @property
-    def targets(self) -> Tensor:
-        """Class that each episode searches for, `(B,)`; 0 in explorations."""
-        return self._targets
+    @abstractmethod
+    def belief_space(self) -> spaces.Box:
+        """Space of `planes` of one episode."""
 
-    @torch.inference_mode()
+    @abstractmethod
+    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
+        """The episode that the options of a reset ask for, or one at random."""
+
+    @abstractmethod
+    def action(self, given: Any) -> Tensor:
+        """Check the action of a single episode; returns a batch of one."""
+
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Start episodes of the protocol in the rows `(n,)`, with a look from their start."""
+        """Start episodes in the rows `(n,)`, each with its first look."""
         every = self._begun or len(rows) == len(self.episodes)
         check(every, "rows", f"all {len(self.episodes)} rows at the first start", rows.tolist())
         for row, episode in zip(rows.tolist(), episodes, strict=True):
             self.episodes[row] = episode
-        scenes = [episode.scene for episode in episodes]
-        cues = [episode.cue if isinstance(episode, Episode) else 0 for episode in episodes]
-        self._targets[rows] = torch.tensor(cues)
-        searching = isinstance(episodes[0], Episode)
-        self.looks.enter(rows, scenes, self._targets[rows] if searching else None)
-        self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
-        self.cell[rows] = torch.tensor([episode.start for episode in episodes])
         self.shift[rows] = 0
-        fresh = self._look(Memory.empty(self.looks, self.observer, len(rows)), rows)
-        self.memory = self.memory.put(rows, fresh) if self._begun else fresh
-        self._begun = True
         self._enter(rows, episodes)
+        self._begun = True
+
+    def move(self, rows: Tensor, actions: Tensor) -> Score:
+        """Move the gaze of the rows `(n,)`, and look."""
+        self.shift[rows] += 1
+        gain, over = self._look(rows, actions)
+        truncated = ~over & (self.shift[rows] >= self.scenery.shifts)
+        return Score(self.find * gain.double() - self.price, over, truncated)
+
+    def observe(self, rows: Tensor) -> Arrays:
+        """Observations of the rows `(n,)`, each array `(n, ...)`."""
+        entries: Arrays = {
+            "gaze": self.places(rows).float().numpy(),
+            "target": self.targets[rows].numpy(),
+            "step": self.shift[rows].numpy(),
+        }
+        if "belief" in self.observation_space.spaces:
+            entries["belief"] = self.planes(rows)
+        if self._side is not None:
+            entries["glimpse"] = self.glimpses(rows, self._side)
+        return entries
+
+    def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
+        """Infos of the rows `(n,)`, each array `(n, ...)`."""
+        passes = self.shift[rows] + 1
+        entries: Arrays = {
+            "passes": passes.numpy(),
+            "pixels": (passes * self.scenery.pixels).numpy(),
+            "action_mask": self.mask(rows).astype(np.int8),
+            "result": self.result(rows).numpy(),
+            "scene": np.array([self.episodes[row].scene for row in rows.tolist()]),
+        }
+        if detections:
+            entries["detections"] = detection_arrays(self.detections(rows), self.scenery.eye.detector)
+        return entries
 
     @torch.inference_mode()
-    def move(self, rows: Tensor, cells: Tensor) -> Moved:
-        """Move the gaze of the rows `(n,)` to cells `(n,)`, and look."""
-        fresh = ~self.memory.visited[rows, cells]
-        self.cell[rows] = cells
-        self.shift[rows] += 1
-        new = rows[fresh]
-        if len(new) == len(self.episodes):
-            self.memory = self._look(self.memory, new)
-        elif len(new):
-            self.memory = self.memory.put(new, self._look(self.memory[new], new))
-        gain, over = self._judge(rows)
-        truncated = ~over & (self.shift[rows] >= self.scenery.shifts)
-        return Moved(self.find * gain.double() - self.price, over, truncated)
-
-    def _look(self, memory: Memory, rows: Tensor) -> Memory:
-        return attend(self.looks, self.observer, memory, rows, self.cell[rows], self.points(rows))[1]
-
-    def points(self, rows: Tensor) -> Tensor:
-        """Fixated points `(n, 2)` in pixels of the scenes."""
-        return self.places(rows) * self.size[rows] - 0.5
-
-    def places(self, rows: Tensor) -> Tensor:
-        """Fixated points `(n, 2)` as fractions of width and height."""
-        lines, columns = self.scenery.shape
-        cell = self.cell[rows]
-        return torch.stack([(cell % columns + 0.5) / columns, (cell // columns + 0.5) / lines], -1)
-
-    def seen(self, rows: Tensor) -> Detections:
-        """Detections of the present looks, a batch of n."""
-        return self.looks.see(self.observer, rows, self.cell[rows], self.points(rows)).detections()
+    def glimpses(self, rows: Tensor, side: int) -> NDArray[np.uint8]:
+        """Images that the eye sees in the rows `(n,)`, `(n, side, side, 3)`."""
+        views = [interpolate(self._view(row), (side, side), mode="bilinear", antialias=True) for row in rows.tolist()]
+        pixels: NDArray[np.uint8] = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1).numpy()
+        return np.ascontiguousarray(pixels)
 
     @abstractmethod
-    def map(self, rows: Tensor) -> Tensor:
-        """The belief as planes `(n, C, Y, X)`, in [0, 1]."""
+    def planes(self, rows: Tensor) -> NDArray[np.float32]:
+        """The belief of the rows `(n,)` as planes over the scene, `(n, C, Y, X)`."""
+
+    @abstractmethod
+    def places(self, rows: Tensor) -> Tensor:
+        """Where the rows `(n,)` look, each coordinate from 0 to 1."""
+
+    @abstractmethod
+    def mask(self, rows: Tensor) -> NDArray[np.bool_]:
+        """Places that the rows `(n,)` have not looked at."""
 
     @abstractmethod
     def result(self, rows: Tensor) -> Tensor:
         """Result of the task so far, `(n,)`, from 0 to 1."""
 
     @abstractmethod
-    def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Prepare the rows for new episodes, whose first look was made."""
+    def detections(self, rows: Tensor) -> Detections:
+        """Detections of the present looks, a batch of n."""
 
     @abstractmethod
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Gain of the last look, and whether the episode is over, each `(n,)`."""
+    def draw(self) -> NDArray[np.uint8]:
+        """Picture of the first episode, RGB `(H, W, 3)`."""
 
+    def close(self) -> None:  # noqa: B027 (most kinds have nothing to release)
+        """Keep what would be lost."""
 
-class Searches(Gazes):
-    """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
-
-    def __init__(self, scenery: Scenery, count: int, **options: Any) -> None:
-        super().__init__(scenery, count, **options)
-        self._goal = torch.zeros(count, scenery.shape[0] * scenery.shape[1], dtype=torch.bool)
-
-    def map(self, rows: Tensor) -> Tensor:
-        """Probability of the target in each cell if no fixated cell holds it, `(n, 1, Y, X)`; 0 in fixated cells."""
-        every = len(rows) == len(self.episodes)
-        belief, visited = self.memory.belief, self.memory.visited
-        belief, visited = (belief, visited) if every else (belief[rows], visited[rows])
-        chance = belief.chance(self._targets[rows]).masked_fill(visited, 0.0)
-        return chance.reshape(-1, 1, *self.scenery.shape)
-
-    def result(self, rows: Tensor) -> Tensor:
-        """1 where the gaze is on the target."""
-        return self._goal[rows, self.cell[rows]].float()
-
+    @abstractmethod
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        goal = torch.zeros(len(rows), self._goal.shape[1], dtype=torch.bool)
-        for number, episode in enumerate(episodes):
-            goal[number, list(episode.goal)] = True
-        self._goal[rows] = goal
+        """Set the targets, and make the first looks of new episodes."""
 
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        found = self.result(rows)
-        return found, found > 0
+    @abstractmethod
+    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Make the next looks; returns their gain, and whether the task is done, each `(n,)`."""
+
+    @abstractmethod
+    def _view(self, row: int) -> Tensor:
+        """The image that the eye sees in a row, `(1, 3, h, w)`."""
 
 
-class Explorations(Gazes):
-    """Explorations: an episode is over when every cell was fixated."""
+def glimpse_space(side: int) -> spaces.Box:
+    """Space of the image that the eye sees, `side` pixels wide and high."""
+    check_whole(side, "glimpse", 1, 4096)
+    return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
-    def __init__(self, scenery: Scenery, count: int, **options: Any) -> None:
-        super().__init__(scenery, count, **options)
-        self._answers = torch.zeros(count, scenery.shape[0] * scenery.shape[1], len(scenery.classes), dtype=torch.bool)
-        self._success = torch.zeros(count)
 
-    def map(self, rows: Tensor) -> Tensor:
-        """Probability of every class in each cell, background first, `(n, K+1, Y, X)`."""
-        every = len(rows) == len(self.episodes)
-        known = (self.memory.belief if every else self.memory.belief[rows]).class_probabilities()
-        return known.mT.reshape(len(rows), -1, *self.scenery.shape)
+def detection_arrays(found: Detections, detector: Detector) -> Arrays:
+    """Detections as arrays of one shape, padded to the largest number L that the detector gives.
 
-    def result(self, rows: Tensor) -> Tensor:
-        """Fraction of the cells with objects whose most probable class is that of one of these objects."""
-        return self._success[rows]
+    Gymnasium's own vectorised environments require infos of constant shape.
 
-    def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        self._answers[rows] = torch.stack([self.scenery.answers(episode.scene) for episode in episodes])
-        self._success[rows] = self._rate(rows)
+    Args:
+        found: detections of n looks.
+        detector: the detector, which limits their number.
 
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        before = self._success[rows]
-        self._success[rows] = self._rate(rows)
-        return self._success[rows] - before, self.memory.visited[rows].all(-1)
-
-    def _rate(self, rows: Tensor) -> Tensor:
-        every = len(rows) == len(self.episodes)
-        known = (self.memory.belief if every else self.memory.belief[rows]).class_probabilities()
-        answers = self._answers[rows]
-        return count_right(known, answers) / answers.any(-1).sum(-1)
+    Returns:
+        `boxes` `(n, L, 4)`, `scores` `(n, L, K+1)` and `mask` `(n, L)`, which is true for entries that are detections.
+    """
+    number, count = found.mask.shape
+    limit, components = max(detector.selection.limit, count), found.scores.shape[-1]
+    boxes = np.zeros((number, limit, 4), np.float32)
+    scores = np.zeros((number, limit, components), np.float32)
+    mask = np.zeros((number, limit), bool)
+    boxes[:, :count], scores[:, :count], mask[:, :count] = found.boxes.numpy(), found.scores.numpy(), found.mask.numpy()
+    return {"boxes": boxes, "scores": scores, "mask": mask}

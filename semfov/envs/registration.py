@@ -1,20 +1,55 @@
-"""Registration of the environments with Gymnasium."""
+"""Registration of the environments with Gymnasium, and the entry points of `gymnasium.make` and `make_vec`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, Literal
+
+import gymnasium
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, ZoomEnv, ZoomExplore, ZoomSearch
+from semfov.envs.vector import GazeVectorEnv
+from semfov.envs.zoom_scenery import open_zoom_scenery
+from semfov.errors import lookup
 
 IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
+
+Action = Literal["cell", "window"]
+"""Kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
+
+KINDS: dict[str, dict[str, type[Any]]] = {
+    "cell": {"search": GazeSearch, "exploration": GazeExplore},
+    "window": {"search": ZoomSearch, "exploration": ZoomExplore},
+}
 
 
 def register() -> None:
     """Register the environments by their names, unless they are registered already.
 
-    >>> import gymnasium
     >>> register()
     >>> sorted(name for name in gymnasium.registry if name.startswith("semfov/"))
     ['semfov/GazeExplore-v0', 'semfov/GazeSearch-v0']
     """
-    import gymnasium
-
-    entries = {"search": ("make_search", "make_search_vector"), "exploration": ("make_explore", "make_explore_vector")}
     for task, name in IDS.items():
-        one, many = (f"semfov.envs.making:{entry}" for entry in entries[task])
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=one, vector_entry_point=many)
+            one, many = f"{__name__}:make", f"{__name__}:make_vector"
+            gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})
+
+
+def make(task: str, action: Action = "cell", **options: Any) -> EpisodeEnv:
+    """Make an environment; options of `GazeEnv`, or of `ZoomEnv` where actions are windows."""
+    env: EpisodeEnv = KINDS[lookup(action, KINDS, "action")][task](**options)
+    return env
+
+
+def make_vector(task: str, num_envs: int = 1, action: Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
+    """Make environments side by side; options of `GazeVectorEnv`, or of `ZoomEnv` where actions are windows."""
+    if lookup(action, KINDS, "action") == "cell":
+        return GazeVectorEnv(task, num_envs, **options)
+    # Single environments with shared looks, since a belief about windows is about one picture.
+    mode = AutoresetMode(options.pop("autoreset_mode", AutoresetMode.NEXT_STEP))
+    own = inspect.signature(ZoomEnv).parameters.keys() - {"scenery"}
+    common = {name: options.pop(name) for name in list(options) if name not in own}
+    scenery = common.pop("scenery", None) or open_zoom_scenery(**common)
+    return SyncVectorEnv([lambda: make(task, action, scenery=scenery, **options)] * num_envs, autoreset_mode=mode)

@@ -15,23 +15,23 @@ from torch import Tensor
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, check_whole
+from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import (
     BeliefConfig,
     DataConfig,
     DetectorConfig,
-    ExploreConfig,
     PolicyConfig,
     ProtocolConfig,
     RunConfig,
-    SearchConfig,
     SensorConfig,
 )
 from semfov.experiments.exploration_protocol import Exploration, explorations_of, explore_noise
-from semfov.experiments.runs import ExploreRun, SearchRun
+from semfov.experiments.policy_looking import PolicyLooking
 from semfov.experiments.search_protocol import Episode, episodes_of, tie_noise
+from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
 from semfov.sensor.named import SensorName
 
@@ -44,20 +44,24 @@ _VIEWS = 16  # number of pictures that are kept open for glimpses
 class Scenery:
     """Scenes, an eye and a belief, which any number of environments can share; `open_scenery` makes one.
 
-    Episodes and looks are those of the protocols (`semfov.experiments`). The looks from all cells of a scene are
+    Episodes and looks are those of the protocols of search and exploration. The looks from all cells of a scene are
     computed when an episode first enters it, and are kept on disk.
 
     Args:
-        run: experiment that defines the episodes, with one policy, whose belief the environments keep.
+        looking: scenes, an eye that looks at them, and one policy, whose belief the environments keep.
         targets: classes to search for; None takes all that a scene allows.
 
     Attributes:
-        run: as given.
+        eye: sensor and detector.
+        protocol: the protocol of the episodes.
         policy: name of the policy in tables.
+        observer: turns looks into belief.
+        shape: number of rows and columns of the cells.
+        count: number of scenes.
         scenes: indices of the scenes that may have episodes.
 
     Raises:
-        InputError: the run has several policies, or its belief uses context between scenes.
+        InputError: there are several policies, or the belief uses context between scenes.
         DataError: no scene has anything to look for.
 
     Example::
@@ -67,23 +71,26 @@ class Scenery:
         print(len(scenery.episodes(0)), scenery.shape, scenery.shifts)
     """
 
-    def __init__(self, run: SearchRun | ExploreRun, targets: Sequence[str | int] | None = None) -> None:
-        check(len(run.policies) == 1, "policy", "a single policy", f"{len(run.policies)}")
-        self.run = run
-        self.policy = next(iter(run.policies))
-        context = run.config.belief.context, run.policies[self.policy].context
+    def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
+        check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")
+        self._looking, self._data, self.count = looking, looking.scenes, len(looking.scenes)
+        self.policy, settings = next(iter(looking.policies.items()))
+        belief, self.protocol = looking.config.belief, looking.config.protocol
+        context = belief.context, settings.context
         learned = {"place", "cooccurrence", "both"} & set(context)
         check(not learned, "context", "none, as an environment keeps the belief about one scene", context)
+        self.eye, self.shape = looking.eye, (belief.rows, belief.columns)
+        self.observer: Observer = looking.strategies[self.policy].observer
         names = self.classes[1:]
         self._wanted = None if targets is None else {class_index(target, names, "targets") for target in targets}
-        self.scenes = [scene for scene in range(len(run.scenes)) if self._asked(scene)]
+        self.scenes = [scene for scene in range(self.count) if self._asked(scene)]
         # Results are kept for as long as an environment uses this scenery.
         self._listed = cache(self._list)
-        self.grid = cache(run.grid)
+        self.grid = cache(looking.grid)
         self.answers = cache(self._answers)
         self.open = cache(self._open)
         self.together = cache(self._together)
-        self.view = lru_cache(_VIEWS)(lambda scene: run.eye.open(self.image(scene)[None]))
+        self.view = lru_cache(_VIEWS)(lambda scene: self.eye.open(self.image(scene)[None]))
         if not any(self.episodes(scene) for scene in self.scenes):
             raise DataError(
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
@@ -91,10 +98,10 @@ class Scenery:
 
     def _asked(self, scene: int) -> list[int]:
         """Classes to search for in a scene, or those of its objects in an exploration."""
-        if isinstance(self.run, SearchRun):
-            allowed = self.run.scenes.targets(scene)
+        if self._looking.task == "search":
+            allowed = self._data.targets(scene)
             return [target for target in allowed if self._wanted is None or target in self._wanted]
-        found: list[int] = self.run.scenes.annotation(scene).labels.tolist()
+        found: list[int] = self.annotation(scene).labels.tolist()
         return found
 
     def episodes(self, scene: int) -> list[Any]:
@@ -109,12 +116,12 @@ class Scenery:
         return self._listed(scene)
 
     def _list(self, scene: int) -> list[Any]:
-        run, protocol, belief = self.run, self.run.config.protocol, self.run.config.belief
-        if isinstance(run, SearchRun):
-            return list(episodes_of(run.scenes, scene, belief.columns, belief.rows, protocol, self._asked(scene)))
+        rows, columns = self.shape
+        if self._looking.task == "search":
+            return list(episodes_of(self._data, scene, columns, rows, self.protocol, self._asked(scene)))
         if not self.answers(scene).any():
             return []
-        return list(explorations_of(run.scenes, scene, belief.columns * belief.rows, protocol))
+        return list(explorations_of(self._data, scene, columns * rows, self.protocol))
 
     def draw(self, random: np.random.Generator) -> Any:
         """Draw an episode: all scenes are equally likely, and so are all episodes of a scene.
@@ -133,27 +140,17 @@ class Scenery:
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
-        return ("background", *self.run.scenes.classes)
-
-    @property
-    def observer(self) -> Observer:
-        """The observer that turns looks into belief."""
-        return self.run.strategies[self.policy].observer
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of rows and columns of the cells."""
-        return self.run.config.belief.rows, self.run.config.belief.columns
+        return ("background", *self._data.classes)
 
     @property
     def shifts(self) -> int:
         """Largest number of gaze shifts of an episode."""
-        return self.run.config.protocol.shifts
+        return self.protocol.shifts
 
     @property
     def pixels(self) -> int:
         """Number of pixels that the detector takes in for a look."""
-        wide, high = self.run.eye.detector.input_size
+        wide, high = self.eye.detector.input_size
         return wide * high
 
     def _together(self) -> Observer:
@@ -166,11 +163,11 @@ class Scenery:
         """Stored looks from every cell of a scene."""
         asked = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
         targets = torch.tensor(asked) if asked else None
-        return StoredLooks(self.run.detections(scene), self.grid(scene), targets)
+        return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
 
     def _answers(self, scene: int) -> Tensor:
         """Correct classes of each cell of a scene, `(X·Y, K+1)`."""
-        return answers_of(self.run.scenes.annotation(scene), self.grid(scene), len(self.classes))
+        return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
 
     def noise(self, episode: Episode | Exploration) -> Tensor:
         """Random numbers that break the ties of an episode, the same as in `eval.search` and `eval.explore`.
@@ -181,10 +178,32 @@ class Scenery:
         Returns:
             `(shifts+1, X·Y)`, in [0, 1).
         """
-        cells, protocol = self.shape[0] * self.shape[1], self.run.config.protocol
+        cells = self.shape[0] * self.shape[1]
         if isinstance(episode, Episode):
-            return tie_noise(self.run.scenes, episode, cells, protocol)
-        return explore_noise(self.run.scenes, episode, cells, protocol)
+            return tie_noise(self._data, episode, cells, self.protocol)
+        return explore_noise(self._data, episode, cells, self.protocol)
+
+    def candidate(self, scene: int) -> Candidate:
+        """The policy, with the tables that it needs for a scene.
+
+        Args:
+            scene: index of the scene.
+
+        Returns:
+            The policy.
+        """
+        return self._looking.candidate(self.policy, scene)
+
+    def annotation(self, scene: int) -> Annotation:
+        """Objects of a scene.
+
+        Args:
+            scene: index of the scene.
+
+        Returns:
+            Their boxes and classes.
+        """
+        return self._data.annotation(scene)
 
     def image(self, scene: int) -> Tensor:
         """Pixels of a scene.
@@ -195,26 +214,14 @@ class Scenery:
         Returns:
             `(3, H, W)`, RGB in [0, 1].
         """
-        return self.run.scenes[scene].image
+        return self._data[scene].image
 
 
-class _Search(SearchRun):
-    """Visual search in given scenes."""
+class _Given(PolicyLooking):
+    """Looks at given scenes."""
 
-    def __init__(self, config: SearchConfig, scenes: Callable[[Any], Scenes]) -> None:
-        self._choose = scenes
-        super().__init__(config)
-
-    def open_scenes(self) -> Scenes:
-        """The given scenes."""
-        return self._choose(super().open_scenes)
-
-
-class _Explore(ExploreRun):
-    """Exploration of given scenes."""
-
-    def __init__(self, config: ExploreConfig, scenes: Callable[[Any], Scenes]) -> None:
-        self._choose = scenes
+    def __init__(self, config: RunConfig, task: Task, choose: Callable[[Callable[[], Scenes]], Scenes]) -> None:
+        self.task, self._choose = task, choose
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
@@ -223,7 +230,7 @@ class _Explore(ExploreRun):
 
 
 def open_scenery(
-    task: str,
+    task: Task,
     scenes: Source = None,
     annotations: str | Path | None = None,
     *,
@@ -265,7 +272,7 @@ def open_scenery(
         seed: of embedded scenes, mosaics and starts.
         cache: folder for stored looks (None: the user's cache).
         store: whether looks are kept on disk.
-        config: all settings of the experiment, instead of these arguments; its scenes may be given as `scenes` too.
+        config: all settings of an evaluation, instead of these arguments; its scenes may be given as `scenes` too.
 
     Returns:
         The scenery, to be shared by environments.
@@ -279,26 +286,22 @@ def open_scenery(
         scenery = open_scenery("search", "photographs/", "instances.json", targets=["cat", "cup"])
         envs = [GazeSearch(scenery, belief=True) for _ in range(4)]
     """
-    search = task == "search"
     check(task in ("search", "exploration"), "task", "'search' or 'exploration'", repr(task))
     check_whole(mosaics, "mosaics", 0, 1_000_000)
     if config is None:
         folder = Path(scenes) if isinstance(scenes, str | Path) else None
-        settings: dict[str, Any] = {
-            "data": DataConfig(
-                folder, None if annotations is None else Path(annotations), count, min_instances=0, scene_seed=seed
-            ),
-            "detector": DetectorConfig(detector, None if weights is None else Path(weights)),
-            "sensor": SensorConfig(sensor),
-            "belief": BeliefConfig(columns=grid[0], rows=grid[1]),
-            "protocol": ProtocolConfig(starts, shifts or (30 if search else 20), seed=seed),
-            "policies": (policy,),
-            "cache": None if cache is None else Path(cache),
-            "store": store,
-        }
-        config = SearchConfig(**settings) if search else ExploreConfig(**settings)
-    expected = SearchConfig if search else ExploreConfig
-    check(isinstance(config, expected), "config", expected.__name__, type(config).__name__)
+        notes = None if annotations is None else Path(annotations)
+        config = RunConfig(
+            data=DataConfig(folder, notes, count, min_instances=0, scene_seed=seed),
+            detector=DetectorConfig(detector, None if weights is None else Path(weights)),
+            sensor=SensorConfig(sensor),
+            belief=BeliefConfig(columns=grid[0], rows=grid[1]),
+            protocol=ProtocolConfig(starts, shifts or (30 if task == "search" else 20), seed=seed),
+            policies=(policy,),
+            cache=None if cache is None else Path(cache),
+            store=store,
+        )
+    check(isinstance(config, RunConfig), "config", "settings of an evaluation", type(config).__name__)
     config = replace(config, policies=config.policies[:1])
     size = config.data.scene_seed
 
@@ -308,7 +311,7 @@ def open_scenery(
             chosen = Mosaics(chosen, *tiles, count=mosaics, seed=size)
         return chosen
 
-    run = _Search(config, choose) if isinstance(config, SearchConfig) else _Explore(config, choose)
-    names = run.eye.detector.classes
-    check(run.scenes.classes == names, "scenes", "the classes of the detector", f"{len(run.scenes.classes)} others")
-    return Scenery(run, targets)
+    looking = _Given(config, task, choose)
+    found, names = looking.scenes.classes, looking.eye.detector.classes
+    check(found == names, "scenes", "the classes of the detector", f"{len(found)} others")
+    return Scenery(looking, targets)

@@ -7,19 +7,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.envs.environment import GazeExplore, GazeSearch, choose
-from semfov.envs.observation import GAZES, Arrays, infos_of, observation_space, observations_of
+from semfov.envs.cells import GAZES
+from semfov.envs.environment import PRICES, opened
+from semfov.envs.gazes import Arrays
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
-
-PRICES = {"search": GazeSearch.default_price, "exploration": GazeExplore.default_price}
 
 
 class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
@@ -69,21 +67,22 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         **options: Any,
     ) -> None:
         check_whole(num_envs, "num_envs", 1, 1_000_000)
-        check(scenery is None or not options, "scenery", "no options of `open_scenery` beside it", ", ".join(options))
-        lookup(
-            str(getattr(autoreset_mode, "value", autoreset_mode)),
-            [mode.value for mode in AutoresetMode],
-            "autoreset_mode",
-        )
-        mode = AutoresetMode(autoreset_mode)
+        modes, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
+        mode = AutoresetMode(lookup(str(name), modes, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
         self.num_envs, self.task = num_envs, task
-        self.scenery = open_scenery(task, **options) if scenery is None else scenery
-        reward = {"price": PRICES[task] if price is None else price, "find": find}
-        self.gazes = GAZES[task](self.scenery, num_envs, **reward, together=together)
-        self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
-        self.single_observation_space = observation_space(self.scenery, task, belief=belief, glimpse=glimpse)
-        self.single_action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
+        self.scenery = opened(scenery, open_scenery, options, task)
+        self.gazes = GAZES[task](
+            self.scenery,
+            num_envs,
+            price=PRICES[task] if price is None else price,
+            find=find,
+            belief=belief,
+            glimpse=glimpse,
+            together=together,
+        )
+        self.single_observation_space = self.gazes.observation_space
+        self.single_action_space = self.gazes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._detections = detections
@@ -122,7 +121,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         rows = self._rows if mask is None else torch.from_numpy(np.flatnonzero(mask))
         episodes = asked.pop("episodes", None)
         if episodes is None:
-            episodes = [choose(self.scenery, self._randoms[row], asked) for row in rows.tolist()]
+            episodes = [self.gazes.choose(self._randoms[row], asked) for row in rows.tolist()]
         wanted = f"{len(rows)} episodes, one for each environment that is reset"
         check(len(episodes) == len(rows), "episodes", wanted, len(episodes))
         self.gazes.begin(rows, episodes)
@@ -143,15 +142,15 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
             InputError: the actions are not `num_envs` cells.
         """
         chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
-        cells = self.scenery.shape[0] * self.scenery.shape[1]
+        cells = int(self.gazes.action_space.n)
         inside = chosen.shape == (self.num_envs,) and bool(((chosen >= 0) & (chosen < cells)).all())
         check(inside, "actions", f"{self.num_envs} cells from 0 to {cells - 1}", actions)
         mode, over = self.metadata["autoreset_mode"], self._ended.any(0)
         reward, last = torch.zeros(self.num_envs, dtype=torch.float64), {}
         going, resting = (~over).nonzero()[:, 0], over.nonzero()[:, 0]
         if len(going):
-            moved = self.gazes.move(going, chosen[going])
-            reward[going], self._ended[:, going] = moved.reward, torch.stack([moved.terminated, moved.truncated])
+            score = self.gazes.move(going, chosen[going])
+            reward[going], self._ended[:, going] = score.reward, torch.stack([score.terminated, score.truncated])
         if mode == AutoresetMode.NEXT_STEP:
             self._restart(resting)
             self._ended[:, resting] = False
@@ -171,32 +170,31 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         Returns:
             `(num_envs, X·Y)`, boolean.
         """
-        free: NDArray[np.bool_] = (~self.gazes.memory.visited).numpy()
-        return free
+        return self.gazes.mask(self._rows)
 
     def _restart(self, rows: Tensor) -> None:
         if len(rows):
-            self.gazes.begin(rows, [self.scenery.draw(self._randoms[row]) for row in rows.tolist()])
+            self.gazes.begin(rows, [self.gazes.choose(self._randoms[row], {}) for row in rows.tolist()])
 
     def _last(self, rows: Tensor) -> Arrays:
         """Last observations and infos of finished episodes, which Gymnasium keeps where a reset follows at once."""
         ended = np.zeros(self.num_envs, dtype=bool)
         ended[rows.numpy()] = True
-        seen = observations_of(self.gazes, rows, **self.shown)
-        shown = np.full(self.num_envs, None, dtype=object)
+        observations = self.gazes.observe(rows)
+        each = np.full(self.num_envs, None, dtype=object)
         for number, row in enumerate(rows.tolist()):
-            shown[row] = {name: value[number] for name, value in seen.items()}
-        infos = infos_of(self.gazes, self._rows, detections=self._detections)
+            each[row] = {name: value[number] for name, value in observations.items()}
+        infos = self.gazes.infos(self._rows, detections=self._detections)
         return {
-            "final_obs": shown,
+            "final_obs": each,
             "_final_obs": ended,
             "final_info": _marked(infos, ended),
             "_final_info": ended.copy(),
         }
 
     def _observed(self) -> tuple[Arrays, Arrays]:
-        infos = infos_of(self.gazes, self._rows, detections=self._detections)
-        return observations_of(self.gazes, self._rows, **self.shown), _marked(infos, np.ones(self.num_envs, dtype=bool))
+        infos = self.gazes.infos(self._rows, detections=self._detections)
+        return self.gazes.observe(self._rows), _marked(infos, np.ones(self.num_envs, dtype=bool))
 
 
 def _marked(infos: Arrays, which: NDArray[np.bool_]) -> Arrays:

@@ -11,10 +11,9 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from semfov.envs.environment import GazeEnv
-from semfov.envs.observation import Arrays, belief_planes, belief_space, glimpse_space
+from semfov.envs.environment import GazeEnv, ZoomEnv
+from semfov.envs.gazes import Arrays, glimpse_space
 from semfov.envs.vector import GazeVectorEnv
-from semfov.envs.zoom import ZoomEnv
 from semfov.errors import InputError
 
 
@@ -106,7 +105,7 @@ class VectorBeliefObservation(VectorObservationWrapper):
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
         self._inner = _own(env.unwrapped, GazeVectorEnv)
-        self.single_observation_space = belief_space(self._inner.scenery, self._inner.task)
+        self.single_observation_space = self._inner.gazes.belief_space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def observations(self, observations: Arrays) -> NDArray[np.float32]:
@@ -118,7 +117,8 @@ class VectorBeliefObservation(VectorObservationWrapper):
         Returns:
             `(num_envs, C + 2, Y, X)`, float32 in [0, 1].
         """
-        return belief_planes(self._inner.gazes, torch.arange(self.num_envs))
+        found: NDArray[np.float32] = self._inner.gazes.planes(torch.arange(self.num_envs))
+        return found
 
 
 def _own(env: Any, *kinds: type[Any]) -> Any:

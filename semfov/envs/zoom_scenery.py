@@ -17,9 +17,8 @@ from semfov.data.sources import PHOTOGRAPHS
 from semfov.envs.scenery import Source
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.experiments.config import DataConfig, DetectorConfig
-from semfov.experiments.zoom import SHOWN, ZoomConfig, ZoomRun, found_in
+from semfov.experiments.window_looking import SHOWN, WindowLooking, WindowLookingConfig, found_in
 from semfov.experiments.zoom_orders import overview
-from semfov.experiments.zoom_store import StoredGlances
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -31,8 +30,16 @@ class ZoomScenery:
     """Large pictures and an eye that zooms, which any number of environments can share; `open_zoom_scenery` makes one.
 
     Args:
-        run: experiment that defines the pictures, looks and evidence.
+        looking: pictures, looks and evidence.
+        passes: largest number of looks of an episode, the first one at the whole picture included.
         targets: classes to search for; None takes all that a picture allows.
+
+    Attributes:
+        pictures: the pictures.
+        eye: the eye that looks at windows.
+        evidence: learned evidence by magnification.
+        shifts: largest number of looks of an episode after the first one.
+        known: whether the objects in the pictures are annotated.
 
     Example::
 
@@ -40,42 +47,35 @@ class ZoomScenery:
         envs = [ZoomSearch(scenery) for _ in range(4)]
     """
 
-    def __init__(self, run: ZoomRun, targets: Sequence[str | int] | None = None) -> None:
-        self.run = run
-        self.known = not isinstance(run.scenes, Pictures)
-        names = run.eye.detector.classes
+    def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
+        self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
+        self.known = not isinstance(self.pictures, Pictures)
+        names = self.eye.detector.classes
         self._wanted = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
-        self.glances = cache(self._glances)
+        # Looks are kept for as long as an environment uses this scenery.
+        self.glances = cache(looking.glances)
         self._listed = cache(self._list)
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
-        return ("background", *self.run.eye.detector.classes)
-
-    @property
-    def passes(self) -> int:
-        """Largest number of looks of an episode, the first one at the whole picture included."""
-        return self.run.config.passes
+        return ("background", *self.eye.detector.classes)
 
     @property
     def pixels(self) -> int:
         """Number of pixels that the detector takes in for a look."""
-        wide, high = self.run.eye.detector.input_size
+        wide, high = self.eye.detector.input_size
         return wide * high
 
     @cached_property
     def windows(self) -> int:
         """Largest number of windows of any of the pictures."""
-        scenes, eye = self.run.scenes, self.run.eye
-        if isinstance(scenes, Pictures):
-            sizes = [open_large(scenes.root / str(name)).size for name in scenes.ids]
+        pictures, eye = self.pictures, self.eye
+        if isinstance(pictures, Pictures):
+            sizes = [open_large(pictures.root / str(name)).size for name in pictures.ids]
         else:
-            sizes = [scenes.annotation(index).size for index in range(len(scenes))]
+            sizes = [pictures.annotation(index).size for index in range(len(pictures))]
         return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
-
-    def _glances(self, scene: int) -> StoredGlances:
-        return self.run.glances(scene)
 
     def targets(self, scene: int) -> list[int]:
         """Classes that a picture may be searched for.
@@ -93,7 +93,7 @@ class ZoomScenery:
             if self._wanted is None:
                 raise InputError("targets: expected classes to search for in pictures without annotations, got none")
             return self._wanted
-        return [each for each in self.run.scenes.targets(scene) if self._wanted is None or each in self._wanted]
+        return [each for each in self.pictures.targets(scene) if self._wanted is None or each in self._wanted]
 
     def episodes(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the look at the whole picture does not show already.
@@ -126,9 +126,9 @@ class ZoomScenery:
             DataError: no picture was found that has anything to look for.
         """
         for _ in range(_TRIES):
-            picture = int(random.integers(len(self.run.scenes))) if scene is None else scene
+            picture = int(random.integers(len(self.pictures))) if scene is None else scene
             if task != "search":
-                if not self.known or len(self.run.scenes.annotation(picture).boxes):
+                if not self.known or len(self.pictures.annotation(picture).boxes):
                     return picture, 0
             elif targets := self.episodes(picture):
                 return picture, targets[random.integers(len(targets))]
@@ -163,7 +163,7 @@ class ZoomScenery:
         """
         if not self.known:
             return float(len(merge(looks, None, score=SHOWN)))
-        return float(found_in(looks, self.run.scenes.annotation(scene)).float().mean())
+        return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
     def boxes(self, scene: int, target: int) -> Tensor:
         """True boxes of the objects of a class, or of all objects, as far as they are annotated.
@@ -175,10 +175,10 @@ class ZoomScenery:
         Returns:
             `(M, 4)`, in pixels of the picture.
         """
-        return (self._of(scene, target) if target else self.run.scenes.annotation(scene)).boxes
+        return (self._of(scene, target) if target else self.pictures.annotation(scene)).boxes
 
     def _of(self, scene: int, target: int) -> Annotation:
-        every = self.run.scenes.annotation(scene)
+        every = self.pictures.annotation(scene)
         kept = every.labels == target
         return Annotation(every.boxes[kept], every.labels[kept], every.crowd[kept], every.size)
 
@@ -191,13 +191,13 @@ class ZoomScenery:
         Returns:
             `(3, H, W)`, RGB in [0, 1].
         """
-        return self.run.scenes[scene].image
+        return self.pictures[scene].image
 
 
-class _Given(ZoomRun):
+class _Given(WindowLooking):
     """Given large pictures, or those of a folder without annotations."""
 
-    def __init__(self, config: ZoomConfig, scenes: Source) -> None:
+    def __init__(self, config: WindowLookingConfig, scenes: Source) -> None:
         self._chosen = scenes
         super().__init__(config)
 
@@ -271,18 +271,17 @@ def open_zoom_scenery(
         max_target_area=0.2 if annotations is not None else None,
         scene_seed=seed,
     )
-    config = ZoomConfig(
+    config = WindowLookingConfig(
         data=data,
         detector=DetectorConfig(detector, None if weights is None else Path(weights)),
         mosaics=(8 if scenes is None else 0) if mosaics is None else mosaics,
         columns=tiles[0],
         rows=tiles[1],
-        passes=passes,
         seed=seed,
         cache=None if cache is None else Path(cache),
         store=store,
     )
-    run = _Given(config, scenes)
-    names = run.eye.detector.classes
-    check(run.scenes.classes == names, "scenes", "the classes of the detector", f"{len(run.scenes.classes)} others")
-    return ZoomScenery(run, targets)
+    looking = _Given(config, scenes)
+    found, names = looking.scenes.classes, looking.eye.detector.classes
+    check(found == names, "scenes", "the classes of the detector", f"{len(found)} others")
+    return ZoomScenery(looking, passes, targets)

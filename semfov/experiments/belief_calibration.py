@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -74,7 +74,7 @@ class BeliefCalibrationRun(Run):
         left_out: for each belief without a shipped model, the reason why it is left out.
     """
 
-    task: ClassVar[Task] = "search"
+    task: Task = "search"
     config: SearchConfig
 
     def __init__(self, config: SearchConfig) -> None:

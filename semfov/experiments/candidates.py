@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
-from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, SearchConfig
+from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.experiments.presets import TARGET_EVIDENCE, resolve, table_of
 from semfov.experiments.setup import (
     make_context,
@@ -93,8 +93,8 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         make_map_evidence(belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
         else None,
-        make_templates(config.templates, eye)
-        if isinstance(config, SearchConfig) and any(table_of(policy) == "attention" for policy in policies)
+        make_templates(config.class_templates, eye)
+        if any(table_of(policy) == "attention" for policy in policies)
         else None,
     )
 

@@ -263,7 +263,35 @@ class LookingConfig(Settings):
 
 
 @dataclass(frozen=True)
-class SearchConfig(LookingConfig):
+class RunConfig(LookingConfig):
+    """Policies that look at scenes, in the episodes of a protocol.
+
+    Args:
+        data: the scenes.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief, a grid of class distributions.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        saliency: the saliency baselines.
+        protocol: the protocol of the episodes.
+        policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
+    """
+
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
+
+    @property
+    def class_templates(self) -> str | None:
+        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
+        return None
+
+
+@dataclass(frozen=True)
+class SearchConfig(RunConfig):
     """Visual search: find a target class by moving a fovea, and count the gaze shifts that this takes.
 
     Args:
@@ -289,8 +317,6 @@ class SearchConfig(LookingConfig):
         models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str | PolicyConfig, ...] = (
         "random",
         "non-predictive-raw",
@@ -304,9 +330,14 @@ class SearchConfig(LookingConfig):
     scanpaths: Whole = 3
     models: Path | None = None
 
+    @property
+    def class_templates(self) -> str | None:
+        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
+        return self.templates
+
 
 @dataclass(frozen=True)
-class ExploreConfig(LookingConfig):
+class ExploreConfig(RunConfig):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:
@@ -330,7 +361,6 @@ class ExploreConfig(LookingConfig):
         models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=20))
     policies: tuple[str | PolicyConfig, ...] = (
         "random-raw",
@@ -347,9 +377,6 @@ class ExploreConfig(LookingConfig):
     )
     out: Path = Path("runs/explore")
     models: Path | None = None
-
-
-RunConfig = SearchConfig | ExploreConfig
 
 
 @dataclass(frozen=True)

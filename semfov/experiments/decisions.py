@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -17,17 +16,17 @@ from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide, decide_by_price
+from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
 from semfov.errors import InputError, check
-from semfov.experiments.close_ups import CloseUps
 from semfov.experiments.config import DecidingConfig, PolicyConfig, SearchConfig
+from semfov.experiments.looks import Box, photograph_looks
 from semfov.experiments.parts import Record
+from semfov.experiments.remembered import RememberedLooks
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes, search_steps
 from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.settings import Positive
 from semfov.experiments.setup import make_observation, make_verification, published_model
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
@@ -53,14 +52,9 @@ SEEN_FROM = 0.5
 
 @dataclass(frozen=True)
 class DecisionConfig(DecidingConfig, SearchConfig):
-    """Searches that end in a decision. `policies` is ignored.
-
-    Args:
-        prices: prices of a look, for additional searches that end by `decide_by_price` instead of by thresholds.
-    """
+    """Searches that end in a decision. `policies` is ignored."""
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
-    prices: tuple[Positive, ...] = ()
 
 
 class DecisionRun(Run):
@@ -73,7 +67,7 @@ class DecisionRun(Run):
         config: settings of the run.
     """
 
-    task: ClassVar[Task] = "search"
+    task: Task = "search"
     config: DecisionConfig
 
     def __init__(self, config: DecisionConfig) -> None:
@@ -97,7 +91,6 @@ class DecisionRun(Run):
             AGENT: (learned, self._by_thresholds),
             **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
             RANDOM: (random, self._by_thresholds),
-            **{f"price {price:g}": (learned, by_price(price)) for price in config.prices},
         }
         model = self._published()
         if model is not None:
@@ -108,13 +101,16 @@ class DecisionRun(Run):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(self, close_up: CloseUps, grid: Grid, target: int) -> Verifier[Step]:
+    def _verifier(self, closer: Callable[[Box], Detections], grid: Grid, target: int) -> Verifier[Step]:
         """The closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
         thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
-        return Verifier(self.verification, CandidateCells(grid, target), close_up, thresholds, config.closer)
+        candidates = CandidateCells(grid, target)
+        return Verifier(
+            self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
+        )
 
     def _published(self) -> FovealObservationModel | None:
         """The observation model of the published belief; None if the settings name none and none is shipped."""
@@ -130,7 +126,7 @@ class DecisionRun(Run):
         evidence, config = self.models.evidence, self.config
         assert evidence is not None
         chosen = asdict(evidence.thresholds) if evidence.thresholds else None
-        given = [config.confirm, config.give_up, config.place, config.prices, config.closer]
+        given = [config.confirm, config.give_up, config.place, config.closer]
         model = self.verification
         verified = None
         if model is not None:
@@ -155,7 +151,9 @@ class DecisionRun(Run):
             sharp = self.eye.detector(image)
             tiles = [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
-        close_up = CloseUps(self.eye, lambda: image)
+        closer: RememberedLooks[int | Box, Detections] = RememberedLooks(
+            lambda: photograph_looks(self.eye, lambda: image, grid)
+        )
         for target in classes:
             goal = covered[annotation.labels == target].any(0)
             start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
@@ -175,7 +173,7 @@ class DecisionRun(Run):
                 def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
-                verifier = self._verifier(close_up, grid, target) if name in self.verified else None
+                verifier = self._verifier(closer, grid, target) if name in self.verified else None
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
                     last, seen = steps[-1], torch.cat([step.cell for step in steps])
@@ -204,11 +202,6 @@ class DecisionRun(Run):
                 )
         watch.lap("search")
         return records, watch.seconds
-
-
-def by_price(price: float) -> Rule:
-    """The rule that decides by the price of a look (`decide_by_price`)."""
-    return lambda step, target, grid: decide_by_price(step, target, price)
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:

@@ -11,6 +11,7 @@ from semfov.experiments.config import (
     ExploreConfig,
     PolicyConfig,
     RunConfig,
+    SearchConfig,
     SensorConfig,
 )
 from semfov.experiments.presets import TARGET_EVIDENCE as EVIDENCE
@@ -18,7 +19,7 @@ from semfov.experiments.presets import Choice, resolve
 from semfov.gaze.policies import POLICIES
 from semfov.model_folder import ModelFolder
 
-Config = TypeVar("Config", bound=RunConfig)
+Config = TypeVar("Config", bound=SearchConfig | ExploreConfig)
 
 
 def with_models(config: Config) -> Config:

@@ -19,11 +19,13 @@ from semfov.data.scene import Scenes
 from semfov.episode import Stopwatch
 from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.head_store import HeadStore, StoredLooksAround
+from semfov.experiments.looks import SOURCES, tight
 from semfov.experiments.parts import Record
+from semfov.experiments.remembered import RememberedLooks
 from semfov.experiments.scene_run import SceneRun, cache_folder, digest_of
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
 from semfov.experiments.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
+from semfov.experiments.store import DetectionStore
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
@@ -40,6 +42,9 @@ OURS = "ours"
 
 MOSAIC = 240.0
 """Width in degrees of a mosaic of 4 × 4 photographs."""
+
+LOOKS = (*SOURCES, "semfov.head.views", "semfov.head.panoramas", "semfov.data.mosaics", "semfov.head.episode")
+"""Modules that turn a scene into looks; all modules that they import count, too."""
 
 Degrees = Annotated[float, Range(1, 170)]
 
@@ -126,8 +131,8 @@ class HeadRun(SceneRun):
                 seed=config.seed,
             )
         )
-        looks = {"eye": self.eye.settings(), "fields": config.fields}
-        self.store = HeadStore(cache_folder(config.cache) / "head", looks, len(self.eye.detector.classes))
+        looks, components = {"eye": self.eye.settings(), "fields": config.fields}, len(self.eye.detector.classes) + 1
+        self.store = DetectionStore(cache_folder(config.cache) / "head", looks, LOOKS, components)
 
     def _key(self) -> str:
         besides = ("out", "cache", "store", "workers", "data", "detector")
@@ -150,7 +155,12 @@ class HeadRun(SceneRun):
         watch, config = Stopwatch(), self.config
         views = Views(self.world(index), config.fields, fovea=self.fovea)
         store = self.store if config.store else None
-        looks = StoredLooksAround(lambda: live(self.eye, views), store, self.scenes.digest(index))
+
+        def open_scene() -> Detect:
+            detect = live(self.eye, views)
+            return lambda action: tight(detect(action))
+
+        looks = RememberedLooks(open_scene, store, lambda: self.scenes.digest(index))
         watch.lap("scene")
         try:
             with torch.inference_mode():

@@ -9,11 +9,11 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.experiments.config import BeliefConfig, LookingConfig
-from semfov.experiments.looks import see_all
 from semfov.experiments.parts import Record
+from semfov.experiments.remembered import look_everywhere
 from semfov.experiments.scene_run import SceneRun, cache_folder, digest_of
 from semfov.experiments.setup import check_sources, make_eye, make_scenes
-from semfov.experiments.store import DetectionStore
+from semfov.experiments.store import cell_store
 
 
 class Looking(SceneRun):
@@ -39,7 +39,7 @@ class Looking(SceneRun):
         if not len(self.scenes):
             raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
         size, components = (config.belief.columns, config.belief.rows), len(self.scenes.classes) + 1
-        self.store = DetectionStore(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self.store = cell_store(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
         self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
@@ -66,13 +66,9 @@ class Looking(SceneRun):
 
     def detections(self, index: int) -> Detections:
         """Detections from every cell of a scene, read from the store, or computed and stored."""
-        digest = self.digest(index)
-        seen = self.store.load(digest) if self.config.store else None
-        if seen is None:
-            seen = see_all(self.eye, self.scenes[index].image, self.grid(index))
-            if self.config.store:
-                self.store.save(digest, seen)
-        return seen
+        store = self.store if self.config.store else None
+        image, digest = (lambda: self.scenes[index].image[None]), (lambda: self.digest(index))
+        return look_everywhere(self.eye, image, self.grid(index), store, digest)
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Look at a scene; there are no episodes, so there are no records."""

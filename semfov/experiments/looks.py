@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -10,7 +10,10 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.eye import Eye
+from semfov.eye import Eye, View
+
+Box = tuple[float, ...]
+"""`(x1, y1, x2, y2)`."""
 
 SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
@@ -47,6 +50,30 @@ def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
         return Detections.stack([eye.look(view, point[None]) for point in points])
 
 
-def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
-    """Detections in `image` `(3, H, W)` from the centre of every cell, a batch of X·Y (`look_from`)."""
-    return look_from(eye, image, grid.centres.to(image))
+def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | Box], Detections]:
+    """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
+
+    Args:
+        eye: sensor and detector.
+        image: gives the image, `(1, 3, H, W)`.
+        grid: the cells.
+
+    Returns:
+        A function that maps a cell or a box to the detections, a batch of one without padding.
+    """
+    view: View | None = None
+
+    def look(action: int | Box) -> Detections:
+        nonlocal view
+        if isinstance(action, tuple):
+            return tight(eye.close_up(image(), torch.tensor(action)))
+        view = eye.open(image()) if view is None else view
+        return tight(eye.look(view, grid.centres.to(view.canvas)[[action]]))
+
+    return look
+
+
+def tight(look: Detections) -> Detections:
+    """Remove the padding of a batch of one."""
+    mask = look.mask[0]
+    return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])

@@ -4,55 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import asdict
-from typing import ClassVar
 
-from torch import Tensor
-
-from semfov.errors import check, lookup
-from semfov.experiments.attention import attend_all
-from semfov.experiments.candidates import Candidate, load_models, make_strategy
-from semfov.experiments.config import RunConfig, SaliencyModel
-from semfov.experiments.looking import Looking
 from semfov.experiments.parts import Record
-from semfov.experiments.presets import label, resolve
-from semfov.experiments.saliency_store import SaliencyStore, saliency_table
-from semfov.experiments.scene_run import cache_folder, digest_of
-from semfov.experiments.setup import fovea_of
-from semfov.gaze.policies import POLICIES, Task
+from semfov.experiments.policy_looking import PolicyLooking
+from semfov.experiments.scene_run import digest_of
+from semfov.gaze.policies import POLICIES
 from semfov.io.code import class_digest
 from semfov.io.storage import checksum
 
 
-class Run(Looking):
-    """Policies compared in the same scenes; every process builds its own run from the settings.
-
-    Attributes:
-        task: the task of the episodes.
-        policies: settings of the policies under comparison, by their names in tables.
-    """
-
-    task: ClassVar[Task]
-    config: RunConfig
-
-    def __init__(self, config: RunConfig) -> None:
-        labels = [label(choice, self.task) for choice in config.policies]
-        for name in labels:
-            check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
-        self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
-        super().__init__(config)
-        self.models = load_models(config, self.task, self.eye)
-        components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
-        self.strategies = {
-            name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
-            for name, policy in self.policies.items()
-        }
-        folder, sensor = cache_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
-        size = config.belief.columns, config.belief.rows
-        self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency, sensor, size)
-            for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
-            if name is not None
-        }
+class Run(PolicyLooking):
+    """Policies compared in the same scenes; every process builds its own run from the settings."""
 
     def _code(self) -> str:
         """Digest of the code of the run, and of policies that the user registered."""
@@ -83,33 +45,3 @@ class Run(Looking):
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Run all episodes of a scene with all policies; returns records, and the seconds that each stage took."""
-
-    def candidate(self, name: str, index: int) -> Candidate:
-        """The policy of this name in tables, for a scene."""
-        policy = self.policies[lookup(name, self.policies, "policy of this run")]
-        strategy = self.strategies[name]
-        if strategy.policy.table == "attention":
-            return Candidate(strategy, self.attention(index))
-        if policy.saliency is None:
-            return Candidate(strategy)
-        saliency = self.saliency(policy.saliency, index)
-        if strategy.policy.table == "saliency":
-            return Candidate(strategy, saliency)
-        return Candidate(strategy, saliency=saliency, weight=self.config.saliency.weight)
-
-    def attention(self, index: int) -> Tensor:
-        """Attention to every class in the cells of a scene, from every cell; computed at each call, never stored."""
-        assert self.models.templates is not None
-        return attend_all(self.eye, self.models.templates, self.scenes[index].image, self.grid(index))
-
-    def saliency(self, name: SaliencyModel, index: int) -> Tensor:
-        """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
-        digest, store = self.digest(index), self.saliency_stores[name]
-        saliency = store.load(digest) if self.config.store else None
-        if saliency is None:
-            image = self.scenes[index].image
-            sensor, reference = fovea_of(self.eye), self.config.sensor.reference
-            saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
-            if self.config.store:
-                store.save(digest, saliency)
-        return saliency

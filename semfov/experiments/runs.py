@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,7 +28,7 @@ from semfov.metrics.exploration import answers_of
 class SearchRun(Run):
     """Visual search."""
 
-    task: ClassVar[Task] = "search"
+    task: Task = "search"
     config: SearchConfig
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
@@ -70,7 +69,7 @@ class SearchRun(Run):
 class ExploreRun(Run):
     """Scene exploration."""
 
-    task: ClassVar[Task] = "exploration"
+    task: Task = "exploration"
     config: ExploreConfig
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:

@@ -22,9 +22,8 @@ from semfov.experiments.looks import look_from
 from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_others
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.setup import check_sources, make_eye, make_scenes, prepare_worker
-from semfov.experiments.store import looks_digest, versions
+from semfov.experiments.store import SceneStore, looks_digest
 from semfov.eye import Eye
-from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import match
 from semfov.zoom.eye import ZoomEye
@@ -147,9 +146,9 @@ class SampleSettings:
         """Take these settings from those of a command, by their names."""
         return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
 
-    def sampler(self) -> Sampler:
-        """The sampler with these settings."""
-        return Sampler(self)
+    def sampler(self, folder: Path) -> Sampler:
+        """The sampler with these settings, whose shards are in a folder."""
+        return Sampler(self, folder)
 
 
 Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
@@ -170,8 +169,12 @@ def cells_of(columns: int, rows: int) -> Cells:
 class Sampler:
     """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
 
+    Args:
+        settings: settings of the samples.
+        folder: folder of the shards.
+
     Attributes:
-        key: sha256 of everything that the samples depend on.
+        store: store of the shards.
         sources: modules that samples depend on; all modules that they import count, too.
         coordinates: number of coordinates of a fixation.
     """
@@ -179,15 +182,12 @@ class Sampler:
     sources: ClassVar[tuple[str, ...]] = SOURCES
     coordinates: ClassVar[int] = 2
 
-    def __init__(self, settings: SampleSettings) -> None:
+    def __init__(self, settings: SampleSettings, folder: Path) -> None:
         self.settings = settings
         check_sources(settings.data, settings.detector)
         self.eye, self.scenes = self.make()
-        what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
-        what += [settings.shard, versions(), looks_digest(*self.sources)]
-        self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         components = len(self.scenes.classes) + 1
-        self._schema = Schema(
+        schema = Schema(
             {
                 "boxes": Field(("M", 4)),
                 "scores": Field(("M", components), low=0, high=1),
@@ -198,6 +198,12 @@ class Sampler:
                 "fixations": Field(("R", self.coordinates)),
             }
         )
+        what = {
+            "settings": self.eye.settings(),
+            "scenes": self.scenes.fingerprint,
+            **{name: getattr(settings, name) for name in ("fixations", "iou", "seed", "shard")},
+        }
+        self.store = SceneStore(folder, what, looks_digest(*self.sources), schema)
 
     def make(self) -> tuple[Eye | ZoomEye, Scenes]:
         """Make the eye and open the scenes."""
@@ -219,29 +225,24 @@ class Sampler:
         """The numbers of the shards."""
         return range(-(-len(self.scenes) // self.settings.shard))
 
-    def path(self, folder: Path, shard: int) -> Path:
-        """Path of a shard's file."""
-        return folder / self.key[:16] / f"{shard:06d}.safetensors"
-
-    def load(self, folder: Path, shard: int) -> Samples | None:
+    def load(self, shard: int) -> Samples | None:
         """The samples of a shard; None if they are missing or damaged."""
-        tensors = read_tensors(self.path(folder, shard), self._shard_key(shard), self._schema)
+        tensors = self.store.read(self.digest(shard))
         return None if tensors is None else Samples(**tensors)
 
-    def save(self, folder: Path, shard: int, samples: Samples) -> None:
+    def save(self, shard: int, samples: Samples) -> None:
         """Store the samples of a shard."""
-        tensors = {name: getattr(samples, name) for name in _NAMES}
-        write_tensors(self.path(folder, shard), self._shard_key(shard), tensors)
+        self.store.write(self.digest(shard), {name: getattr(samples, name) for name in _NAMES})
 
     def scenes_of(self, shard: int) -> range:
         """The photographs of a shard."""
         first = shard * self.settings.shard
         return range(first, min(first + self.settings.shard, len(self.scenes)))
 
-    def _shard_key(self, shard: int) -> str:
-        """Digest of everything that a shard depends on, including the pixels of its photographs."""
-        digests = [self.scenes.digest(index) for index in self.scenes_of(shard)]
-        return hashlib.sha256(json.dumps([self.key, digests]).encode()).hexdigest()
+    def digest(self, shard: int) -> str:
+        """sha256 of what the pixels of a shard's photographs depend on, and of their numbers."""
+        digests = [[index, self.scenes.digest(index)] for index in self.scenes_of(shard)]
+        return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
 
     def sample(self, shard: int) -> Samples:
         """Look at the photographs of a shard; returns the labelled detections."""
@@ -256,17 +257,17 @@ class Sampler:
         return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
 
 
-_process: dict[str, tuple[Sampler, Path]] = {}
+_process: dict[str, Sampler] = {}
 
 
 def _prepare(settings: SampleSettings, folder: Path) -> None:
     prepare_worker()
-    _process["sampler"] = settings.sampler(), folder
+    _process["sampler"] = settings.sampler(folder)
 
 
 def _run_shard(shard: int) -> int:
-    sampler, folder = _process["sampler"]
-    sampler.save(folder, shard, sampler.sample(shard))
+    sampler = _process["sampler"]
+    sampler.save(shard, sampler.sample(shard))
     return shard
 
 
@@ -287,8 +288,8 @@ def collect(settings: SampleSettings, folder: Path, workers: int | None, title: 
     Raises:
         DataError: the file of a shard is missing or damaged.
     """
-    sampler = settings.sampler()
-    todo = [shard for shard in mine(sampler.shards) if sampler.load(folder, shard) is None]
+    sampler = settings.sampler(folder)
+    todo = [shard for shard in mine(sampler.shards) if sampler.load(shard) is None]
     done = run_tasks(
         _run_shard,
         todo,
@@ -300,12 +301,12 @@ def collect(settings: SampleSettings, folder: Path, workers: int | None, title: 
     )
     for _ in done:
         pass
-    wait_for_others(sampler.shards, lambda shard: sampler.load(folder, shard) is not None)
+    wait_for_others(sampler.shards, lambda shard: sampler.load(shard) is not None)
     parts = []
     for shard in sampler.shards:
-        part = sampler.load(folder, shard)
+        part = sampler.load(shard)
         if part is None:
-            path = sampler.path(folder, shard)
+            path = sampler.store.path(sampler.digest(shard))
             raise DataError(f"{path} is missing or damaged; run the same command again")
         parts.append(part)
     return sampler, Samples.join(parts)

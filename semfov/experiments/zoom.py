@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,23 +13,18 @@ from torch import Tensor
 
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scenes
+from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
-from semfov.errors import DataError
-from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Record
-from semfov.experiments.scene_run import SceneRun, cache_folder, digest_of
+from semfov.experiments.scene_run import SceneRun, digest_of
 from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Whole, Workers
-from semfov.experiments.setup import make_detector, make_scenes, make_zoom_observation
+from semfov.experiments.settings import Count, Range, Workers
+from semfov.experiments.setup import make_zoom_observation
+from semfov.experiments.window_looking import SHOWN, Tile, WindowLooking, WindowLookingConfig, found_in
 from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
-from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
 from semfov.io.storage import checksum
-from semfov.observation.matching import box_iou
-from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
@@ -37,19 +32,11 @@ from semfov.zoom.objects import merge
 from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 
-SHOWN = 0.3
-"""Smallest score with which a look confirms a class."""
-
-
-Tile = Annotated[int, Range(16, 16_384)]
-"""Side of a part of a picture in pixels."""
-
-
 Measure = Literal["recall", "hit", "decision"]
 
 
 @dataclass(frozen=True)
-class ZoomConfig(Settings):
+class ZoomConfig(WindowLookingConfig):
     """Large pictures: recall against detector passes, passes to the first confirmed hit, and decisions.
 
     Args:
@@ -78,60 +65,27 @@ class ZoomConfig(Settings):
         workers: number of processes (None: one per CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
-    mosaics: Whole = 100
-    columns: Side = 4
-    rows: Side = 4
-    tile: Tile = 640
     target: str | None = None
     slice: Tile = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
     measures: tuple[Measure, ...] = ("recall", "hit", "decision")
     sought: Count = 4
-    cut: Cut = "keep"
-    model: str | None = None
     observation: str | None = None
-    seed: Seed = 0
     out: Path = Path("runs/zoom")
-    cache: Path | None = None
-    store: bool = True
     workers: Workers | None = None
 
 
-class ZoomRun(SceneRun):
-    """Scenes, eye and models of a run; every process builds its own from the settings.
-
-    Attributes:
-        scenes: the mosaics or photographs.
-    """
+class ZoomRun(WindowLooking, SceneRun):
+    """Ways of looking at large pictures; every process builds its own run from the settings."""
 
     config: ZoomConfig
 
     def __init__(self, config: ZoomConfig) -> None:
-        self.config = config
-        detector = make_detector(config.detector)
-        self.eye = ZoomEye(detector, cut=config.cut).eval().requires_grad_(False)
-        self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
-        self.evidence.check_compatible(self.eye.settings())
+        super().__init__(config)
         self.observation = make_zoom_observation(config.observation, self.eye)
-        photographs = self.open_scenes(detector.classes)
-        if not len(photographs):
-            raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
-        self.scenes: Scenes = photographs
-        if config.mosaics:
-            size = config.tile, config.tile * 3 // 4
-            self.scenes = Mosaics(
-                photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
-            )
-        names = detector.classes
+        names = self.eye.detector.classes
         self.target = None if config.target is None else class_index(config.target, names, "target")
-        self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
-
-    def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        """Open the photographs of the run; a subclass may open others."""
-        return make_scenes(self.config.data, classes)
 
     def _key(self) -> str:
         settings = asdict(self.config)
@@ -143,10 +97,6 @@ class ZoomRun(SceneRun):
         model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds, verified]
         observed = None if self.observation is None else checksum(self.observation.state_dict())
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
-
-    def glances(self, index: int) -> StoredGlances:
-        """The looks at a scene."""
-        return open_scene(self.eye, self.scenes, index, self.store if self.config.store else None)
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
         """The slices of a scene: the photographs of a mosaic, or squares of a picture."""
@@ -269,12 +219,3 @@ def without_cut(glance: Glance) -> Glance:
     seen, whole = glance.detections, ~glance.cut
     detections = Detections(seen.boxes[:, whole], seen.scores[:, whole], seen.mask[:, whole])
     return replace(glance, detections=detections, cut=glance.cut[whole])
-
-
-def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
-    """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
-    objects = merge(looks, target, score=FOUND)
-    if not len(objects):
-        return torch.zeros(len(annotation.boxes), dtype=torch.bool)
-    hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
-    return hits.any(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import cast
 
 import torch
@@ -40,9 +41,9 @@ class MosaicSettings(SampleSettings):
     mosaics: int = 0
     holdout: int = 10
 
-    def sampler(self) -> Sampler:
-        """The sampler with these settings."""
-        return MosaicSampler(self)
+    def sampler(self, folder: Path) -> Sampler:
+        """The sampler with these settings, whose shards are in a folder."""
+        return MosaicSampler(self, folder)
 
 
 class HeldOutMosaics:

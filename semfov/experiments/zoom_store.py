@@ -1,4 +1,4 @@
-"""Stores the glances at pictures, so that each is computed only once."""
+"""Stores looks at the windows of pictures, so that each is computed only once."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
-from semfov.experiments.gists import gist_fields, pack_gists, unpack_gists
-from semfov.experiments.looks import one_thread
-from semfov.experiments.store import SceneStore
-from semfov.io.code import modules_digest
-from semfov.io.schema import Field, Schema
+from semfov.experiments.remembered import RememberedLooks
+from semfov.experiments.store import LookStore, pack, unpack
+from semfov.io.schema import Field
 from semfov.zoom.eye import ZoomEye
+from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 
@@ -23,8 +21,8 @@ SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "
 """Modules that turn a large picture into glances; all modules that they import count, too."""
 
 
-class GlanceStore(SceneStore):
-    """Glances at pictures, on disk.
+class GlanceStore(LookStore[Window, Glance]):
+    """Glances at pictures by window, on disk.
 
     Args:
         folder: folder of the store.
@@ -32,113 +30,153 @@ class GlanceStore(SceneStore):
         classes: number of the detector's classes.
     """
 
+    width = 12
+
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
-        schema = Schema(
-            {
-                "show": Field(("N", classes), torch.float32, low=0, high=1),
-                "windows": Field(("N", 12), torch.float64),
-                "count": Field(("N",), torch.int64, low=0),
-                "boxes": Field(("M", 4), torch.float32),
-                "scores": Field(("M", classes + 1), torch.float32, low=0, high=1),
-                "cut": Field(("M",), torch.bool),
-                **gist_fields(classes),
-            }
-        )
-        super().__init__(folder, {"settings": settings}, modules_digest(*SOURCES), schema)
+        self.classes = classes
+        super().__init__(folder, {"settings": settings}, SOURCES, classes + 1)
 
-    def load(self, digest: str) -> list[Glance]:
-        """The stored glances at a picture; empty if they are missing or incomplete."""
-        tensors = self.read(digest)
-        if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
-            return []
-        return unpack(tensors)
+    def more(self) -> dict[str, Field]:
+        """Whether boxes are cut, the highest scores, and the gists."""
+        return {
+            "cut": Field(("M",), torch.bool),
+            "show": Field(("N", self.classes), torch.float32, low=0, high=1),
+            **gist_fields(self.classes),
+        }
 
-    def save(self, digest: str, glances: Sequence[Glance]) -> None:
-        """Store the glances at a picture."""
-        self.write(digest, pack(glances))
+    def encode(self, action: Window) -> Sequence[float]:
+        """The fixation, the part of the picture, the level and the cells of a window."""
+        # Four zeros stand for a window without a limit, since no limit ends at 0.
+        return (*action.fixation, *(action.within or (0.0, 0.0, 0.0, 0.0)), action.level, *action.cells)
+
+    def decode(self, row: Sequence[float]) -> Window:
+        """A window."""
+        within: Any = tuple(row[3:7]) if row[5] > 0 else None
+        cells: Any = tuple(map(int, row[8:12]))
+        return Window((row[0], row[1], row[2]), int(row[7]), cells, within)
+
+    def pack(self, looks: Sequence[Glance]) -> dict[str, Tensor]:
+        """Convert glances to tensors for a file."""
+        return {
+            **pack([glance.detections for glance in looks]),
+            "cut": torch.cat([glance.cut for glance in looks]),
+            "show": torch.stack([glance.show for glance in looks]),
+            **pack_gists([glance.gist for glance in looks], self.classes),
+        }
+
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
+        """Convert the tensors of a file back to the glances at these windows."""
+        cut, gists = tensors["cut"].split(tensors["count"].tolist()), unpack_gists(tensors, actions)
+        return [Glance(*each) for each in zip(actions, unpack(tensors), cut, tensors["show"], gists, strict=True)]
 
 
 class StoredGlances(Glances):
-    """Looks at one picture, each computed once: read from a store, or taken by an eye that is opened only when needed.
+    """Looks at the windows of one picture, each computed once. They have all their hints.
 
-    Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
-    batch nor on the number of CPU cores.
+    The picture is composed or read only when a look is missing.
 
     Args:
-        lattice: lattice of the picture.
-        live: opens the picture.
-        store: store of the looks; None stores none.
-        digest: digest of the picture's pixels.
+        eye: the eye.
+        scenes: the pictures.
+        index: index of the picture.
+        store: store of the looks; None keeps them in memory.
     """
 
-    def __init__(self, lattice: Lattice, live: Callable[[], Glances], store: GlanceStore | None, digest: str) -> None:
-        self.lattice = lattice
-        self._open, self._live = live, None
-        self._store, self._digest = store, digest
-        self._known = {} if store is None else {glance.window: glance for glance in store.load(digest)}
-        self._kept = len(self._known)
+    def __init__(self, eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
+        self.lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
 
-    _live: Glances | None
+        def open_picture() -> Callable[[Window], Glance]:
+            glances = LiveGlances(eye, eye.open(scenes[index].image))
+            return lambda window: glances.see([window])[0]
+
+        self.looks = RememberedLooks(open_picture, store, lambda: scenes.digest(index))
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
-        """The looks at windows, read from the store or computed; they have all their hints."""
-        for window in windows:
-            if window not in self._known:
-                with one_thread(), torch.inference_mode():
-                    self._live = self._open() if self._live is None else self._live
-                    self._known[window] = self._live.see([window])[0]
-        return [self._known[window] for window in windows]
+        """The looks at windows, read from the store or computed."""
+        return [self.looks(window) for window in windows]
 
     def save(self) -> None:
         """Store the looks at the picture if there are new ones."""
-        if self._store is not None and len(self._known) > self._kept:
-            self._store.save(self._digest, [*self._known.values()])
-            self._kept = len(self._known)
+        self.looks.save()
 
 
-def open_scene(eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | None) -> StoredGlances:
-    """Looks of an eye at a scene; the scene's image is composed or read only when a look is not in the store."""
-    lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
+def gist_fields(kinds: int) -> dict[str, Field]:
+    """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file.
 
-    def live() -> Glances:
-        return LiveGlances(eye, eye.open(scenes[index].image))
+    Args:
+        kinds: number of classes.
 
-    return StoredGlances(lattice, live, store, scenes.digest(index))
-
-
-def pack(glances: Sequence[Glance]) -> dict[str, Tensor]:
-    """Convert glances to tensors for a file."""
-    # Four zeros stand for a window without a limit, since no limit ends at 0.
-    rows = [
-        [*g.window.fixation, *(g.window.within or (0.0, 0.0, 0.0, 0.0)), g.window.level, *g.window.cells]
-        for g in glances
-    ]
+    Returns:
+        The fields by name.
+    """
     return {
-        "windows": torch.tensor(rows, dtype=torch.float64),
-        "count": torch.tensor([len(g.cut) for g in glances]),
-        "boxes": torch.cat([g.detections.boxes[0] for g in glances]),
-        "scores": torch.cat([g.detections.scores[0] for g in glances]),
-        "cut": torch.cat([g.cut for g in glances]),
-        "show": torch.stack([g.show for g in glances]),
-        **pack_gists([g.gist for g in glances], len(glances[0].show)),
+        "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
+        "gist.counts": Field(("N", 2), torch.int64, low=0),
+        "gist.cells": Field(("P",), torch.int32, low=0),
+        "gist.scores": Field(("P", kinds), torch.float32, low=0, high=1),
+        "gist.sizes": Field(("P",), torch.float32, low=0),
+        "gist.found": Field(("Q",), torch.int32, low=0),
     }
 
 
-def unpack(tensors: dict[str, Tensor]) -> list[Glance]:
-    """Convert the tensors of `pack` back to glances."""
-    windows = [_window(row) for row in tensors["windows"].tolist()]
-    counts = tensors["count"].tolist()
-    parts = (tensors[name].split(counts) for name in ("boxes", "scores", "cut"))
-    gists = unpack_gists(tensors, windows)
-    return [
-        Glance(
-            window, Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool)), cut, show, look
+def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
+    """Pack gists into the tensors of `gist_fields`; a look without a gist has no cells.
+
+    Args:
+        gists: the gists of the looks.
+        kinds: number of classes.
+
+    Returns:
+        The tensors by name.
+    """
+    frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
+    cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
+    scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]
+    for number, look in enumerate(gists):
+        if look is None:
+            continue
+        full = (look.scores > 0).any(-1).flatten()
+        cells.append(full.nonzero()[:, 0].int())
+        scores.append(look.scores.flatten(0, 1)[full].float())
+        sizes.append(look.size.flatten()[full].float())
+        found.append(look.found.flatten().nonzero()[:, 0].int())
+        frames[number] = torch.tensor([look.scale, *look.scores.shape[:2]])
+        counts[number] = torch.tensor([len(cells[-1]), len(found[-1])])
+    return {
+        "gist.frames": frames,
+        "gist.counts": counts,
+        "gist.cells": torch.cat(cells),
+        "gist.scores": torch.cat(scores),
+        "gist.sizes": torch.cat(sizes),
+        "gist.found": torch.cat(found),
+    }
+
+
+def unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
+    """Unpack the tensors of `pack_gists`.
+
+    Args:
+        tensors: the tensors by name.
+        windows: the windows of the looks.
+
+    Returns:
+        The gists of the looks; None for a look without one.
+    """
+    full, found = (column.tolist() for column in tensors["gist.counts"].unbind(1))
+    parts = (tensors[f"gist.{name}"].split(full) for name in ("cells", "scores", "sizes"))
+    told = zip(windows, tensors["gist.frames"].tolist(), *parts, tensors["gist.found"].split(found), strict=True)
+    kinds = tensors["gist.scores"].shape[-1]
+    gists: list[Gist | None] = []
+    for window, (scale, rows, columns), cells, scores, sizes, seen in told:
+        if not scale:
+            gists.append(None)
+            continue
+        values, size = torch.zeros(rows * columns, kinds), torch.zeros(rows * columns)
+        sure = torch.zeros(rows * columns * kinds, dtype=torch.bool)
+        values[cells.long()], size[cells.long()], sure[seen.long()] = scores.float(), sizes.float(), True
+        shape = rows, columns
+        look = Gist(
+            window.level, window.cells[:2], scale, values.view(*shape, -1), size.view(shape), sure.view(*shape, -1)
         )
-        for window, boxes, scores, cut, show, look in zip(windows, *parts, tensors["show"], gists, strict=True)
-    ]
-
-
-def _window(row: list[float]) -> Window:
-    within: Any = tuple(row[3:7]) if row[5] > 0 else None
-    cells: Any = tuple(map(int, row[8:12]))
-    return Window((row[0], row[1], row[2]), int(row[7]), cells, within)
+        gists.append(look)
+    return gists

@@ -13,13 +13,12 @@ from semfov.belief.observers import Observer
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
-from semfov.experiments.close_ups import CloseUps
-from semfov.experiments.looks import one_thread
-from semfov.experiments.photograph_store import PhotographStore
+from semfov.experiments.looks import Box, photograph_looks
+from semfov.experiments.remembered import RememberedLooks
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for
-from semfov.experiments.store import tight
-from semfov.eye import Eye, View
+from semfov.experiments.store import DetectionStore
+from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 
@@ -68,17 +67,15 @@ class Photograph:
         number: int,
         grid: Grid,
         sought: tuple[Sought, ...],
-        store: PhotographStore | None = None,
+        store: DetectionStore | None = None,
         everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
         self.grid, self.sought, self.store, self.everywhere = grid, sought, store, everywhere
-        self.seen: dict[int, Detections] = {}
-        self._closely = CloseUps(eye, lambda: self.image)
-        # Number of looks in the store; None as long as it was not read.
-        self._known: int | None = None
+        self.looks: RememberedLooks[int | Box, Detections] = RememberedLooks(
+            lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
+        )
         self._image: Tensor | None = None
-        self._view: View | None = None
         self._from_cells: Detections | None = None
 
     @property
@@ -90,46 +87,22 @@ class Photograph:
 
     def close(self) -> None:
         """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
-        self._image = self._view = self._from_cells = None
-        if self.store is None or self._known is None:
-            return
-        if len(self.seen) + len(self._closely.seen) > self._known:
-            self.store.save(self.scenes.digest(self.index), self.seen, self._closely.seen)
-        self.seen, self._closely.seen, self._known = {}, {}, None
+        self._image = self._from_cells = None
+        self.looks.close()
 
-    def _recall(self) -> None:
-        """Read the stored looks."""
-        if self.store is not None and self._known is None:
-            self.seen, self._closely.seen = self.store.load(self.scenes.digest(self.index))
-            self._known = len(self.seen) + len(self._closely.seen)
-
-    def look(self, cell: int, fixation: Tensor) -> Detections:
-        """Look from a cell.
-
-        Args:
-            cell: the cell.
-            fixation: `(1, 2)`, its centre.
-
-        Returns:
-            The detections, a batch of one.
-        """
-        if self.everywhere is not None:
-            self._from_cells = self.everywhere(self.index) if self._from_cells is None else self._from_cells
-            return self._from_cells[cell : cell + 1]
-        self._recall()
-        if cell not in self.seen:
-            with one_thread(), torch.inference_mode():
-                self._view = self.eye.open(self.image) if self._view is None else self._view
-                self.seen[cell] = tight(self.eye.look(self._view, fixation))
-        return self.seen[cell]
+    def look(self, cell: int) -> Detections:
+        """Look from the centre of a cell; returns the detections, a batch of one."""
+        if self.everywhere is None:
+            return self.looks(cell)
+        self._from_cells = self.everywhere(self.index) if self._from_cells is None else self._from_cells
+        return self._from_cells[cell : cell + 1]
 
     def close_up(self, box: Tensor) -> Detections:
         """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-        self._recall()
-        return self._closely(box)
+        return self.looks(tuple(box.tolist()))
 
 
-class RememberedLooks(Looks):
+class PhotographLooks(Looks):
     """Looks at a photograph that are made only once, whatever is searched for.
 
     Args:
@@ -143,7 +116,7 @@ class RememberedLooks(Looks):
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Look, or remember."""
-        seen = self.photograph.look(int(cell), fixation)
+        seen = self.photograph.look(int(cell))
         return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
 
 
@@ -157,7 +130,7 @@ def photographs(
     absent: int | None,
     max_area: float,
     seed: int,
-    store: PhotographStore | None = None,
+    store: DetectionStore | None = None,
     spare: int = 0,
     everywhere: Callable[[int], Detections] | None = None,
 ) -> list[Photograph]:
@@ -218,7 +191,7 @@ def search(
     Returns:
         The steps.
     """
-    source = RememberedLooks(photograph, sought.target)
+    source = PhotographLooks(photograph, sought.target)
     choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
     rule = None if ends is None else lambda step: ends(step) > 0
     return rollout(source, observer, TargetPosterior(sought.target), sought.start, choice, most=looks, ends=rule)

@@ -25,13 +25,13 @@ from semfov.experiments.config import (
     SaliencyConfig,
     SensorConfig,
 )
-from semfov.experiments.looks import see_all
 from semfov.experiments.presets import label, resolve
+from semfov.experiments.remembered import look_everywhere
 from semfov.experiments.saliency_store import saliency_table
 from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.settings import Count, Name, Positive, Settings
 from semfov.experiments.setup import fovea_of, make_eye, prepare_worker
-from semfov.experiments.store import DetectionStore
+from semfov.experiments.store import cell_store
 from semfov.eye import Eye
 from semfov.training.habits import Halves, fit_terms, habits_of
 from semfov.training.habits_report import report
@@ -142,7 +142,7 @@ class Viewer:
             for name, policy in self.policies.items()
         }
         size = config.belief.columns, config.belief.rows
-        self.store = DetectionStore(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self.store = cell_store(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
 
     def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
         """Gather the choices of all people in a picture.
@@ -165,10 +165,7 @@ class Viewer:
                 f"size for {records[0].picture}"
             )
         grid = Grid(self.config.belief.columns, self.config.belief.rows, size)
-        seen = self.store.load(digest)
-        if seen is None:
-            seen = see_all(self.eye, image, grid)
-            self.store.save(digest, seen)
+        seen = look_everywhere(self.eye, lambda: image[None], grid, self.store, lambda: digest)
         cells, count = cells_of(records, grid)
         values = {}
         for name in self.policies:

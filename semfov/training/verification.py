@@ -6,9 +6,9 @@ import json
 from dataclasses import replace
 
 from semfov.errors import DataError
-from semfov.experiments.photograph_store import PhotographStore
 from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.setup import make_eye, make_scenes, make_target_evidence
+from semfov.experiments.store import cell_store
 from semfov.training.closer_looks import photographs
 from semfov.training.outputs import model_path, training_of, write_outputs
 from semfov.training.verification_fit import fit_and_verify
@@ -30,8 +30,8 @@ def fit_verification(config: FitVerificationConfig) -> None:
     chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
-    size, classes = (config.columns, config.rows), len(eye.detector.classes)
-    store = PhotographStore(cache_folder(config.cache) / "searches", eye.settings(), *size, classes)
+    size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
+    store = cell_store(cache_folder(config.cache) / "searches", eye.settings(), *size, components)
     seen = photographs(
         eye,
         scenes,

@@ -16,7 +16,7 @@ from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
 from semfov.experiments.tables import table
-from semfov.experiments.zoom_store import GlanceStore, open_scene
+from semfov.experiments.zoom_store import GlanceStore, StoredGlances
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
 from semfov.training.zoom_choice import choose_foresight, choose_patience, open_all
@@ -94,7 +94,7 @@ def look(task: tuple[str, int]) -> tuple[str, int]:
     """Look at all windows of a mosaic that are not in the store yet."""
     kind, index = task
     mosaics = _process["mosaics"][kind]
-    glances = open_scene(_process["eye"], mosaics, index, _process["store"])
+    glances = StoredGlances(_process["eye"], mosaics, index, _process["store"])
     glances.see(windows_of(mosaics, index, glances.lattice))
     glances.save()
     return task
@@ -102,7 +102,7 @@ def look(task: tuple[str, int]) -> tuple[str, int]:
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
     """Read the results of the looks at all mosaics."""
-    return [example_of(mosaics, n, open_scene(eye, mosaics, n, store)) for n in range(len(mosaics))]
+    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store)) for n in range(len(mosaics))]
 
 
 def fit_zoom(config: FitZoomConfig) -> None:

@@ -8,8 +8,8 @@ from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.experiments.zoom import SHOWN, found_in
-from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
+from semfov.experiments.window_looking import SHOWN, found_in
+from semfov.experiments.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
 from semfov.zoom.glances import Glance, Glances, Window, around
@@ -85,7 +85,7 @@ def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: 
 
 def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
     """Open the stored looks of each mosaic."""
-    return [open_scene(eye, mosaics, index, store) for index in range(len(mosaics))]
+    return [StoredGlances(eye, mosaics, index, store) for index in range(len(mosaics))]
 
 
 def mean_recall(

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.experiments.zoom import SHOWN
+from semfov.experiments.window_looking import SHOWN
 from semfov.training.zoom_examples import ZoomExample
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.networks import STEPS

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from semfov.experiments.zoom import SHOWN
+from semfov.experiments.window_looking import SHOWN
 from semfov.training.zoom_examples import LookedAt, ZoomExample, closer_windows
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence

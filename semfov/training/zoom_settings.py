@@ -6,7 +6,7 @@ from typing import Literal
 
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
-from semfov.experiments.zoom import Tile
+from semfov.experiments.window_looking import Tile
 
 Part = Literal["decision", "survey", "verification"]
 

@@ -123,10 +123,10 @@ def test_thresholds_can_be_changed_and_are_checked(image):
             agent(Scripted(*script)).search(image, "red", closer=wrong)
 
 
-def test_given_boxes_and_prices_end_a_search_without_closer_looks(image):
+def test_given_boxes_end_a_search_without_closer_looks(image):
     script = [(cells(c11=0.9), 0.9)]
-    for options in ({"boxes": [[130.0, 90, 150, 110]]}, {"price": 0.5}):
-        assert agent(Scripted(*script)).search(image, "red", start=11, **options).closer == ()
+    boxes = [[130.0, 90, 150, 110]]
+    assert agent(Scripted(*script)).search(image, "red", start=11, boxes=boxes).closer == ()
 
 
 def test_a_search_whose_shifts_are_spent_can_still_find_its_target(image):

@@ -19,7 +19,6 @@ from semfov.decision import (
     Decision,
     conclude,
     decide,
-    decide_by_price,
     goal_cells,
     strength,
     strongest,
@@ -341,66 +340,6 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     nothing = [Detections.empty(1, 3)]
     assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
     assert strength(nothing[0], grid, 2).tolist() == [0.0] * 12
-
-
-def value_of_looks(cells, visited, presence, price):
-    """Value of deciding now, and the best value of deciding after m more looks, by enumerating all courses."""
-    left = sorted((p for p, seen in zip(cells, visited, strict=True) if not seen), reverse=True)
-    total, best = sum(cells), -1.0
-    for most in range(1, len(left) + 1):
-        paid, value, unmet = 0.0, 0.0, 1.0
-        for p in left[:most]:
-            paid += price
-            met = presence * p / total
-            # This look finds the target: a right decision, minus the price paid so far.
-            value += met * (1 - paid)
-            unmet -= met
-        here = unmet - (1 - presence)
-        value += max(here, 1 - presence) - unmet * paid
-        best = max(best, value)
-    return max(presence, 1 - presence), best
-
-
-@given(
-    st.lists(st.tuples(st.floats(0.01, 0.99), st.booleans()), min_size=2, max_size=6),
-    st.floats(0.01, 0.99),
-    st.floats(0.0001, 0.3),
-)
-def test_decision_by_price_equals_enumerating_all_courses_of_the_search(cells, presence, price):
-    known, visited = (list(column) for column in zip(*cells, strict=True))
-    stated = SimpleNamespace(
-        belief=Known(torch.tensor([known]).double(), torch.tensor([presence]).double(), torch.zeros(())),
-        visited=torch.tensor([visited]),
-    )
-    now, later = value_of_looks(known, visited, presence, price)
-    outcome = int(decide_by_price(stated, 1, price))
-    if later > now + 1e-5:
-        assert outcome == 0
-    elif later < now - 1e-5:
-        assert outcome == (1 if presence >= 0.5 else 2)
-
-
-def test_search_goes_on_if_looks_are_cheap_and_ends_if_they_are_expensive():
-    stated = step([[0.4, 0.3, 0.2]], [[0]], 0.6)
-    assert int(decide_by_price(stated, 1, 1e-4)) == 0
-    assert int(decide_by_price(stated, 1, 0.9)) == 1
-    # After every cell was fixated no look is left to pay for.
-    assert int(decide_by_price(step([[0.4, 0.3]], [[0, 1]], 0.4), 1, 1e-4)) == 2
-    for price in (-0.1, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="price: expected 0 or more"):
-            decide_by_price(stated, 1, price)
-
-
-def test_a_search_can_end_by_price(image):
-    script = [(cells(c5=0.9), 0.6), (cells(c5=0.99), 0.97)]
-    assert agent(Scripted(*script)).search(image, "red", start=0, price=0.02).cells.tolist() == [0, 5]
-    assert agent(Scripted(*script)).search(image, "red", start=0, price=0.9).decision.outcome == "found"
-    for price in ("a", -0.1, True):
-        with pytest.raises(InputError, match="price: expected 0 or more"):
-            agent(Scripted(*script)).search(image, "red", price=price)
-    for observer, options in ((Scripted(*script), {"confirm": 0.5}), (Semantic(3), {})):
-        with pytest.raises(InputError, match="price: expected None"):
-            agent(observer).search(image, "red", price=0.1, **options)
 
 
 @pytest.mark.parametrize(

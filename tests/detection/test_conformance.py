@@ -148,6 +148,21 @@ ADAPTERS = {
 }
 
 
+# One of each way to run a network; the others differ from them in the outputs that they read.
+FAMILIES = ("darknet", "onnx, own static export", "onnx, yolov8", "onnx, batch of two", "faster r-cnn")
+
+
+def with_values(argument, *values):
+    """Every detector with one of the values, and one of each family with all of them."""
+    names = list(ADAPTERS)
+    pairs = {(name, values[number % len(values)]): None for number, name in enumerate(names)}
+    pairs |= {(family, value): None for family in FAMILIES for value in values}
+    return pytest.mark.parametrize(("adapter", argument), list(pairs), indirect=["adapter"])
+
+
+of_each_family = pytest.mark.parametrize("adapter", FAMILIES, indirect=True)
+
+
 @pytest.fixture
 def small_weights(write_weights):
     return write_weights()
@@ -203,6 +218,7 @@ def test_scores_are_on_the_simplex_and_shapes_are_right(detector):
     assert int(found.count.max()) > 0
     assert_valid(detector, found, images)
     assert torch.equal(images, before)
+    same(detector(images), found, 0.0)
 
 
 def test_images_without_detections_give_empty_tensors(detector):
@@ -213,12 +229,13 @@ def test_images_without_detections_give_empty_tensors(detector):
     assert found.mask.shape == (2, 0)
 
 
-@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+@with_values("value", 0.0, 0.5, 1.0)
 def test_uniform_images_give_valid_detections(detector, value):
     images = torch.full((1, 3, 48, 64), value)
     assert_valid(detector, detector(images), images)
 
 
+@of_each_family
 @pytest.mark.parametrize(
     "images",
     [
@@ -236,13 +253,14 @@ def test_inputs_that_are_not_a_batch_of_images_are_refused(detector, images):
         detector(images)
 
 
+@of_each_family
 def test_an_empty_batch_of_canvases_is_refused(detector):
     canvas, placement = detector.fit(photographs(1, 40, 50))
     with pytest.raises(InputError, match="canvas: expected at least one image"):
         detector.detect(canvas[:0], placement)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+@with_values("dtype", torch.float16, torch.bfloat16, torch.float64)
 def test_images_may_have_other_precisions(detector, dtype):
     images = photographs(1, 45, 64, dtype=torch.float64).to(dtype)
     found = detector(images)
@@ -259,7 +277,7 @@ def test_a_batch_equals_a_loop(detector):
     same(detector(images), loop, 1e-5)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (17, 31), (200, 301), (512, 64)])
+@with_values("size", (1, 1), (1, 300), (300, 1), (17, 31), (200, 301), (512, 64))
 def test_images_may_have_any_size(detector, size):
     images = photographs(1, *size)
     assert_valid(detector, detector(images), images)
@@ -289,11 +307,6 @@ def test_bytes_are_proposed_as_their_share_of_white(detector):
         torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-4, atol=1e-5)
     with pytest.raises(InputError, match="canvas: expected bytes"):
         detector.propose_bytes(canvas / 255)
-
-
-def test_detections_are_reproducible(detector):
-    images = photographs(2, 45, 64)
-    same(detector(images), detector(images), 0.0)
 
 
 def test_a_copy_gives_the_same_detections(detector):
@@ -329,7 +342,7 @@ def test_settings_are_json_and_differ_between_detectors(detector):
     assert detector.settings() != settings
 
 
-@pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
+@with_values("policy", "residual", "normalised", "uniform", "none")
 def test_detectors_accept_every_background_policy(detector, policy):
     detector.background = policy
     images = photographs(1, 45, 64)

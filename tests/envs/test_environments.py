@@ -192,7 +192,7 @@ def test_infos_have_the_detections_of_the_look(sceneries):
     seen = info["detections"]
     grid = Grid(5, 4, (640, 480))
     with torch.inference_mode():
-        live = scenery.run.eye(scenery.image(info["scene"])[None], grid.centres[7][None])
+        live = scenery.eye(scenery.image(info["scene"])[None], grid.centres[7][None])
     assert int(live.count) == seen["mask"].sum() > 0
     assert seen["boxes"][seen["mask"]] == pytest.approx(live.boxes[0].numpy(), abs=1e-3)
     assert seen["scores"][seen["mask"]] == pytest.approx(live.scores[0].numpy(), abs=1e-4)

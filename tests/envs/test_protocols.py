@@ -1,12 +1,17 @@
 """Policies as agents in environments make the same fixations as those recorded in the evaluations."""
 
-from dataclasses import replace
-
 import gymnasium
 import pytest
 
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
-from semfov.experiments.config import PolicyConfig
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    ExploreConfig,
+    PolicyConfig,
+    ProtocolConfig,
+    SearchConfig,
+)
 from semfov.experiments.runs import ExploreRun, SearchRun
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
@@ -22,9 +27,20 @@ SEARCHES = [
 EXPLORATIONS = ["recommended", "random-raw", "kl-calibrated"]
 
 
-def evaluated(kind, scenery):
+def settings(kind, world, policy="recommended"):
+    """Settings of the evaluation in the same world."""
+    columns, rows = world["grid"]
+    return kind(
+        data=DataConfig(limit=world["count"], min_instances=0),
+        belief=BeliefConfig(columns=columns, rows=rows),
+        protocol=ProtocolConfig(world["starts"], world["shifts"]),
+        policies=(policy,),
+        cache=world["cache"],
+    )
+
+
+def evaluated(run):
     """Records of the evaluation with the same settings, scene by scene: a separate run without the environment."""
-    run = kind(scenery.run.config)
     return [record for scene in range(len(run.scenes)) for record in run.outcomes(scene)[0]]
 
 
@@ -52,7 +68,7 @@ def run_one_at_a_time(env, episodes):
 @pytest.mark.parametrize("policy", SEARCHES, ids=str)
 def test_searches_equal_the_records_of_the_evaluation(world, policy):
     scenery = open_scenery("search", **world, policy=policy)
-    records, episodes = evaluated(SearchRun, scenery), all_episodes(scenery)
+    records, episodes = evaluated(SearchRun(settings(SearchConfig, world, policy))), all_episodes(scenery)
     assert len(records) == len(episodes) >= 12
     wanted = [(record["cells"], record["found_at"]) for record in records]
     assert len({found for _, found in wanted}) > 1  # The searches end at different times.
@@ -64,7 +80,7 @@ def test_searches_equal_the_records_of_the_evaluation(world, policy):
 @pytest.mark.parametrize("policy", EXPLORATIONS)
 def test_explorations_equal_the_records_of_the_evaluation(world, policy):
     scenery = open_scenery("exploration", **world, policy=policy)
-    records, episodes = evaluated(ExploreRun, scenery), all_episodes(scenery)
+    records, episodes = evaluated(ExploreRun(settings(ExploreConfig, world, policy))), all_episodes(scenery)
     records = [record for record in records if record["policy"] == scenery.policy]
     assert len(records) == len(episodes) == 6
     wanted = [(record["cells"], [right / record["object_cells"] for right in record["right"]]) for record in records]
@@ -98,8 +114,7 @@ def test_the_policy_agent_accepts_wrapped_environments(sceneries):
     assert info["action_mask"][PolicyAgent(env)(observation, info)] == 1
 
 
-def test_an_environment_can_be_made_from_the_settings_of_an_evaluation(sceneries):
-    config = sceneries["search"].run.config
-    scenery = open_scenery("search", config=replace(config, policies=("random",)))
+def test_an_environment_can_be_made_from_the_settings_of_an_evaluation(world):
+    scenery = open_scenery("search", config=settings(SearchConfig, world, "random"))
     assert scenery.policy == "random"
     assert scenery.shape == (4, 5)

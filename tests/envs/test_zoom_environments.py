@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from semfov import InputError
-from semfov.envs import BeliefObservation, GlimpseObservation
+from semfov.envs import (
+    BeliefObservation,
+    GlimpseObservation,
+    ZoomExplore,
+    ZoomPolicyAgent,
+    ZoomSearch,
+    open_zoom_scenery,
+)
 from semfov.envs.registration import IDS
-from semfov.envs.zoom import ZoomExplore, ZoomPolicyAgent, ZoomSearch, window_of
-from semfov.envs.zoom_scenery import open_zoom_scenery
+from semfov.envs.windows import window_of
 from semfov.experiments.zoom_orders import overview
 from semfov.zoom.glances import on_lattice
 from semfov.zoom.lattice import Lattice
@@ -72,11 +78,11 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
         while not over:
             _, reward, terminated, truncated, info = env.step(agent())
             over = terminated or truncated
-        seen = [glance.window for glance in env.seen]
-        steps = look_for(zoom_scenery.glances(0), zoom_scenery.run.evidence, target, confirm=2.0)
+        seen = [glance.window for glance in env.gazes.looks]
+        steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target, confirm=2.0)
         assert seen == [glance.window for (glance, *_), _ in zip(steps, seen, strict=False)]
-        assert terminated == zoom_scenery.found(env.seen, 0, target)
-        assert not zoom_scenery.found(env.seen[:-1], 0, target)
+        assert terminated == zoom_scenery.found(env.gazes.looks, 0, target)
+        assert not zoom_scenery.found(env.gazes.looks[:-1], 0, target)
         assert reward == pytest.approx(terminated - 0.05)
         assert info["passes"] == len(seen)
         lengths.add(len(seen))
@@ -93,10 +99,10 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
     while not truncated:
         _, reward, _, truncated, info = env.step(agent())
         total += reward
-    assert len(env.seen) == info["passes"] == 6
-    steps = find_everything(zoom_scenery.glances(0), zoom_scenery.run.evidence)
+    assert len(env.gazes.looks) == info["passes"] == 6
+    steps = find_everything(zoom_scenery.glances(0), zoom_scenery.evidence)
     expected = [glance.window for (glance, _), _ in zip(steps, range(6), strict=False)]
-    assert [glance.window for glance in env.seen] == expected
+    assert [glance.window for glance in env.gazes.looks] == expected
     assert total == pytest.approx(10 * (info["result"] - before) - 0.5 * 5)
     assert info["result"] > before
 
@@ -106,7 +112,7 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
 def test_observations_and_infos_follow_the_windows(zoom_scenery):
     env = ZoomExplore(zoom_scenery, **EVERYTHING)
     observation, info = env.reset(seed=0)
-    lattice = env.glances.lattice
+    lattice = env.gazes.glances.lattice
     assert lattice.levels >= 3
     assert info["action_mask"].sum() == len(lattice) - 1
     closest = np.array([0.0, 0.0, 1.0], np.float32)
@@ -146,7 +152,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
         while not over:
             _, _, terminated, truncated, _ = env.step(env.action_space.sample())
             over = terminated or truncated
-        shown = [float(glance.show[env.target - 1]) for glance in env.seen]
+        shown = [float(glance.show[env.gazes.episodes[0].target - 1]) for glance in env.gazes.looks]
         assert max(shown[:-1], default=0) < 0.3
         assert terminated == (shown[-1] >= 0.3)
     explore = ZoomExplore(scenery)
@@ -175,6 +181,6 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
     def refuse(*given, **options):
         raise AssertionError("the detector was called")
 
-    monkeypatch.setattr(again.run.eye, "glance", refuse)
+    monkeypatch.setattr(again.eye, "glance", refuse)
     kept = again.glances(0).see([overview(again.glances(0))])[0]
-    assert torch.equal(kept.show, env.seen[0].show)
+    assert torch.equal(kept.show, env.gazes.looks[0].show)

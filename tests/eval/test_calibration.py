@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 
-from eval.calibration import CalibrationConfig, main
+from eval.calibration import main
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.experiments.config import DetectorConfig, SensorConfig
 from semfov.experiments.setup import make_eye
@@ -77,24 +77,6 @@ def test_sums_in_the_file_add_up_to_the_figures(finished):
             assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2
 
 
-@pytest.mark.weights
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_finished_scenes_are_not_evaluated_again(finished, arguments, tmp_path, workers):
-    """The number of workers does not change the results; a damaged part is computed again."""
-    threads = torch.get_num_threads()
-    assert main([*arguments, "--workers", workers, "--out", str(tmp_path)]) == 0
-    for name in FILES:
-        assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
-    first, second = sorted(tmp_path.glob("parts/*/*.json"))
-    kept = first.stat().st_mtime_ns
-    second.write_text(second.read_text()[:-40])
-    assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
-    torch.set_num_threads(threads)
-    assert first.stat().st_mtime_ns == kept
-    for name in FILES:
-        assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
-
-
 @pytest.mark.slow
 @pytest.mark.weights
 def test_scores_can_be_evaluated_without_beliefs(arguments, tmp_path, capsys):
@@ -102,14 +84,3 @@ def test_scores_can_be_evaluated_without_beliefs(arguments, tmp_path, capsys):
     assert "classwise ECE" in capsys.readouterr().out
     assert not list(tmp_path.glob("beliefs*"))
     assert not (tmp_path / "parts").exists()
-
-
-def test_help_and_defaults(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--help"])
-    assert stopped.value.code == 0
-    printed = capsys.readouterr().out
-    assert "--target_model" in printed
-    assert "how well the belief's probabilities agree with which cells hold the target" in printed.replace("\n", " ")
-    assert CalibrationConfig().beliefs
-    assert CalibrationConfig().grid == (10, 10)

@@ -5,18 +5,17 @@ import json
 import pytest
 import torch
 
-from eval.decide import DecideConfig, main, mean, search_and_decide, share, summary, utility
+from eval.decide import main, mean, share, summary
 from semfov.belief import TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
-from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.experiments.config import DetectorConfig, SensorConfig
 from semfov.experiments.setup import make_eye
 from semfov.metrics.presence import area_under_roc, hits_at
 
 POLICIES = [
     "target-evidence",
     "random gaze",
-    "price 0.05",
     "published belief",
     "published belief, a detection at the gaze",
 ]
@@ -42,7 +41,7 @@ def arguments(tmp_path_factory):
     return [
         "--data.limit", "2", "--data.max_target_area", "0.5", "--belief.columns", "4", "--belief.rows", "3",
         "--belief.target_model", str(folder / "model.safetensors"), "--protocol.shifts", "5",
-        "--cache", str(folder / "cache"), "--prices", "[0.05]",
+        "--cache", str(folder / "cache"),
     ]  # fmt: skip
 
 
@@ -62,65 +61,25 @@ def records_in(out):
 @pytest.mark.weights
 def test_run_writes_table_and_records(finished):
     records = records_in(finished)
-    assert len(records) == 20
+    assert len(records) == 16
     for record in records:
         assert record["policy"] in POLICIES
         assert record["outcome"] in OUTCOMES
         assert 1 <= record["looks"] <= 6
         assert 0 < record["probability"] < 1
-    assert [record["present"] for record in records] == 2 * [*[True] * 5, *[False] * 5]
+    assert [record["present"] for record in records] == 2 * [*[True] * 4, *[False] * 4]
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
     places, lands = [*POLICIES, "one sharp look"], POLICIES
-    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *places, *lands, "price of a look", "0.05"]
+    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *places, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
     assert "4 searches" in text
     assert "2 of them for a present class" in text
-    for row in rows[:5]:
+    for row in rows[:4]:
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])
         there = torch.tensor([record["present"] for record in group])
         assert row[1] == f"{area_under_roc(score, there):.3f}"
-
-
-@pytest.mark.weights
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, workers):
-    """A damaged part is computed again, and the number of workers does not change the results."""
-    out = tmp_path / "out"
-    threads = torch.get_num_threads()
-    assert main([*arguments, "--workers", workers, "--out", str(out)]) == 0
-    assert records_in(out) == records_in(finished)
-    first, second = sorted(out.glob("parts/*/*.json"))
-    kept = first.stat().st_mtime_ns
-    second.write_text(second.read_text()[:-40])
-    (out / "episodes.jsonl").unlink()
-    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
-    torch.set_num_threads(threads)
-    assert first.stat().st_mtime_ns == kept
-    for name in ("episodes.jsonl", "decisions.md"):
-        assert (out / name).read_bytes() == (finished / name).read_bytes()
-    part = json.loads(second.read_text())
-    assert part["records"] == records_in(finished)[10:]
-
-
-@pytest.mark.slow
-@pytest.mark.weights
-def test_scenes_without_a_searchable_class_are_reported(arguments, tmp_path, capsys):
-    assert main([*arguments, "--data.max_target_area", "1e-9", "--workers", "1", "--out", str(tmp_path)]) == 1
-    assert "no scene has a class that may be searched for; raise data.max_target_area" in capsys.readouterr().err
-
-
-def test_help_and_defaults(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--help"])
-    assert stopped.value.code == 0
-    printed = capsys.readouterr().out
-    assert "--belief.target_model" in printed
-    assert "Decide whether a target is present, where, and how surely" in printed
-    assert DecideConfig().data == DataConfig()
-    assert (DecideConfig().belief, DecideConfig().protocol) == (BeliefConfig(), ProtocolConfig())
-    assert callable(search_and_decide)
 
 
 def record(policy, present, outcome, probability, looks, **more):
@@ -163,10 +122,10 @@ def test_table_matches_hand_calculations():
     }
     first = [{**each, "sharp_place": fits.get(number)} for number, each in enumerate(first)]
     second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
-    third = [{**each, "policy": "price 0.1"} for each in first]
-    text = summary([*first, *second, *third], "sensed", [])
+    text = summary([*first, *second], "sensed")
+    assert "Closer looks" not in text
     assert "6 searches (sensed), 4 of them for a present class." in text
-    area, other, _, sharp, tiled, a, b, _, look, landed, nowhere, _ = rows_of(text)
+    area, other, sharp, tiled, a, b, look, landed, nowhere = rows_of(text)
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
@@ -185,28 +144,13 @@ def test_table_matches_hand_calculations():
     assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 
 
-def test_utility_of_searches_matches_hand_calculations():
-    """A right decision adds 1, an undecided one 0, and every look costs its price."""
-    records = [
-        record("target-evidence", True, "found", 0.9, 3, right_place=True),
-        record("target-evidence", True, "undecided", 0.6, 5),
-        record("target-evidence", False, "found", 0.9, 2, right_place=False),
-        record("target-evidence", False, "absent", 0.1, 4),
-    ]
-    by_price = [{**each, "policy": "price 0.1", "looks": 1} for each in records]
-    assert utility(records, 0.1) == pytest.approx((2 - 0.1 * 14) / 4)
-    text = summary([*records, *by_price], "sensed", [0.1])
-    assert rows_of(text)[-1] == ["0.1", "0.1500", "0.4000"]
-    assert "Closer looks" not in text
-
-
 def test_the_table_counts_closer_looks():
     agent = [
         record("target-evidence", present, "found", 0.9, 4, right_place=present, closer=2 - present)
         for present in (1, 0)
     ]
     alone = [{**each, "policy": "target-evidence, no closer looks", "looks": 2, "closer": 0} for each in agent]
-    text = summary([*agent, *alone], "sensed", [])
+    text = summary([*agent, *alone], "sensed")
     assert "Closer looks count as looks; target-evidence makes 1.50 of them in a search." in text
 
 

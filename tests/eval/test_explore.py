@@ -3,10 +3,7 @@
 import csv
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -29,9 +26,6 @@ from semfov.gaze.policies import POLICIES
 from semfov.gaze.saliency import VOCUS2
 
 pytestmark = pytest.mark.weights
-
-RECORDS = ("episodes.jsonl", "summary.csv")
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -56,10 +50,6 @@ def finished(small):
     explore(small)
     torch.set_num_threads(threads)
     return small
-
-
-def records_of(config: ExploreConfig) -> list[bytes]:
-    return [(config.out / name).read_bytes() for name in RECORDS]
 
 
 def count_right_by_loop(run: ExploreRun, record: dict) -> tuple[list[int], list[int], list[int], int]:
@@ -130,17 +120,6 @@ def test_run_writes_records_tables_and_figures(finished):
     assert "kl-calibrated" in (finished.out / "summary.md").read_text()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"store": False}, {"protocol": ProtocolConfig(starts=2, shifts=4, batch=1)}],
-    ids=["without the stores", "small batches"],
-)
-def test_records_do_not_depend_on_the_stores_or_the_batch_size(finished, change, tmp_path):
-    again = replace(finished, out=tmp_path / "out", **change)
-    explore(again)
-    assert records_of(again) == records_of(finished)
-
-
 def test_saliency_is_computed_from_the_foveated_image(finished):
     run = ExploreRun(finished)
     image, grid = run.scenes[0].image, run.grid(0)
@@ -190,30 +169,6 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     assert key() == run.saliency_stores["vocus2"].key
     # The whole photograph looks the same to every sensor.
     assert key(view="picture", sensor=other) == key(view="picture")
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
-    call = [
-        sys.executable, "-m", "eval.explore", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
-        "--protocol.starts", "2", "--protocol.shifts", "4", "--policies", json.dumps(list(finished.policies)),
-        "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"), "--workers", "1",
-    ]  # fmt: skip
-    kill_when(call, lambda: list(tmp_path.glob("out/parts/*/*.json")), cwd=ROOT)
-    assert not (tmp_path / "out/summary.csv").exists()
-    subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
-    assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
-
-
-def test_wrong_policies_are_reported_in_one_line(capsys, tmp_path):
-    assert main(["--policies", '["kl-row"]', "--out", str(tmp_path)]) == 1
-    assert "did you mean 'kl-raw'" in capsys.readouterr().err
-    assert main(["--policies", '["random"]', "--out", str(tmp_path)]) == 1
-    assert "random-raw" in capsys.readouterr().err
-    assert main(["--policies", "[{policy: kl, tempering: 0}]", "--out", str(tmp_path)]) == 1
-    expected = "error: policies[0].tempering: expected a number above 0, up to 1,000,000,000, got 0.0\n"
-    assert capsys.readouterr().err == expected
 
 
 def test_help_names_every_preset(capsys):

@@ -104,30 +104,6 @@ def test_figures_come_from_the_held_out_half(finished):
     assert {path.name for path in finished.glob("scanpaths_*.png")} == {"scanpaths_1.png", "scanpaths_3.png"}
 
 
-TABLES = ("summary.csv", "pictures.csv", "weights.csv", "sequences.csv")
-
-
-@pytest.mark.weights
-def test_a_second_run_reuses_finished_parts(pictures, finished):
-    before, threads = [(finished / name).read_bytes() for name in TABLES], torch.get_num_threads()
-    part = next(finished.rglob("parts/**/*.json"))
-    kept = part.stat().st_mtime_ns
-    assert main(viewing(pictures, "viewing")) == 0
-    torch.set_num_threads(threads)
-    assert part.stat().st_mtime_ns == kept
-    assert [(finished / name).read_bytes() for name in TABLES] == before
-
-
-@pytest.mark.long
-@pytest.mark.weights
-def test_results_do_not_depend_on_the_store(pictures, finished):
-    threads = torch.get_num_threads()
-    assert main(viewing(pictures, "again", "--store", "false")) == 0
-    torch.set_num_threads(threads)
-    for name in TABLES:
-        assert (pictures / "again" / name).read_text() == (finished / name).read_text()
-
-
 @pytest.mark.slow
 @pytest.mark.weights
 def test_searches_of_people_models_random_draws_and_policies_are_compared(pictures):
@@ -161,8 +137,3 @@ def test_an_unknown_job_is_refused_with_the_names_of_jobs(capsys):
     assert main(["dance"]) == 2
     assert "search or viewing" in capsys.readouterr().err
     assert main(["--help"]) == 0
-
-
-def test_a_missing_file_of_people_is_named(tmp_path, capsys):
-    assert main(["search", "--people", str(tmp_path / "nobody.json"), "--out", str(tmp_path / "out")]) == 1
-    assert "nobody.json" in capsys.readouterr().err

@@ -103,7 +103,7 @@ def test_a_video_is_searched_and_options_for_photographs_are_refused(run, tmp_pa
     code, printed = run(path, "--explore")
     assert "red.avi: exploring" in printed.out
     assert "p(object) up to 0." in printed.out
-    for option in ("--shifts", "--price", "--until", "--report"):
+    for option in ("--shifts", "--until", "--report"):
         code, printed = run(path, "--target", "red", option, 1)
         assert code == 1
         assert f"{option[2:]}: expected none for a video or a camera" in printed.err

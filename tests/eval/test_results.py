@@ -119,7 +119,7 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
         runs[name].out.mkdir(parents=True)
         parts = [f"Some words.\n\n| {number} |\n|---|\n| x |\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
-    for number, kind in enumerate(("presence", "decisions", "landings", "prices")):
+    for number, kind in enumerate(("presence", "decisions", "landings")):
         assert fill(f"@@ decide-tiny {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
     for number, kind in enumerate(("by-looks", "by-distance")):
         assert fill(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"

@@ -2,28 +2,23 @@
 
 import csv
 import json
-import os
 import re
-import subprocess
-import sys
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import asdict
 
 import pytest
 import torch
 import yaml
 
 from eval.search import main, search
+from semfov.detection import Detections
 from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SearchConfig
-from semfov.experiments.looks import see_all
+from semfov.experiments.looks import look_from
 from semfov.experiments.presets import label, presets
 from semfov.experiments.runs import SearchRun
-from semfov.experiments.store import DetectionStore
+from semfov.experiments.store import cell_store
 from semfov.gaze.policies import POLICIES
 
 pytestmark = pytest.mark.weights
-
-RECORDS = ("episodes.jsonl", "summary.csv")
 
 
 @pytest.fixture(scope="session")
@@ -49,10 +44,6 @@ def finished(small):
     search(small)
     torch.set_num_threads(threads)
     return small
-
-
-def records_of(config: SearchConfig) -> list[bytes]:
-    return [(config.out / name).read_bytes() for name in RECORDS]
 
 
 def test_run_writes_records_tables_and_figures(finished):
@@ -89,105 +80,23 @@ def test_run_writes_records_tables_and_figures(finished):
     assert "| non-predictive-raw, tempering 0.25 |" in summary
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"store": False}, {"workers": 2}, {"protocol": ProtocolConfig(starts=3, shifts=6, batch=2)}],
-    ids=["without the store", "two workers", "small batches"],
-)
-def test_records_do_not_depend_on_the_store_the_workers_or_the_batch_size(finished, change, tmp_path):
-    again = replace(finished, out=tmp_path / "out", cache=tmp_path / "cache", **change)
-    search(again)
-    assert records_of(again) == records_of(finished)
-
-
 @pytest.mark.usefixtures("one_thread")
 def test_stored_looks_equal_new_looks_and_damaged_files_are_refused(finished):
     run = SearchRun(finished)
     digest = run.scenes.digest(0)
-    stored = run.store.load(digest)
-    seen = see_all(run.eye, run.scenes[0].image, run.grid(0))
+    stored = Detections.stack([*run.store.load(digest).values()])
+    seen = look_from(run.eye, run.scenes[0].image, run.grid(0).centres)
     for name in ("boxes", "scores", "mask"):
         assert torch.equal(getattr(stored, name), getattr(seen, name))
     path = run.store.path(digest)
     whole = path.read_bytes()
     for damage in (whole[: len(whole) // 2], b"", whole[:-40] + bytes([whole[-40] ^ 1]) + whole[-39:]):
         path.write_bytes(damage)
-        assert run.store.load(digest) is None
+        assert run.store.load(digest) == {}
     path.write_bytes(whole)
-    other = DetectionStore(path.parent.parent, {"another": "eye"}, 4, 3)
+    other = cell_store(path.parent.parent, {"another": "eye"}, 4, 3)
     other.folder = run.store.folder
-    assert other.load(digest) is None
-
-
-def test_damaged_parts_are_computed_again(finished, tmp_path):
-    again = replace(finished, out=tmp_path)
-    search(again)
-    part = next((tmp_path / "parts").glob("*/000001.json"))
-    part.write_text(part.read_text().replace('"repetition": 1', '"repetition": 2', 1))
-    search(again)
-    assert records_of(again) == records_of(finished)
-
-
-def as_mapping(policy: PolicyConfig) -> dict:
-    """A policy as the mapping that a user would write."""
-    return {name: value for name, value in asdict(policy).items() if value is not None}
-
-
-def command(config: SearchConfig, out: Path, cache: Path, *more: str) -> list[str]:
-    policies = [choice if isinstance(choice, str) else as_mapping(choice) for choice in config.policies]
-    return [
-        sys.executable, "-m", "eval.search", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
-        "--protocol.starts", "3", "--protocol.shifts", "6", "--policies", json.dumps(policies),
-        "--out", str(out), "--cache", str(cache), "--workers", "1", "--scanpaths", "0", *more,
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
-    call = command(finished, tmp_path / "out", tmp_path / "cache")
-    root = Path(__file__).parents[2]
-    kill_when(call, lambda: list(tmp_path.glob("out/parts/*/*.json")), cwd=root)
-    assert not (tmp_path / "out/summary.csv").exists()
-    threads = torch.get_num_threads()
-    assert main(call[3:]) == 0
-    torch.set_num_threads(threads)
-    again = replace(finished, out=tmp_path / "out")
-    assert records_of(again) == records_of(finished)
-
-
-@pytest.mark.slow
-def test_torchrun_ranks_share_the_work(finished, tmp_path):
-    call = command(finished, tmp_path / "out", tmp_path / "cache")
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run(
-        [*launch, *call[1:]], cwd=Path(__file__).parents[2], check=True, capture_output=True, env=environment
-    )
-    assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
-
-
-def test_wrong_policies_and_detectors_are_reported_in_one_line(capsys, tmp_path):
-    assert main(["--policies", '["predicitve-raw"]', "--out", str(tmp_path)]) == 1
-    assert "did you mean 'predictive-raw'" in capsys.readouterr().err
-    assert main(["--detector.name", "yolov3-tinny", "--out", str(tmp_path)]) == 1
-    error = capsys.readouterr().err
-    assert "yolov3-tiny" in error
-    assert error.count("\n") == 1
-
-
-def test_unwritable_output_is_named(capsys, tmp_path, small):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    arguments = command(small, blocked / "out", small.cache)[3:]
-    assert main(arguments) == 1
-    assert str(blocked) in capsys.readouterr().err
-
-
-def test_unknown_keys_are_refused(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--sensor.sigmma", "3"])
-    assert stopped.value.code == 2
-    assert "sigmma" in capsys.readouterr().err
+    assert other.load(digest) == {}
 
 
 def test_help_and_print_config(capsys):

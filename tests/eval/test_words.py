@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from eval.words import main
 from semfov.belief import ContextPrior
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import InputError
@@ -91,20 +90,7 @@ def test_table_lists_searches_that_miss_at_the_first_look_separately(records, co
     assert "misses the target: none." in "\n".join(told(records, arms, replace(config, missed=0.0)))
 
 
-@pytest.mark.slow
-def test_repeating_the_command_reuses_its_results(records, config):
-    written = (config.out / "episodes.jsonl").read_bytes()
-    words(config)
-    assert (config.out / "episodes.jsonl").read_bytes() == written
-    text = (config.out / "words.md").read_text()
-    assert "| noise, permuted |" in text
-    assert "yolov3-tiny" in text
-
-
-def test_invalid_settings_are_refused(config, folder, capsys):
-    assert main(["--context", "none", "--out", str(folder / "x")]) == 1
-    assert "context" in capsys.readouterr().err
-    assert main(["--tables", f"[{folder / 'nothing.safetensors'}]", "--out", str(folder / "x")]) == 1
+def test_tables_need_different_names(config, folder):
     twice = (folder / "noise.safetensors", folder / "noise.safetensors")
     with pytest.raises(InputError, match="different names"):
         words(replace(config, tables=twice, out=folder / "y"))

@@ -154,9 +154,10 @@ class TestExpectedGain(GraphTester):
 
 
 class PolicyTester(AcquisitionTester):
-    """Values that a policy's acquisition function gives for a belief."""
+    """Values that a policy's acquisition function gives for a belief; that function has the other tests."""
 
-    test_compile = test_export = None  # tested with the acquisition function
+    test_shapes = test_no_rows = test_dtypes = test_autocast = test_gradcheck = test_vmap = None
+    test_compile = test_export = None
 
     @staticmethod
     def call(module, beta, closest):
@@ -174,8 +175,6 @@ class TestNonPredictive(PolicyTester):
 
 
 class TestPredictive(PolicyTester):
-    autocast = 0.05
-
     def make(self):
         return policies.Predictive(model())
 
@@ -191,8 +190,6 @@ class TestFovealHits(PolicyTester):
 
 
 class TestInformationOnPlace(PolicyTester):
-    autocast = 0.05
-
     def make(self):
         return policies.InformationOnPlace(model())
 
@@ -221,43 +218,37 @@ class TestObjects(PolicyTester):
         return policies.Objects()
 
 
-class ExplorerTester(PolicyTester):
-    """For policies whose function subtracts nearly equal values."""
-
-    autocast = 0.1
-
-
-class TestKL(ExplorerTester):
+class TestKL(PolicyTester):
     def make(self):
         return policies.KL(model())
 
 
-class TestSurprise(ExplorerTester):
+class TestSurprise(PolicyTester):
     def make(self):
         return policies.Surprise(model())
 
 
-class TestNegentropy(ExplorerTester):
+class TestNegentropy(PolicyTester):
     def make(self):
         return policies.Negentropy(model())
 
 
-class TestPeaks(ExplorerTester):
+class TestPeaks(PolicyTester):
     def make(self):
         return policies.Peaks(model())
 
 
-class TestConfidenceBound(ExplorerTester):
+class TestConfidenceBound(PolicyTester):
     def make(self):
         return policies.ConfidenceBound(model())
 
 
-class TestImprovement(ExplorerTester):
+class TestImprovement(PolicyTester):
     def make(self):
         return policies.Improvement(model())
 
 
-class TestAccuracy(ExplorerTester):
+class TestAccuracy(PolicyTester):
     def make(self):
         return policies.Accuracy(model().requires_grad_(False))
 

@@ -19,7 +19,8 @@ from semfov.gaze.policies import Means, named_policy
 
 LEVELS = 8
 SHAPES = {"wide": (4, 3, (640, 480)), "tall": (2, 5, (300, 500)), "row": (6, 1, (60, 10))}
-CASES = [(shape, components, seed) for shape in SHAPES for components in (5, 81) for seed in (0, 1, 2)]
+# All seeds with few components, one with many.
+CASES = [(shape, components, seed) for shape in SHAPES for components, seed in ((5, 0), (5, 1), (5, 2), (81, 0))]
 
 
 def kaplan(beta, likelihood):

@@ -281,7 +281,7 @@ def test_invalid_targets_are_refused(target, agent, zooming):
 ARGUMENTS = [
     ("shifts", -1), ("shifts", 2.5), ("shifts", None), ("seed", -1), ("seed", 1.5), ("start", 12), ("start", -1),
     ("start", "middle"), ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
-    ("give_up", float("nan")), ("price", -1), ("price", "cheap"),
+    ("give_up", float("nan")),
 ]  # fmt: skip
 
 
@@ -341,7 +341,6 @@ COMMANDS = {
     "--target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
     "--target cup --confirm 50": "confirm: expected a number from 0 to 1, got 50",
     "--target cup --give_up -1": "give_up: expected a number from 0 to 1, got -1",
-    "--target cup --price -1": "price: expected a number from 0",
     "--target cup --start -1": "start: expected a whole number from 0",
     "--target cup --seed -1": "seed: expected a whole number from 0",
     "--target cup --rate -1": "rate: expected a number from 0",

@@ -37,78 +37,8 @@ from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence import FitSearchConfig, choose_thresholds
 from semfov.training.held_out import Difference
 from semfov.training.verification_decisions import Verified
+from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_network, write_photographs
 from train.fit_detector import main
-
-CLASSES = ("red", "green", "blue")
-COLOURS = np.array([[210, 40, 40], [40, 190, 40], [50, 50, 210]], dtype=np.uint8)
-SIDE = 64
-
-
-def write_network(path: Path, bias: float = -4.0) -> Path:
-    """Save a network that scores three colours in 8 × 8 squares of a canvas of 64 × 64 pixels."""
-    from onnx import TensorProto, helper, numpy_helper, save
-
-    squares = SIDE // 8
-    weight = 12 * (1.5 * np.eye(3) - 0.5)[:, :, None, None]
-    y, x = np.mgrid[0:squares, 0:squares].reshape(2, -1) * 8
-    constants = {
-        "weight": weight.astype(np.float32),
-        "bias": np.full(3, bias, dtype=np.float32),
-        "shape": np.array([1, 3, -1]),
-        "corners": np.stack([x, y, x + 8, y + 8], -1)[None].astype(np.float32),
-    }
-    nodes = [
-        helper.make_node("AveragePool", ["images"], ["pooled"], kernel_shape=[8, 8], strides=[8, 8]),
-        helper.make_node("Conv", ["pooled", "weight", "bias"], ["colour"]),
-        helper.make_node("Sigmoid", ["colour"], ["scored"]),
-        helper.make_node("Reshape", ["scored", "shape"], ["rows"]),
-        helper.make_node("Transpose", ["rows"], ["classes"], perm=[0, 2, 1]),
-        helper.make_node("Identity", ["corners"], ["boxes"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "colours",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, SIDE, SIDE])],
-        [
-            helper.make_tensor_value_info("boxes", TensorProto.FLOAT, [1, squares**2, 4]),
-            helper.make_tensor_value_info("classes", TensorProto.FLOAT, [1, squares**2, 3]),
-        ],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(model, {"semfov": json.dumps({"classes": list(CLASSES)})})
-    save(model, str(path))
-    return path
-
-
-def write_photographs(folder: Path, count: int = 20) -> Path:
-    """Save photographs of coloured squares on noise, with boxes and a category that the detector does not know."""
-    draw = np.random.default_rng(0)
-    images, boxes = [], []
-    for number in range(count):
-        pixels = draw.integers(90, 160, (SIDE, SIDE, 3), dtype=np.uint8)
-        for place in draw.permutation(64)[: draw.integers(2, 5)]:
-            kind, x, y = int(draw.integers(0, 3)), 8 * int(place % 8), 8 * int(place // 8)
-            pixels[y : y + 8, x : x + 8] = COLOURS[kind]
-            boxes.append((number, kind + 1, [x, y, 8, 8]))
-        Image.fromarray(pixels).save(folder / f"{number}.png")
-        images.append({"id": number, "file_name": f"{number}.png", "width": SIDE, "height": SIDE})
-    names = (*CLASSES, "sky")
-    categories = [{"id": number + 1, "name": name} for number, name in enumerate(names)]
-    boxes.append((0, 4, [0, 0, 60, 20]))
-    annotations = [
-        {"id": number, "image_id": image, "category_id": kind, "bbox": box}
-        for number, (image, kind, box) in enumerate(boxes)
-    ]
-    path = folder / "instances.json"
-    path.write_text(json.dumps({"images": images, "annotations": annotations, "categories": categories}))
-    return path
-
-
-SMALL = [
-    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "120", "--map_steps", "20", "--fixations", "6",
-    "--sensor.sigma", "60", "--sensor.growth", "1", "--workers", "1",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -416,7 +346,7 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
     assert with_models(DecisionConfig(models=folder, verification="other")).verification == "other"
     given = ["--models", str(folder), "--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
     out = tmp_path / "decide"
-    assert decide([*data(home), *given, "--prices", "[]", "--out", str(out), "--cache", str(home / "cache")]) == 0
+    assert decide([*data(home), *given, "--out", str(out), "--cache", str(home / "cache")]) == 0
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert any(record["closer"] > 0 for record in records if record["policy"] == "target-evidence")
     assert {record["closer"] for record in records if "no closer looks" in record["policy"]} == {0}
@@ -520,13 +450,6 @@ def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_pat
     error = capsys.readouterr().err
     assert "expected some of the detector's 3 classes (red, green, blue" in error
     assert "'other 1'" in error
-
-
-def test_a_call_without_a_detector_or_with_two_is_refused(capsys, tmp_path):
-    assert main(["--out", str(tmp_path)]) == 1
-    assert "model: expected the name or the file of a detector, got none" in capsys.readouterr().err
-    with pytest.raises(InputError, match=r"detector\.name: expected nothing, as model already names the detector"):
-        FitDetectorConfig(model=Path("a.onnx"), detector=DetectorConfig(name="yolov3")).named()
 
 
 def test_unknown_settings_of_the_call_are_named():

@@ -288,12 +288,6 @@ def test_more_training_lowers_the_evaluated_loss(examples):
     assert nll[1] < nll[0] - 0.1
 
 
-@pytest.mark.parametrize("name", ["holdout", "looks"])
-def test_invalid_settings_are_refused(name, capsys, tmp_path):
-    assert main([f"--{name}", "1", "--out", str(tmp_path)]) == 1
-    assert f"{name}: expected a whole number from 2 to" in capsys.readouterr().err
-
-
 SMALL = [
     "--data.limit", "6", "--columns", "4", "--rows", "4", "--looks", "4", "--holdout", "3", "--max_target_area", "0.5",
     "--steps", "30", "--batch", "8",
@@ -330,18 +324,3 @@ def test_training_writes_model_report_and_figures(trained):
         assert cells[3:] == [
             f"{row[name]:.4f}" for name in ("cells_ece", "visited_ece", "presence_area", "presence_ece")
         ]
-
-
-@pytest.mark.weights
-@pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_stored_looks_are_reused_and_the_result_is_the_same(trained, tmp_path, workers):
-    """Files are identical for any number of workers, and no photograph is looked at again."""
-    stored = {path: path.stat().st_mtime_ns for path in (trained / "cache/looks").rglob("*") if path.is_file()}
-    assert len([path for path in stored if path.suffix == ".safetensors"]) >= 6
-    torch.manual_seed(1)  # random numbers drawn elsewhere change nothing
-    assert main([*SMALL, "--workers", workers, "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
-    assert stored == {path: path.stat().st_mtime_ns for path in stored}
-    for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):
-        assert (tmp_path / name).read_bytes() == (trained / "out" / name).read_bytes(), name

@@ -1,9 +1,6 @@
 """`python -m train.fit_verification`: small on the embedded scenes, and its parts against loops and SciPy."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +15,8 @@ from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
-from semfov.experiments.looks import see_all
-from semfov.experiments.photograph_store import PhotographStore
+from semfov.experiments.looks import look_from
+from semfov.experiments.store import cell_store
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.io.storage import read
 from semfov.training.closer_looks import photographs, search
@@ -28,8 +25,6 @@ from semfov.training.verification_fit import SHIPPED, STRENGTH, Examined, examin
 from semfov.training.verification_settings import FitVerificationConfig
 from tests.small import CLASSES, Blobs
 from train.fit_verification import main
-
-ROOT = Path(__file__).parents[2]
 
 
 def examined(count=200, seed=0):
@@ -158,7 +153,7 @@ def opened(detector, store=None):
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
     torch.manual_seed(0)
     evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
-    kept = None if store is None else PhotographStore(store, eye.settings(), 4, 3, len(CLASSES))
+    kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
     return photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
 
 
@@ -171,9 +166,9 @@ def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
     found, evidence = seen
     photograph = found[0]
     first = list(search(photograph, photograph.sought[0], Target(evidence), 3))
-    count = len(photograph.seen)
+    count = len(photograph.looks.looks)
     again = list(search(photograph, photograph.sought[0], Target(evidence), 3))
-    assert len(photograph.seen) == count == 3
+    assert len(photograph.looks.looks) == count == 3
     view = photograph.eye.open(photograph.image)
     for one, other in zip(first, again, strict=True):
         assert torch.equal(one.belief.probability(1), other.belief.probability(1))
@@ -192,7 +187,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
 
     def stored(index):
         calls.append(index)
-        return see_all(eye, scenes[index].image, live[index].grid)
+        return look_from(eye, scenes[index].image, live[index].grid.centres)
 
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
     found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
@@ -328,38 +323,23 @@ def test_interrupted_searches_continue_with_the_stored_looks(tmp_path):
 
 def test_stored_looks_are_read_as_they_were_written_or_not_at_all(tmp_path):
     (photograph, *_), _ = opened(Blobs(), tmp_path)
-    centre = photograph.grid.centres[[5]]
-    first, box = photograph.look(5, centre), torch.tensor([3.0, 4.0, 30.1, 40.0])
+    first, box = photograph.look(5), torch.tensor([3.0, 4.0, 30.1, 40.0])
     closer = photograph.close_up(box)
     photograph.close()
     (path,) = tmp_path.rglob("*.safetensors")
     (again, *_), _ = opened(Limited(0), tmp_path)
-    assert torch.equal(again.look(5, centre).scores, first.scores)
+    assert torch.equal(again.look(5).scores, first.scores)
     assert torch.equal(again.close_up(box).boxes, closer.boxes)
     again.close()
     path.write_bytes(path.read_bytes()[:-9])
     counting = Limited()
     (anew, *_), _ = opened(counting, tmp_path)
-    assert torch.equal(anew.look(5, centre).boxes, first.boxes)
+    assert torch.equal(anew.look(5).boxes, first.boxes)
     assert counting.passes == 1
     # Another grid has other looks.
     eye = anew.eye
-    assert PhotographStore(tmp_path, eye.settings(), 4, 3, 3).folder == path.parent
-    assert PhotographStore(tmp_path, eye.settings(), 3, 4, 3).folder != path.parent
-
-
-@pytest.mark.weights
-@pytest.mark.long
-def test_a_killed_fit_resumes_with_the_same_model(tmp_path, kill_when):
-    small = ["--data.limit", "3", "--looks", "2", "--folds", "2", "--data.min_instances", "0"]
-    assert main([*small, "--out", str(tmp_path / "whole"), "--cache", str(tmp_path / "other")]) == 0
-    call = [sys.executable, "-m", "train.fit_verification", *small]
-    call += ["--out", str(tmp_path / "killed"), "--cache", str(tmp_path / "cache")]
-    kill_when(call, lambda: list(tmp_path.glob("cache/searches/*/*.safetensors")), cwd=ROOT)
-    assert not (tmp_path / "killed" / "report.md").exists()
-    subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
-    for name in ("yolov3-tiny.safetensors", "report.md", "judged.json"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert cell_store(tmp_path, eye.settings(), 4, 3, 4).folder == path.parent
+    assert cell_store(tmp_path, eye.settings(), 3, 4, 4).folder != path.parent
 
 
 @pytest.mark.weights
@@ -375,8 +355,3 @@ def test_the_command_fits_a_model_that_the_agent_can_load(tmp_path, capsys):
     report = (tmp_path / "report.md").read_text()
     assert "(chosen)" in report
     assert report in capsys.readouterr().out
-
-
-def test_too_few_photographs_are_refused(tmp_path, capsys):
-    assert main(["--data.limit", "2", "--folds", "5", "--data.min_instances", "0", "--out", str(tmp_path)]) == 1
-    assert "expected at least 5 photographs" in capsys.readouterr().err

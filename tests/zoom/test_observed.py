@@ -49,17 +49,17 @@ def test_every_nth_mosaic_is_made_of_held_out_photographs():
 
 
 @pytest.fixture
-def sampler(detector, monkeypatch):
+def sampler(detector, monkeypatch, tmp_path):
     detector.classes = ("person", "cat", "cup")
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: detector)
     monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
     settings = MosaicSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
-    return settings.sampler()
+    return settings.sampler(tmp_path)
 
 
 @pytest.mark.slow
-def test_samples_are_detections_with_octaves(sampler, tmp_path):
+def test_samples_are_detections_with_octaves(sampler):
     samples = sampler.sample(0)
     x, y, magnification = samples.fixations[samples.look].unbind(-1)
     torch.testing.assert_close(samples.distance, -magnification.log2().clamp(max=0))
@@ -70,8 +70,8 @@ def test_samples_are_detections_with_octaves(sampler, tmp_path):
     for box, label in zip(samples.boxes, samples.labels, strict=True):
         overlaps = box_iou(box[None], annotation.boxes)[0] >= 0.5
         assert int(label) in {0, *annotation.labels[overlaps].tolist()}
-    sampler.save(tmp_path, 0, samples)
-    assert torch.equal(sampler.load(tmp_path, 0).boxes, samples.boxes)
+    sampler.save(0, samples)
+    assert torch.equal(sampler.load(0).boxes, samples.boxes)
 
 
 @pytest.mark.slow

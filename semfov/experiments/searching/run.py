@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import torch
 
@@ -23,7 +23,7 @@ from semfov.gaze.policies import Task
 class PeopleSearchRun(Run):
     """Searches for the targets of people, one screen after the other."""
 
-    task: ClassVar[Task] = "search"
+    task: Task = "search"
     config: PeopleSearchConfig  # type: ignore[assignment]
 
     def __init__(self, config: PeopleSearchConfig) -> None:

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -48,7 +48,7 @@ def read_people(path: Path) -> list[Fixations]:
 class ViewingRun(Run):
     """Free viewing, one picture after the other: computes the maps of policies along people's scanpaths."""
 
-    task: ClassVar[Task] = "exploration"
+    task: Task = "exploration"
     config: ViewingConfig  # type: ignore[assignment]
 
     def __init__(self, config: ViewingConfig) -> None:

@@ -1,0 +1,275 @@
+"""Gazes that move from cell to cell: searches and explorations with a fovea."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.belief.belief import Belief
+from semfov.belief.observers import Observer, Semantic
+from semfov.detection.detections import Detections
+from semfov.envs.gazes import Gazes
+from semfov.envs.looks import SceneLooks
+from semfov.envs.scenery import Scenery
+from semfov.episode import Memory, Sight, Step, attend
+from semfov.errors import check, check_whole
+from semfov.experiments.search_protocol import Episode
+from semfov.metrics.exploration import count_right
+from semfov.paths import Scanpath, Stimulus, trace
+from semfov.viz.animation import render
+from semfov.viz.fixation import plot_fixation
+
+_FIRST = torch.tensor([0])
+
+
+class CellGazes(Gazes):
+    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own.
+
+    Args:
+        scenery: scenes, looks and belief.
+        count: B, number of episodes at a time.
+        together: whether learned beliefs of all episodes are computed at once.
+        options: the other arguments of `Gazes`.
+
+    Attributes:
+        memory: beliefs and visited cells.
+        cell: `(B,)`, fixated cells.
+    """
+
+    coordinates = 2
+    scenery: Scenery
+    memory: Memory
+
+    def __init__(self, scenery: Scenery, count: int = 1, *, together: bool = False, **options: Any) -> None:
+        super().__init__(scenery, count, **options)
+        self.observer: Observer = scenery.together() if together else scenery.observer
+        self.looks = SceneLooks(scenery.open, self.observer, count)
+        self.cell = torch.zeros(count, dtype=torch.int64)
+        self.size = torch.zeros(count, 2)
+        self._steps: list[Step] = []
+        self._stimulus: Stimulus | None = None
+
+    @property
+    def action_space(self) -> spaces.Discrete:
+        """The cells."""
+        return spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
+
+    @property
+    def belief_space(self) -> spaces.Box:
+        """Space of the probabilities of the target or of all classes, and of two more planes."""
+        return spaces.Box(0, 1, (self._classes() + 2, *self.scenery.shape), np.float32)
+
+    @property
+    def belief(self) -> Belief:
+        """Belief after the last look of each episode."""
+        return self.memory.belief
+
+    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
+        """The episode that the options of a reset ask for, or one at random."""
+        unknown, scenery = options.keys() - {"episode", "scene"}, self.scenery
+        check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
+        if "episode" in options:
+            return options["episode"]
+        if "scene" not in options:
+            return scenery.draw(random)
+        scene = options["scene"]
+        check_whole(scene, "scene", 0, scenery.count - 1)
+        found = scenery.episodes(int(scene))
+        check(len(found) > 0, "scene", "a scene with objects to look for", scene)
+        return found[random.integers(len(found))]
+
+    def action(self, given: Any) -> Tensor:
+        """Check the cell of a single episode; returns a batch of one."""
+        check_whole(given, "action", 0, int(self.action_space.n) - 1)
+        return torch.tensor([int(given)])
+
+    @torch.inference_mode()
+    def planes(self, rows: Tensor) -> NDArray[np.float32]:
+        """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
+        visited = self.memory.visited[rows]
+        here = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
+        more = torch.stack([visited, here], 1).reshape(len(rows), 2, *self.scenery.shape)
+        found: NDArray[np.float32] = torch.cat([self._map(rows).float().clamp(0, 1), more.float()], 1).numpy()
+        return found
+
+    def places(self, rows: Tensor) -> Tensor:
+        """Fixated points `(n, 2)` as fractions of width and height."""
+        lines, columns = self.scenery.shape
+        cell = self.cell[rows]
+        return torch.stack([(cell % columns + 0.5) / columns, (cell // columns + 0.5) / lines], -1)
+
+    def points(self, rows: Tensor) -> Tensor:
+        """Fixated points `(n, 2)` in pixels of the scenes."""
+        return self.places(rows) * self.size[rows] - 0.5
+
+    def mask(self, rows: Tensor) -> NDArray[np.bool_]:
+        """Cells that were not fixated, `(n, X·Y)`."""
+        free: NDArray[np.bool_] = (~self.memory.visited[rows]).numpy()
+        return free
+
+    def detections(self, rows: Tensor) -> Detections:
+        """Detections of the present looks, a batch of n."""
+        return self.looks.see(self.observer, rows, self.cell[rows], self.points(rows)).detections()
+
+    def draw(self) -> NDArray[np.uint8]:
+        """Picture of the last look of the first episode: the scanpath, the foveated view, and the belief."""
+        scenery, episode, boxes = self.scenery, self.episodes[0], None
+        if self._stimulus is None:
+            self._stimulus = Stimulus.of(scenery.eye, scenery.image(episode.scene))
+        if isinstance(episode, Episode):
+            objects = scenery.annotation(episode.scene)
+            boxes = objects.boxes[objects.labels == episode.target]
+        path = self.scanpath()
+        view = self._stimulus.views(path.fixations[-1:])[0]
+        return render([plot_fixation(path, -1, self._stimulus.image, view, boxes=boxes)])[0]
+
+    def scanpath(self) -> Scanpath:
+        """The looks of the first episode, which are kept for pictures."""
+        episode = self.episodes[0]
+        grid, classes = self.scenery.grid(episode.scene), self.scenery.classes
+        searching = isinstance(episode, Episode)
+        # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
+        beside: Observer | None = Semantic(len(classes)) if searching else None
+        with torch.inference_mode():
+            return trace(self._steps, grid, classes, episode.cue if searching else None, beside)
+
+    @torch.inference_mode()
+    def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+        scenes = [episode.scene for episode in episodes]
+        self.targets[rows] = torch.tensor([episode.cue if isinstance(episode, Episode) else 0 for episode in episodes])
+        searching = isinstance(episodes[0], Episode)
+        self.looks.enter(rows, scenes, self.targets[rows] if searching else None)
+        self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
+        self.cell[rows] = torch.tensor([episode.start for episode in episodes])
+        fresh = self._attend(Memory.empty(self.looks, self.observer, len(rows)), rows)
+        self.memory = self.memory.put(rows, fresh) if self._begun else fresh
+        self._prepare(rows, episodes)
+        self._steps, self._stimulus = [], None
+        self._keep()
+
+    @torch.inference_mode()
+    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        fresh = ~self.memory.visited[rows, actions]
+        self.cell[rows] = actions
+        new = rows[fresh]
+        if len(new) == len(self.episodes):
+            self.memory = self._attend(self.memory, new)
+        elif len(new):
+            self.memory = self.memory.put(new, self._attend(self.memory[new], new))
+        self._keep()
+        return self._judge(rows)
+
+    def _attend(self, memory: Memory, rows: Tensor) -> Memory:
+        return attend(self.looks, self.observer, memory, rows, self.cell[rows], self.points(rows))[1]
+
+    def _keep(self) -> None:
+        """Keep the last look of the first episode."""
+        if not self.pictures:
+            return
+        found, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
+        sight = Sight(None, lambda: found, {})  # type: ignore[arg-type]
+        visited = self.memory.visited
+        values = torch.zeros(visited.shape)
+        step = Step(len(self._steps), _FIRST, cell, point, sight, self.belief, visited, values, cell, point, {})
+        self._steps.append(step)
+
+    def _view(self, row: int) -> Tensor:
+        view = self.scenery.view(self.episodes[row].scene)
+        left, top = view.placement.offset
+        wide, high = (round(n * s) for n, s in zip(view.placement.size, view.placement.scale, strict=True))
+        point = self.points(torch.tensor([row]))
+        return self.scenery.eye.foveated(view, point)[..., top : top + high, left : left + wide]
+
+    def _all_or(self, rows: Tensor) -> Belief:
+        """The belief of some rows, without a copy where these are all."""
+        return self.belief if len(rows) == len(self.episodes) else self.belief[rows]
+
+    @abstractmethod
+    def _classes(self) -> int:
+        """Number of probabilities in each cell."""
+
+    @abstractmethod
+    def _map(self, rows: Tensor) -> Tensor:
+        """The belief as planes `(n, C, Y, X)`, in [0, 1]."""
+
+    @abstractmethod
+    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+        """Prepare the rows for new episodes, whose first look was made."""
+
+    @abstractmethod
+    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Gain of the last look, and whether the task is done, each `(n,)`."""
+
+
+class Searches(CellGazes):
+    """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
+
+    def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
+        super().__init__(scenery, count, **options)
+        self._goal = torch.zeros(count, scenery.shape[0] * scenery.shape[1], dtype=torch.bool)
+
+    def result(self, rows: Tensor) -> Tensor:
+        """1 where the gaze is on the target."""
+        return self._goal[rows, self.cell[rows]].float()
+
+    def _classes(self) -> int:
+        return 1
+
+    def _map(self, rows: Tensor) -> Tensor:
+        """Probability of the target in each cell if no fixated cell holds it; 0 in fixated cells."""
+        chance = self._all_or(rows).chance(self.targets[rows]).masked_fill(self.memory.visited[rows], 0.0)
+        return chance.reshape(-1, 1, *self.scenery.shape)
+
+    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+        goal = torch.zeros(len(rows), self._goal.shape[1], dtype=torch.bool)
+        for number, episode in enumerate(episodes):
+            goal[number, list(episode.goal)] = True
+        self._goal[rows] = goal
+
+    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        found = self.result(rows)
+        return found, found > 0
+
+
+class Explorations(CellGazes):
+    """Explorations: an episode is over when every cell was fixated."""
+
+    def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
+        super().__init__(scenery, count, **options)
+        self._answers = torch.zeros(count, scenery.shape[0] * scenery.shape[1], len(scenery.classes), dtype=torch.bool)
+        self._success = torch.zeros(count)
+
+    def result(self, rows: Tensor) -> Tensor:
+        """Fraction of the cells with objects whose most probable class is that of one of these objects."""
+        return self._success[rows]
+
+    def _classes(self) -> int:
+        return len(self.scenery.classes)
+
+    def _map(self, rows: Tensor) -> Tensor:
+        """Probability of every class in each cell, background first."""
+        return self._all_or(rows).class_probabilities().mT.reshape(len(rows), -1, *self.scenery.shape)
+
+    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+        self._answers[rows] = torch.stack([self.scenery.answers(episode.scene) for episode in episodes])
+        self._success[rows] = self._rate(rows)
+
+    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        before = self._success[rows]
+        self._success[rows] = self._rate(rows)
+        return self._success[rows] - before, self.memory.visited[rows].all(-1)
+
+    def _rate(self, rows: Tensor) -> Tensor:
+        answers = self._answers[rows]
+        return count_right(self._all_or(rows).class_probabilities(), answers) / answers.any(-1).sum(-1)
+
+
+GAZES: dict[str, type[CellGazes]] = {"search": Searches, "exploration": Explorations}
+"""Kind of gazes for each task."""

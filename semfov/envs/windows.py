@@ -1,0 +1,241 @@
+"""Gazes that move from window to window of a large picture: a choice of where to look and how closely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
+
+from semfov.detection.detections import Detections
+from semfov.envs.gazes import Gazes, Score
+from semfov.envs.zoom_scenery import ZoomScenery
+from semfov.errors import check, check_whole
+from semfov.experiments.zoom_orders import overview
+from semfov.viz.animation import render
+from semfov.viz.zoom import plot_zoom_path
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.glances import Glance, Window, on_lattice
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge
+from semfov.zoom.path import ZoomPath
+
+_PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
+
+
+class WindowEpisode(NamedTuple):
+    """A search in a large picture, or its exploration.
+
+    Attributes:
+        scene: index of the picture.
+        target: class to search for, 1..K; 0 in an exploration.
+
+    >>> WindowEpisode(scene=3, target=16).target
+    16
+    """
+
+    scene: int
+    target: int
+
+
+class WindowGaze(Gazes):
+    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief.
+
+    Args:
+        scenery: pictures and looks.
+        task: `search` or `exploration`.
+        grid: number of columns and rows of the belief's planes.
+        options: the other arguments of `Gazes`.
+
+    Attributes:
+        looks: the looks so far, each window once.
+        done: windows that were looked at.
+        window: window of the last look.
+        glances: source of the looks at the picture.
+        belief: belief after the last look.
+    """
+
+    coordinates = 3
+    scenery: ZoomScenery
+
+    def __init__(self, scenery: ZoomScenery, task: str, *, grid: tuple[int, int] = (10, 10), **options: Any) -> None:
+        self.task, self.shape = task, (grid[1], grid[0])
+        super().__init__(scenery, **options)
+        self.looks: list[Glance] = []
+        self.done: set[Window] = set()
+
+    @property
+    def action_space(self) -> spaces.Box:
+        """Place and magnification, each from 0 to 1."""
+        return spaces.Box(0, 1, (3,), np.float32)
+
+    @property
+    def belief_space(self) -> spaces.Box:
+        """Space of two planes over the picture."""
+        return spaces.Box(0, 1, (2, *self.shape), np.float32)
+
+    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> WindowEpisode:
+        """The episode that the options of a reset ask for, or one at random."""
+        unknown = [name for name in options if name not in ("scene", "target")]
+        check(not unknown, "options", "scene or target", ", ".join(unknown))
+        scene, target = options.get("scene"), options.get("target")
+        if scene is None or target is None:
+            return WindowEpisode(*self.scenery.draw(random, self.task, scene))
+        check_whole(scene, "scene", 0, len(self.scenery.pictures) - 1)
+        allowed = self.scenery.episodes(int(scene)) if self.task == "search" else [0]
+        check(int(target) in allowed, "target", f"one of {allowed}", int(target))
+        return WindowEpisode(int(scene), int(target))
+
+    def action(self, given: Any) -> Tensor:
+        """Check an action; returns a batch of one."""
+        action = np.asarray(given, dtype=np.float64)
+        fits = action.shape == (3,) and bool(((action >= 0) & (action <= 1)).all())
+        check(fits, "action", "(x, y, magnification), each from 0 to 1", given)
+        return torch.from_numpy(action)[None]
+
+    def move(self, rows: Tensor, actions: Tensor) -> Score:
+        """Look at another window; the looks are stored at the end of an episode."""
+        score = super().move(rows, actions)
+        if score.terminated or score.truncated:
+            self.glances.save()
+        return score
+
+    def close(self) -> None:
+        """Store the looks of an episode that is not over."""
+        if self.looks:
+            self.glances.save()
+
+    def planes(self, rows: Tensor) -> NDArray[np.float32]:
+        """The probability that closer looks find an object, and how closely each place was looked at."""
+        lattice = self.glances.lattice
+        expected = [self.belief.expected(level) for level in range(1, lattice.levels)]
+        most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
+        # Objects of each place: the mean of its cells times their number.
+        count = adaptive_avg_pool2d(most[None], self.shape) * most.numel() / (self.shape[0] * self.shape[1])
+        closeness = torch.zeros(1, lattice.rows, lattice.columns)
+        for window in self.done:
+            x1, y1, x2, y2 = window.cells
+            closeness[0, y1:y2, x1:x2] = closeness[0, y1:y2, x1:x2].clamp(min=(window.level + 1) / lattice.levels)
+        near = adaptive_max_pool2d(closeness, self.shape)
+        found: NDArray[np.float32] = torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()
+        return found[None]
+
+    def places(self, rows: Tensor) -> Tensor:
+        """The middle of the window and its magnification, each from 0 to 1."""
+        return torch.from_numpy(action_of(self.glances.lattice, self.window))[None]
+
+    def mask(self, rows: Tensor) -> NDArray[np.bool_]:
+        """Windows of the picture that were not looked at, padded to the largest number of windows of any picture."""
+        lattice = self.glances.lattice
+        free = np.zeros((1, self.scenery.windows), dtype=bool)
+        free[0, : len(lattice)] = True
+        for window in self.done:
+            free[0, lattice.number(window.level, *window.cells[:2])] = False
+        return free
+
+    def result(self, rows: Tensor) -> Tensor:
+        """In a search 1 once the target is found; in an exploration the fraction of objects that are found."""
+        return self._result
+
+    def detections(self, rows: Tensor) -> Detections:
+        """Detections of the last look."""
+        return next(glance for glance in self.looks if glance.window == self.window).detections
+
+    def draw(self) -> NDArray[np.uint8]:
+        """Picture of the windows that were looked at, and of the objects that were found."""
+        episode = self.episodes[0]
+        target = episode.target or None
+        objects, values = merge(self.looks, target), (float("inf"),) * len(self.looks)
+        path = ZoomPath(
+            lattice=self.glances.lattice,
+            classes=self.scenery.classes,
+            target=target,
+            glances=tuple(self.looks),
+            values=values,
+            objects=objects,
+        )
+        image = self.scenery.image(episode.scene)[None]
+        share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
+        size = [max(1, round(n * share)) for n in image.shape[-2:]]
+        return render([plot_zoom_path(path, interpolate(image, size, mode="bilinear", antialias=True)[0])])[0]
+
+    def _enter(self, rows: Tensor, episodes: Sequence[WindowEpisode]) -> None:
+        (episode,) = episodes
+        self.targets[rows] = episode.target
+        self.glances = self.scenery.glances(episode.scene)
+        self.belief = ZoomBelief(self.glances.lattice, self.scenery.evidence, episode.target)
+        self.looks, self.done = [], set()
+        self._see(overview(self.glances))
+        self._result = self._rate()
+
+    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        self._see(window_of(self.glances.lattice, actions[0].numpy()))
+        before, self._result = self._result, self._rate()
+        return self._result - before, (self._result == 1) & (self.task == "search")
+
+    def _see(self, window: Window) -> None:
+        self.window = window
+        if window in self.done:
+            return
+        glance = self.glances.see([window])[0]
+        self.looks.append(glance)
+        self.done.add(window)
+        self.belief.add(glance)
+
+    def _rate(self) -> Tensor:
+        scene, target = self.episodes[0]
+        found = self.scenery.found(self.looks, scene, target) if target else self.scenery.share(self.looks, scene)
+        return torch.tensor([found], dtype=torch.float64)
+
+    def _view(self, row: int) -> Tensor:
+        eye = self.scenery.eye
+        view = eye.open(self.scenery.image(self.episodes[row].scene))
+        return eye.glimpse(view, torch.tensor([self.window.fixation], dtype=torch.float64))[0]
+
+
+def window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
+    """The window of the lattice that is nearest to an action.
+
+    Args:
+        lattice: windows of the picture.
+        action: `(x, y, magnification)`, each from 0 to 1.
+
+    Returns:
+        The window.
+
+    >>> window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
+    (12, 8, 20, 16)
+    """
+    level = round(float(action[2]) * (lattice.levels - 1))
+    places, pitch, window = lattice.places(level), lattice.pitch, lattice.window(level)
+    column, row = (
+        min(
+            max(round((float(action[axis]) * lattice.size[axis] - window[axis] / 2) / pitch[axis]), 0), places[axis] - 1
+        )
+        for axis in (0, 1)
+    )
+    return on_lattice(lattice, (level, column, row))
+
+
+def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
+    """The action that looks at a window.
+
+    Args:
+        lattice: windows of the picture.
+        window: window of the lattice.
+
+    Returns:
+        `(x, y, magnification)`, each from 0 to 1.
+
+    >>> lattice = Lattice.over((2560, 1920), (416, 416))
+    >>> action_of(lattice, on_lattice(lattice, (0, 0, 0))).tolist()
+    [0.5, 0.5, 0.0]
+    """
+    x, y, _ = window.fixation
+    level = window.level / max(lattice.levels - 1, 1)
+    return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)

@@ -1,0 +1,232 @@
+"""The commands of `eval` and `train`: a small run of each, the files it writes, and what it refuses.
+
+The small runs look at photographs of coloured squares with a network that detects them (`tests.colours`). In their
+settings, `HERE` stands for the folder that `write_material` fills.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from semfov import FovealObservationModel
+from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov.belief.target_evidence import Thresholds
+from semfov.data.fixations import Fixations, write_table
+from semfov.experiments.config import DetectorConfig, SensorConfig
+from semfov.experiments.setup import make_eye
+from semfov.zoom import GlimpseEvidence
+from tests.colours import CLASSES, write_network, write_photographs
+
+NETWORK = ("--detector.name", "HERE/colours.onnx")
+PHOTOGRAPHS = ("--data.root", "HERE/photographs", "--data.annotations", "HERE/photographs/instances.json",
+               "--data.min_instances", "0", "--data.limit", "4")  # fmt: skip
+GRID = ("--belief.columns", "3", "--belief.rows", "2")
+TRAINED = ("--columns", "3", "--rows", "2", "--looks", "3", "--holdout", "2", "--steps", "4", "--batch", "2")
+MODEL = "colours.safetensors"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command and what its tests need to know about it.
+
+    Attributes:
+        settings: settings of a small run, beside the folders `out` and `cache` and the number of workers.
+        files: files in `out` that have the same bytes whenever the run is repeated; empty if it is not run here.
+        others: further files in `out`.
+        parts: finished parts of the run, below the folder that holds `out` and `cache`; empty if it keeps none.
+        same: further settings that do not change the files, by name.
+        refused: wrong settings and the message about each.
+        workers: whether the work can be shared by processes.
+    """
+
+    settings: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    parts: str = "out/parts/*/*.json"
+    same: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    refused: tuple[tuple[tuple[str, ...], str], ...] = ()
+    workers: bool = True
+
+
+def write_material(folder: Path) -> None:
+    """Write the network, the photographs, untrained models that fit it, and fixations of people in the photographs."""
+    network = write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs", 8)
+    settings = make_eye(DetectorConfig(str(network)), SensorConfig()).settings()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        thresholds = Thresholds(0.6, 0.3)
+        TargetEvidence(4, 4, components=4, thresholds=thresholds, metadata=settings).save(folder / "target.safetensors")
+        MapEvidence(4, 4, components=4, metadata=settings).save(folder / "map.safetensors")
+        GlimpseEvidence(3, 8).save(folder / "zoom.safetensors")
+        model = FovealObservationModel(0.5 + torch.rand(4, 3, 4), [0.2, 0.5], CLASSES, metadata=settings)
+        model.save(folder / "observation.safetensors")
+        for name in ("counted", "noise"):
+            weights, pairs = {"evidence": (1.0, 1.0), "map": (1.0, 1.0)}, torch.randn(4, 4, 2)
+            prior = ContextPrior(CLASSES, torch.randn(4, 3, 3), pairs, [0.3], weights=weights)
+            prior.save(folder / f"{name}.safetensors")
+    (folder / "people").mkdir()
+    draw, viewed, record = np.random.default_rng(0), [], {}
+    for number in range(4):
+        with Image.open(folder / "photographs" / f"{number}.png") as picture:
+            picture.resize((800, 600)).save(folder / "people" / f"{number}.png")
+        points = draw.uniform(0, 599, (4, 5, 2))
+        viewed += [Fixations(f"{number}.png", str(who), each, (800, 600)) for who, each in enumerate(points)]
+        record[f"{number}.png"] = [
+            {"x": each[:, 0].tolist(), "y": each[:, 1].tolist(), "duration_ms": [200] * 5} for each in points
+        ]
+    write_table(folder / "people.csv", viewed)
+    (folder / "people.json").write_text(json.dumps(record))
+
+
+COMMANDS = {
+    "eval.search": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "4", "--scanpaths", "1",
+                  "--policies", "[random, itti-koch, {policy: non-predictive, tempering: 0.25}]"),
+        files=("episodes.jsonl", "summary.csv"),
+        others=("summary.md", "report.html", "manifest.json", "config.yaml", "cumulative_performance.png"),
+        same={"no store": ("--store", "false"), "small batches": ("--protocol.batch", "2")},
+        refused=(
+            (("--policies", '["predicitve-raw"]'), "did you mean 'predictive-raw'"),
+            (("--detector.name", "yolov3-tinny"), "did you mean 'yolov3-tiny'"),
+        ),
+    ),
+    "eval.explore": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
+                  "--policies", "[random-raw, vocus2-raw]"),
+        files=("episodes.jsonl", "summary.csv"),
+        others=("summary.md", "manifest.json", "config.yaml", "success_rate_all_classes.png"),
+        same={"no store": ("--store", "false"), "small batches": ("--protocol.batch", "1")},
+        refused=(
+            (("--policies", '["kl-row"]'), "did you mean 'kl-raw'"),
+            (("--policies", '["random"]'), "random-raw"),
+            (("--policies", "[{policy: kl, tempering: 0}]"), "policies[0].tempering: expected a number above 0"),
+        ),
+    ),
+    "eval.decide": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.target_model", "HERE/target.safetensors",
+                  "--protocol.shifts", "3"),
+        files=("episodes.jsonl", "decisions.md"),
+        others=("roc.png",),
+        refused=(
+            (("--data.max_target_area", "1e-9", "--data.limit", "1", "--belief.columns", "2", "--belief.rows", "2"),
+             "raise data.max_target_area"),
+        ),
+    ),
+    "eval.calibration": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "1", "--grid", "[3,2]", "--target_area", "0.5",
+                  "--model", "HERE/observation.safetensors",
+                  "--target_model", "HERE/target.safetensors", "--map_model", "HERE/map.safetensors"),
+        files=("beliefs.md", "beliefs.csv", "beliefs.json"),
+        others=("calibration.md", "config.yaml", "reliability.png", "beliefs.png"),
+    ),
+    "eval.words": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
+                  "--policy", "{policy: non-predictive, tempering: 0.25}",
+                  "--counted", "HERE/counted.safetensors", "--tables", "[HERE/noise.safetensors]"),
+        files=("episodes.jsonl", "words.md"),
+        refused=((("--context", "none"), "context"), (("--tables", "[nothing.safetensors]"), "nothing.safetensors")),
+    ),
+    "eval.head": Command(refused=tuple(
+            ((f"--{name}", value), f"{name}: expected")
+            for name, value in (("width", "3"), ("dwell", "0"), ("passes", "0"), ("seconds", "0"))
+        ),
+    ),
+    "eval.zoom": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--mosaics", "2", "--columns", "2", "--rows", "2", "--tile", "64",
+                  "--slice", "64", "--passes", "4", "--model", "HERE/zoom.safetensors"),
+        files=("records.jsonl", "zoom.md"),
+        same={"no store": ("--store", "false")},
+        refused=(
+            (("--passes", "1"), "passes: expected a whole number from 2"),
+            (("--overlap", "1"), "overlap: expected a number from 0 to 0.9"),
+            (("--tile", "0"), "tile: expected a whole number from 16"),
+            (("--seed", "-1"), "seed: expected"),
+            (("--mosaics", "-1"), "mosaics: expected"),
+        ),
+    ),
+    "eval.human viewing": Command(
+        settings=(*NETWORK, *GRID, "--people", "HERE/people.csv", "--data.root", "HERE/people",
+                  "--density.columns", "8", "--density.rows", "6", "--density.blurs", "[0, 1]",
+                  "--policies", "[objects-raw]", "--sequences", "[random, vocus2]"),
+        files=("summary.csv", "pictures.csv", "weights.csv", "sequences.csv"),
+        others=("summary.md", "manifest.json", "nss_by_shift.png"),
+        same={"no store": ("--store", "false")},
+        refused=((("--people", "nobody.csv"), "nobody.csv"),),
+    ),
+    "eval.human search": Command(refused=((("--people", "nobody.json"), "nobody.json"),)),
+    "train.fit_fom": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "4", "--holdout", "2", "--shard", "1", "--method", "newton"),
+        files=(MODEL, "report.md"),
+        others=("manifest.json", "reliability.png"),
+        parts="out/samples/*/*.safetensors",
+        same={"other shards": ("--shard", "3")},
+    ),
+    "train.fit_search": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--max_target_area", "0.5"),
+        files=(MODEL, "judged.json", "report.md"),
+        parts="cache/looks/*/*.safetensors",
+        refused=(
+            (("--holdout", "1"), "holdout: expected a whole number from 2 to"),
+            (("--looks", "1"), "looks: expected a whole number from 2 to"),
+        ),
+    ),
+    "train.fit_map": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--gain_steps", "2"),
+        files=(MODEL, "judged.json", "report.md"),
+        parts="cache/looks/*/*.safetensors",
+        refused=(
+            (("--holdout", "1"), "holdout: expected a whole number from 2 to 1,000,000,000, got 1"),
+            (("--looks", "1"), "looks: expected a whole number from 2 to 10,000, got 1"),
+            (("--others", "12"), "others: expected from 1 to 11, got 12"),
+            (("--others", "0"), "others: expected a whole number from 1 to 1,000,000,000, got 0"),
+        ),
+    ),
+    "train.fit_verification": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
+                  "--target_model", "HERE/target.safetensors"),
+        files=(MODEL, "judged.json", "report.md"),
+        parts="cache/searches/*/*.safetensors",
+        workers=False,
+        refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
+    ),
+    "train.fit_tempering": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "2", "--holdout", "2", "--min_objects", "1", "--shard", "1",
+                  "--exponents", "[0.25, 1.0]"),
+        files=("hits.json", "report.md"),
+        parts="cache/samples/*/*.safetensors",
+    ),
+    "train.fit_templates": Command(workers=False),
+    "train.fit_context": Command(
+        settings=("--data.limit", "6", "--holdout", "2", "--min_objects", "1"),
+        files=("coco.safetensors", "judged.json", "report.md"),
+        parts="",
+        refused=tuple((("--name", name), "name: expected ") for name in ("../x", "/x", "a/b", "", "x\0")),
+    ),
+    "train.fit_humanlike": Command(
+        settings=(*NETWORK, *GRID, "--root", "HERE/people", "--fixations", "HERE/people.json",
+                  "--policies", "[closer-look-raw, vocus2-raw]"),
+        files=(MODEL, "bits.json", "report.md"),
+        parts="cache/looks/*/*.safetensors",
+        workers=False,
+    ),
+    "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
+    "train.fit_detector": Command(
+        settings=("HERE/colours.onnx", *PHOTOGRAPHS, "--data.limit", "8", "--columns", "3", "--rows", "2",
+                  "--holdout", "4", "--steps", "4", "--map_steps", "2", "--fixations", "2",
+                  "--sensor.sigma", "60", "--sensor.growth", "1"),
+        files=("evidence.safetensors", "map.safetensors"),
+        others=("manifest.json", "report.md", "search.png", "explore.png"),
+        parts="cache/looks/*/*.safetensors",
+        refused=(
+            ((), "model: expected the name or the file of a detector, got none"),
+            (("a.onnx", "--detector.name", "yolov3"), "detector.name: expected nothing, as model already names"),
+        ),
+    ),
+}  # fmt: skip
+RUN = [name for name, command in COMMANDS.items() if command.files]

@@ -1,0 +1,170 @@
+"""Every command runs, writes its files, goes on after a kill, and gives the same bits however its work is divided."""
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from .table import COMMANDS, RUN, write_material
+
+ROOT = Path(__file__).parents[3]
+
+
+def words(name, folder, *more, workers=1):
+    """Words of a small run that writes to `out` and `cache` in a folder."""
+    command, (_, *job) = COMMANDS[name], name.split()
+    paths = ["--out", str(folder / "out"), "--cache", str(folder / "cache")]
+    return [*job, *more, *paths, *(["--workers", str(workers)] if command.workers else [])]
+
+
+def run(name, *arguments):
+    """Run a command in this process with one thread; returns its exit code."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return importlib.import_module(name.split()[0]).main(list(arguments))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def contents(name, folder):
+    return {file: (folder / "out" / file).read_bytes() for file in COMMANDS[name].files}
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("material")
+    write_material(folder)
+    return folder
+
+
+@pytest.fixture(scope="module", params=RUN)
+def finished(request, material, tmp_path_factory):
+    """A command, the settings of its small run, and the folder of the finished run."""
+    name, folder = request.param, tmp_path_factory.mktemp("command")
+    settings = [word.replace("HERE", str(material)) for word in COMMANDS[name].settings]
+    assert run(name, *words(name, folder, *settings)) == 0
+    return name, settings, folder
+
+
+def test_a_run_writes_its_files(finished):
+    name, _, folder = finished
+    for file in (*COMMANDS[name].files, *COMMANDS[name].others):
+        assert (folder / "out" / file).stat().st_size > 20, file
+    assert not list(folder.rglob("*.part"))
+
+
+def long(name):
+    """Starting processes costs more than the work: two commands are tried by default."""
+    return name if name in ("eval.search", "train.fit_search") else pytest.param(name, marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("finished", [long(name) for name in RUN if COMMANDS[name].workers], indirect=True)
+def test_the_same_bits_from_two_workers(finished, tmp_path):
+    name, settings, folder = finished
+    assert run(name, *words(name, tmp_path, *settings, workers=2)) == 0
+    assert contents(name, tmp_path) == contents(name, folder)
+
+
+@pytest.mark.parametrize(
+    ("finished", "change"), [(name, change) for name in RUN for change in COMMANDS[name].same], indirect=["finished"]
+)
+def test_the_same_bits_with_settings_that_change_only_how_it_is_computed(finished, change, tmp_path):
+    name, settings, folder = finished
+    assert run(name, *words(name, tmp_path, *settings, *COMMANDS[name].same[change])) == 0
+    assert contents(name, tmp_path) == contents(name, folder)
+
+
+def test_finished_parts_are_kept_and_a_damaged_one_is_computed_again(finished, tmp_path):
+    name, settings, folder = finished
+    torch.manual_seed(1)  # random numbers drawn elsewhere change nothing
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    parts = sorted(tmp_path.glob(COMMANDS[name].parts)) if COMMANDS[name].parts else []
+    assert len(parts) > 1 or not COMMANDS[name].parts
+    kept = {part: part.stat().st_mtime_ns for part in parts[1:]}
+    if parts:
+        damaged = parts[0].read_bytes()[:-40]
+        parts[0].write_bytes(damaged)
+    for file in COMMANDS[name].files:
+        (tmp_path / "out" / file).unlink()
+    assert run(name, *words(name, tmp_path, *settings)) == 0
+    assert contents(name, tmp_path) == contents(name, folder)
+    assert {part: part.stat().st_mtime_ns for part in kept} == kept
+    assert not parts or parts[0].read_bytes() != damaged
+
+
+ALONE = pytest.mark.parametrize(
+    "finished", ["eval.search", pytest.param("train.fit_fom", marks=pytest.mark.long)], indirect=True
+)
+
+
+@ALONE
+def test_a_killed_run_goes_on_to_the_same_bits(finished, tmp_path, kill_when):
+    name, settings, folder = finished
+    call = words(name, tmp_path, *settings)
+    kill_when([sys.executable, "-m", name, *call], lambda: list(tmp_path.glob(COMMANDS[name].parts)), cwd=ROOT)
+    assert run(name, *call) == 0
+    assert contents(name, tmp_path) == contents(name, folder)
+
+
+@ALONE
+def test_the_same_bits_from_two_ranks(finished, tmp_path):
+    name, settings, folder = finished
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", name]
+    call, environment = words(name, tmp_path, *settings), {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([*launch, *call], cwd=ROOT, check=True, capture_output=True, env=environment)
+    assert contents(name, tmp_path) == contents(name, folder)
+
+
+WRONG = [(name, *each) for name, command in COMMANDS.items() for each in command.refused]
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize(("name", "wrong", "message"), WRONG, ids=[f"{name} {' '.join(w)}" for name, w, _ in WRONG])
+def test_wrong_settings_are_refused_in_one_line(name, wrong, message, tmp_path, capsys):
+    assert run(name, *name.split()[1:], *wrong, "--out", str(tmp_path / "out")) == 1
+    error = capsys.readouterr().err.splitlines()
+    assert error[-1].startswith("error: ")
+    assert message in error[-1]
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
+def test_an_output_that_cannot_be_written_is_named(material, tmp_path, capsys):
+    (tmp_path / "out").write_text("a file")
+    settings = [word.replace("HERE", str(material)) for word in COMMANDS["eval.search"].settings]
+    assert run("eval.search", *words("eval.search", tmp_path, *settings)) == 1
+    assert str(tmp_path / "out") in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_unknown_settings_are_refused(name, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(name, *name.split()[1:], "--seeed", "3")
+    assert stopped.value.code == 2
+    assert "seeed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_describes_the_command_and_printed_settings_can_be_given_back(name, capsys, tmp_path):
+    module, *job = name.split()
+    with pytest.raises(SystemExit) as stopped:
+        run(name, *job, "--help")
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    assert importlib.import_module(module).__doc__.splitlines()[0] in printed
+    assert "--config" in printed
+    texts = []
+    for given in ([], ["--config", str(tmp_path / "settings.yaml")]):
+        with pytest.raises(SystemExit) as stopped:
+            run(name, *job, *given, "--out", "elsewhere", "--print_config")
+        assert stopped.value.code == 0
+        texts.append(capsys.readouterr().out)
+        (tmp_path / "settings.yaml").write_text(texts[-1])
+    assert texts[0] == texts[1]
+    assert yaml.safe_load(texts[0])["out"] == "elsewhere"
