@@ -20,7 +20,7 @@ from semfov import EmbeddedScenes, ZoomAgent
 from semfov.data.large import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.selection import select
-from semfov.zoom.path import ZoomPath
+from semfov.paths import ZoomPath
 
 PASSES = 17
 SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6), "10240 × 7680 px": (16, 16)}

@@ -26,6 +26,7 @@ MODULES = (
     "semfov.report",
     "semfov.zoom",
     "semfov.head",
+    "semfov.agents",
     "semfov.envs",
     "semfov.data",
     "semfov.data.fixations",

@@ -31,6 +31,7 @@ import semfov
 from eval.demo_text import columns, plain_name, told
 from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
+from semfov.agents import ZoomAgent
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, embedded_picture, is_video, open_pictures, open_stream
 from semfov.data.word_vectors import WordVectors, spread
@@ -41,12 +42,13 @@ from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.io.manifest import Manifest
 from semfov.live import RATE
+from semfov.paths import ZoomPath
 from semfov.paths.stimulus import reduced
 from semfov.report import Pool, episode_data, write_page, zoom_data
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
-from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, ZoomPath
+from semfov.zoom import GlimpseEvidence, ZoomEye
 
 Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 

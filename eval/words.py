@@ -1,7 +1,7 @@
 """Context from words: `python -m eval.words` compares searches with and without context, from the same starts.
 
-    python -m train.fit_context --embeddings glove.6B.300d.txt --weigh 400 --out runs/glove --name glove …
-    python -m eval.words --tables "[runs/glove/glove.safetensors]" --data.root DIR --data.annotations instances.json
+    python -m train.fit_context --table beside.csv --weigh 400 --out runs/beside --name beside …
+    python -m eval.words --tables "[runs/beside/beside.safetensors]" --data.root DIR --data.annotations instances.json
 
 The arms are: no context; context counted from annotations (the upper reference); the context of each table; and that of
 the same table with its classes permuted at random (the control). The tables give the share of targets found after n

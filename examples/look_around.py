@@ -6,7 +6,8 @@ Run it from a checkout: python -m examples.look_around PANORAMA.jpg cup --out he
 import argparse
 
 import semfov
-from semfov.head import HeadAgent, Panorama, Panoramas
+from semfov import HeadAgent
+from semfov.head import Panorama, Panoramas
 from semfov.viz.head import animate_head, plot_head_path
 
 

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
+from semfov.agents import HeadAgent, ZoomAgent
 from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers
 from semfov.data import EmbeddedScenes, as_image, read_image
 from semfov.detection import Detections, Detector, Selection
@@ -16,7 +17,7 @@ from semfov.paths import Scanpath
 from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__
-from semfov.zoom import ZoomAgent, ZoomEye
+from semfov.zoom import ZoomEye
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
@@ -36,6 +37,7 @@ __all__ = [
     "FovealObservationModel",
     "Foveation",
     "Grid",
+    "HeadAgent",
     "InputError",
     "MapEvidence",
     "Scanpath",

@@ -28,7 +28,7 @@ def pytest_configure() -> None:
 
 RUNS = {"finished", "fitted", "home", "trained", "whole"}
 """Fixtures that run a command to its end."""
-LAB = {"lab", "eval", "experiments", "train", "training"}
+LAB = {"lab", "eval"}
 """Folders of tests of the laboratory: studies, the fits that only studies need, benchmarks."""
 
 

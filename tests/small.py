@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
+from semfov.belief.observers.base import Look
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import NonPredictive, Random
 
@@ -16,6 +17,26 @@ GRID = Grid(4, 3, (64, 48))
 def rand(*shape: int) -> Tensor:
     """Uniform random numbers in [0, 1) that depend only on the shape."""
     return torch.rand(shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+def draw(*shape: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None, seed: int = 0) -> Tensor:
+    """Uniform random numbers in [0, 1) of any precision, on any device."""
+    generator = torch.Generator().manual_seed(seed + sum(shape))
+    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
+
+
+def close(a: Tensor, b: Tensor, tolerance: float = 1e-12) -> None:
+    """Check that numbers differ by no more than a tolerance."""
+    torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
+
+
+def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections:
+    """Random detections from every cell of a scene."""
+    generator, cells = torch.Generator().manual_seed(index), len(grid)
+    corner = torch.rand(cells, most, 2, generator=generator) * 400
+    boxes = torch.cat([corner, corner + 20 + torch.rand(cells, most, 2, generator=generator) * 150], -1)
+    scores = (3 * torch.rand(cells, most, classes + 1, generator=generator)).softmax(-1)
+    return Detections(boxes, scores, torch.rand(cells, most, generator=generator) < 0.6)
 
 
 def model() -> FovealObservationModel:
@@ -41,6 +62,17 @@ def mapping() -> MapEvidence:
 def observing() -> Semantic:
     """The observer of the paper with an untrained observation model."""
     return Semantic(4, model().requires_grad_(False))
+
+
+class FixedLook(Semantic):
+    """An observer that returns a given look, whatever is detected."""
+
+    def __init__(self, look: Look) -> None:
+        super().__init__(4)
+        self.look = look
+
+    def weigh(self, detections, fixation, grid, target=None) -> Look:
+        return self.look
 
 
 def context(**weights: tuple[float, float]) -> ContextPrior:

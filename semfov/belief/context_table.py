@@ -1,7 +1,6 @@
 """Tables of classes by classes, or of classes by heights in the picture, from which context is made."""
 
 import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from semfov.data.naming import alike
 from semfov.errors import DataError, InputError
-from semfov.io.files import check_regular, write_text
+from semfov.io.files import check_regular
 
 _MOST = 10_000
 _LARGEST = 1e3
@@ -71,16 +70,6 @@ def read_table(path: str | PathLike[str]) -> NamedTable:
                 f"{path}: expected different names in the first {what}, got {', '.join(twice) or 'no name'}"
             )
     return NamedTable(tuple(rows), tuple(columns), torch.tensor(values))
-
-
-def write_table(path: Path, rows: Sequence[str], columns: Sequence[str], values: Tensor) -> None:
-    """Write a table in the format of `read_table`, atomically; NaN becomes an empty cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["", *columns])
-    for name, line in zip(rows, values.tolist(), strict=True):
-        writer.writerow([name, *("" if math.isnan(value) else f"{value:.6g}" for value in line)])
-    write_text(path, text.getvalue())
 
 
 def _number(cell: str, where: str) -> float:

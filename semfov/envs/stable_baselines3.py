@@ -62,17 +62,17 @@ class StableVecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Make a step in all environments; returns observations, rewards, which episodes are over, and infos."""
-        observations, rewards, terminated, truncated, told = self.envs.step(self._actions)
+        observations, rewards, terminated, truncated, details = self.envs.step(self._actions)
         over = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(over):
             infos[row] = {
-                "terminal_observation": self._part(told["final_obs"][row]),
+                "terminal_observation": self._part(details["final_obs"][row]),
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
                 "episode": {"r": float(self._returns[row]), "l": int(self._lengths[row])},
-                "result": float(told["final_info"]["result"][row]),
+                "result": float(details["final_info"]["result"][row]),
             }
         self._returns[over], self._lengths[over] = 0, 0
         return self._part(observations), rewards.astype(np.float32), over, infos

@@ -17,13 +17,13 @@ from semfov.envs.gazes import Gazes, Score
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.experiments.zoom_orders import overview
+from semfov.paths.windows import ZoomPath
 from semfov.viz.animation import render
 from semfov.viz.zoom import plot_zoom_path
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.path import ZoomPath
 
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 
@@ -150,14 +150,13 @@ class WindowGaze(Gazes):
         """Picture of the windows that were looked at, and of the objects that were found."""
         episode = self.episodes[0]
         target = episode.target or None
-        objects, values = merge(self.looks, target), (float("inf"),) * len(self.looks)
         path = ZoomPath(
             lattice=self.glances.lattice,
             classes=self.scenery.classes,
             target=target,
             glances=tuple(self.looks),
-            values=values,
-            objects=objects,
+            values=(float("inf"),) * len(self.looks),
+            objects=merge(self.looks, target),
         )
         image = self.scenery.image(episode.scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))

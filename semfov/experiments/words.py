@@ -52,7 +52,7 @@ class WordsConfig(Settings):
             tempering: 0.25, footprint: box_centre}`.
         context: which context is added: `place`, `cooccurrence` or `both`.
         counted: context counted from annotations, by name or file; it serves as the upper reference.
-        tables: contexts from tables, files of `train.fit_context --table` or `--embeddings`.
+        tables: contexts from tables, files of `train.fit_context --table`.
         weights: weights of place and co-occurrence in all arms (null: the weights fitted with each context).
         permuted: random seed of the control, in which the classes of each table are permuted.
         missed: the first look counts as missing the target if the target's highest score in it is below this.

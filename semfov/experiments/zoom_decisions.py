@@ -7,6 +7,7 @@ from itertools import product
 
 import torch
 
+from semfov.agents.windows import search
 from semfov.data.scene import Annotation
 from semfov.decision import MOST, OUTCOMES
 from semfov.experiments.decision_report import SHARES, telling
@@ -16,7 +17,6 @@ from semfov.experiments.tables import mean, share, table
 from semfov.metrics.calibration import BinarySums
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
-from semfov.zoom.search import search
 
 OURS, UNVERIFIED = "ours", "ours, without closer looks"
 """Names of searches with closer looks at places that seem to hold the target, and of searches without them."""

@@ -1,10 +1,8 @@
 """A head that turns: scenes larger than the eye's field of view, seen through one window at a time."""
 
-from semfov.head.agent import HeadAgent
 from semfov.head.belief import SceneBelief, SceneObserver
 from semfov.head.gain import ExploreGain, PerPrice, Scan, SearchGain
 from semfov.head.panoramas import Panoramas
-from semfov.head.path import HeadPath
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 from semfov.head.world import Boxes, Flat, Panorama, World
@@ -13,8 +11,6 @@ __all__ = [
     "Boxes",
     "ExploreGain",
     "Flat",
-    "HeadAgent",
-    "HeadPath",
     "Panorama",
     "Panoramas",
     "PerPrice",

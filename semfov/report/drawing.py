@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from html import escape
 
+from semfov.paths import ZoomPath
 from semfov.zoom.gist import FOUND
-from semfov.zoom.path import ZoomPath
 
 WIDTH = 480
 """Width of the drawing in pixels of the screen."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from semfov.head.path import HeadPath
-from semfov.paths import Record, Scanpath
+from semfov.paths import HeadPath, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
 from semfov.report.drawing import path_html
 from semfov.report.episode import Pool, episode_data
@@ -14,7 +13,6 @@ from semfov.viz.animation import animate
 from semfov.viz.head import plot_head_path
 from semfov.viz.scanpath import plot_scanpath
 from semfov.viz.zoom import plot_zoom_path
-from semfov.zoom.path import ZoomPath
 
 MOST = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""

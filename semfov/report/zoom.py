@@ -10,12 +10,12 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.data.reduction import reduction_for
 from semfov.errors import check
+from semfov.paths import ZoomPath
 from semfov.report.episode import Data, Pool, rounded, tagged
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects
-from semfov.zoom.path import ZoomPath
 
 Frame = tuple[int, int, int, int]
 

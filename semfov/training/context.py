@@ -9,15 +9,12 @@ from torch import Tensor
 
 from semfov.belief import ContextPrior
 from semfov.belief.context import reaches
-from semfov.belief.context_table import write_table
-from semfov.data.word_vectors import WordVectors
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
 from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
 from semfov.experiments.tables import table
-from semfov.io.files import inside
 from semfov.metrics.averages import standard_error
 from semfov.training.context_weights import fit_weights, make_cases
 from semfov.training.outputs import model_path, training_of, write_outputs
@@ -27,8 +24,6 @@ from semfov.training.places import FitContextConfig, Places, read_places
 def fit_context(config: FitContextConfig) -> None:
     """Count the context, evaluate it on held-out photographs, fit its weights, and write all results."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    one_source = config.table is None or config.embeddings is None
-    check(one_source, "table", "no table when `embeddings` is given (choose one of the two)", config.table)
     has_table = config.heights is None or config.table is not None
     check(has_table, "heights", "no heights unless `table` is given too", config.heights)
     sampler, samples, scenes = None, None, None
@@ -46,7 +41,7 @@ def fit_context(config: FitContextConfig) -> None:
     prior = fit(known, scenes.classes, config) if given is None else given
     judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
-    metadata = training_of(config, scenes, "table", "source", "heights", "embeddings") | prior.metadata
+    metadata = training_of(config, scenes, "table", "source", "heights") | prior.metadata
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
         folds = cross_fit(places, usable, scenes.classes, config, given)
@@ -83,26 +78,20 @@ def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConf
 
 
 def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrior | None:
-    """Make the prior from the table in the settings, or from the cosine similarities of word vectors.
+    """Make the prior from the table in the settings.
 
     Args:
         config: the settings.
         classes: names of the K classes.
 
     Returns:
-        The prior, or None if the settings name neither a table nor word vectors.
+        The prior, or None if the settings name no table.
     """
-    table, source, heights = config.table, config.source, config.heights
-    if config.embeddings is not None:
-        vectors = WordVectors.read(config.embeddings, classes)
-        if vectors.missing:
-            print(f"no vector in {config.embeddings} for: {', '.join(vectors.missing)}")
-        table = inside(config.out, "similarities.csv")
-        write_table(table, classes, classes, vectors.similarity(classes, classes))
-        source = source or f"cosines of word vectors, {config.embeddings.name}, sha256 {vectors.digest}"
+    table = config.table
     if table is None:
         return None
-    return ContextPrior.from_table(table, classes, source=source or table.name, places=heights, edges=config.edges)
+    source = config.source or table.name
+    return ContextPrior.from_table(table, classes, source=source, places=config.heights, edges=config.edges)
 
 
 def cross_fit(
@@ -292,9 +281,7 @@ def report(
         for row in judged
     ]
     weighed = [[kind, f"{place:.2g}", f"{co_occurrence:.2g}"] for kind, (place, co_occurrence) in weights.items()]
-    counted = (
-        f"Counted on {known} photographs" if config.table is None and config.embeddings is None else "From a table"
-    )
+    counted = f"Counted on {known} photographs" if config.table is None else "From a table"
     fitted = f"fitted on looks at {config.weigh} of" if config.weigh else "not fitted on looks at"
     return "\n".join(
         [

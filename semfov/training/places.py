@@ -56,8 +56,6 @@ class FitContextConfig(Settings):
         table: CSV table of classes by classes to use instead of counting (`ContextPrior.from_table`).
         source: where the table comes from (None: its file name).
         heights: CSV table of classes by heights in a picture, to use with `table`.
-        embeddings: file of word vectors in the text format of GloVe or word2vec. Their cosine similarities serve as the
-            table.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -84,7 +82,6 @@ class FitContextConfig(Settings):
     table: Path | None = None
     source: str | None = None
     heights: Path | None = None
-    embeddings: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from semfov.data.inputs import ImageLike, as_image
 from semfov.errors import check
-from semfov.head.path import HeadPath
+from semfov.paths import HeadPath
 from semfov.viz.animation import Film, render
 from semfov.viz.drawing import draw_image, photograph_of, pixels_of
 from semfov.viz.style import FOUND, GAZE, OTHER, STYLE, TARGET, make_figure, only, styled

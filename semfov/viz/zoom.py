@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from semfov.paths import ZoomPath
 from semfov.viz.drawing import photograph_of
 from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
-from semfov.zoom.path import ZoomPath
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

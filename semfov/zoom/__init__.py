@@ -2,12 +2,10 @@
 
 from typing import TYPE_CHECKING, Any
 
-from semfov.zoom.agent import ZoomAgent
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye, ZoomView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
-from semfov.zoom.path import ZoomPath
 
 if TYPE_CHECKING:
     from semfov.zoom.export import export_look
@@ -16,9 +14,7 @@ __all__ = [
     "GlimpseEvidence",
     "Lattice",
     "Objects",
-    "ZoomAgent",
     "ZoomEye",
-    "ZoomPath",
     "ZoomView",
     "export_look",
     "merge",

@@ -1,5 +1,6 @@
 """Context from tables: values and class names against loops, unreadable files, and the permuted control."""
 
+import csv
 import hashlib
 import math
 
@@ -7,11 +8,20 @@ import pytest
 import torch
 
 from semfov.belief import ContextPrior, context_table
-from semfov.belief.context_table import read_table, write_table
+from semfov.belief.context_table import read_table
 from semfov.errors import DataError, InputError
 
 CLASSES = ("cup", "dining table", "cow", "zebra")
 TABLE = ",mug,desk,cow\nglass,,2,0\ncup,,1,0.5\ntable,3,,-1\ncattle,0,0,\n"
+
+
+def write_table(path, rows, columns, values):
+    """Write a table as CSV; NaN becomes an empty cell."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["", *columns])
+        for name, line in zip(rows, values.tolist(), strict=True):
+            writer.writerow([name, *("" if math.isnan(value) else f"{value:.6g}" for value in line)])
 
 
 @pytest.fixture
@@ -129,11 +139,6 @@ def test_errors_in_a_table_name_the_line(path, text, message):
     path.write_bytes(b"\xff\xfe,cup\n")
     with pytest.raises(DataError, match="CSV"):
         read_table(path)
-
-
-def test_a_written_table_has_exactly_the_expected_bytes(tmp_path):
-    write_table(tmp_path / "t.csv", ["cup"], ["cow", "a, b"], torch.tensor([[0.125, math.nan]]))
-    assert (tmp_path / "t.csv").read_bytes() == b',cow,"a, b"\ncup,0.125,\n'
 
 
 def test_a_byte_order_mark_is_not_part_of_the_first_cell(path):

@@ -34,18 +34,6 @@ def photo(tmp_path):
     return path
 
 
-@pytest.fixture
-def run(agent, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(program, "make_agent", lambda config: agent)
-    monkeypatch.setattr(program, "known_classes", lambda config: None)
-
-    def run_demo(*arguments):
-        code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
-        return code, capsys.readouterr()
-
-    return run_demo
-
-
 def test_search_prints_looks_and_writes_pictures(run, photo, tmp_path):
     code, printed = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
@@ -197,22 +185,6 @@ def test_classes_are_listed_without_a_target(run, photo, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_errors_are_reported_in_one_line(run, photo, tmp_path):
-    for arguments, message in [
-        ((photo, "--target", "goblet"), "did you mean 'wine glass'"),
-        ((tmp_path / "none.jpg", "--target", "red"), "no such file"),
-        ((photo, "--target", "red", "--explore"), "none with --explore"),
-        ((photo, "--target", "red", "--start", 48), "start: expected a whole number from 0 to 47"),
-        ((photo, "--camera", 0, "--target", "red"), "photo: expected none with --camera"),
-        ((photo, "--target", "red", "--confirm", 50), "confirm: expected a number from 0 to 1"),
-        ((photo, "--target", "red", "--give_up", -1), "give_up: expected a number from 0 to 1"),
-    ]:
-        code, printed = run(*arguments)
-        assert code == 1
-        assert message in printed.err
-        assert len(printed.err.strip().splitlines()) == 1
-
-
 def test_a_threshold_that_no_score_reaches_confirms_nothing(run, photo):
     code, printed = run(photo, "--target", "red", "--start", 47, "--confirm", 1, "--shifts", 3)
     assert code == 0
@@ -242,17 +214,6 @@ def test_annotated_boxes_do_not_affect_decisions(agent, photo):
     tired = program.look_at(deciding, picture, program.DemoConfig(**common, give_up=1.0))
     assert (tired.found, tired.shifts) == (False, 0)
     assert tired.decision.outcome == ("absent" if tired.decision.probability < 0.5 else "undecided")
-
-
-def test_help_lists_options(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        program.main(["--help"])
-    assert stopped.value.code == 0
-    printed = capsys.readouterr().out
-    assert "[photo]" in printed
-    assert "--camera" in printed
-    assert "--confirm" in printed
-    assert "--give_up" in printed
 
 
 def test_the_stages_of_every_look_are_timed(agent, photo):

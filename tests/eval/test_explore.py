@@ -175,7 +175,7 @@ def test_help_names_every_preset(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["--help"])
     assert stopped.value.code == 0
-    explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", capsys.readouterr().out, re.DOTALL)[0].split())
+    explained = "".join(re.search(r".*(--policies \[ITEM.*?\(type:)", capsys.readouterr().out, re.DOTALL)[1].split())
     for name, preset in presets("exploration").items():
         if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
             continue  # a policy registered by another test

@@ -71,18 +71,6 @@ def agent():
     return small.agent(small.Coloured(score=0.9))
 
 
-@pytest.fixture
-def run(agent, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(program, "make_agent", lambda config: agent)
-    monkeypatch.setattr(program, "known_classes", lambda config: None)
-
-    def run_demo(*arguments):
-        code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
-        return code, capsys.readouterr()
-
-    return run_demo
-
-
 def frames(count=6):
     pictures = torch.full((count, 3, 120, 160), 0.4)
     for number, picture in enumerate(pictures):

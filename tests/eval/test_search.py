@@ -106,7 +106,7 @@ def test_help_and_print_config(capsys):
     text = capsys.readouterr().out
     for word in ("--sensor.sigma", "width of the fovea", "--config"):
         assert word in text
-    explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", text, re.DOTALL)[0].split())
+    explained = "".join(re.search(r".*(--policies \[ITEM.*?\(type:)", text, re.DOTALL)[1].split())
     for name, preset in presets("search").items():
         if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
             continue  # a policy registered by another test

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid, policies
-from semfov.belief.observers import Semantic, SemanticLook
+from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
@@ -19,6 +19,7 @@ from semfov.experiments.exploration_protocol import (
 )
 from semfov.metrics.exploration import answers_of
 from semfov.strategy import Strategy
+from tests.small import FixedLook
 
 GRID = Grid(4, 3, (80, 60))
 NOTHING = Detections.empty(12, 3)
@@ -34,17 +35,6 @@ class Scenes:
     """Two scenes; the protocol reads only their ids."""
 
     ids = (7, 8)
-
-
-class FixedLook(Semantic):
-    """An observer that returns a given look, whatever is detected."""
-
-    def __init__(self, look):
-        super().__init__(4)
-        self.look = look
-
-    def weigh(self, detections, fixation, grid, target=None):
-        return self.look
 
 
 @pytest.fixture

@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, fusion, policies
-from semfov.belief.observers import Semantic, SemanticLook
+from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.search_protocol import Outcome, episodes_of, run_episodes, tie_noise
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.strategy import Strategy
+from tests.small import FixedLook
 
 CLASSES = ("cat", "cup", "person")
 
@@ -51,17 +52,6 @@ def look():
     torch.manual_seed(0)
     likelihood = torch.rand(25, 3, 4) ** 3
     return SemanticLook(likelihood, torch.rand(25, 3, 25) < 0.15, torch.zeros(25, 25))
-
-
-class FixedLook(Semantic):
-    """An observer that returns a given look, whatever is detected."""
-
-    def __init__(self, look):
-        super().__init__(4)
-        self.look = look
-
-    def weigh(self, detections, fixation, grid, target=None):
-        return self.look
 
 
 GRID = Grid(5, 5, (100, 100))

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from semfov.agents import HeadAgent
 from semfov.errors import InputError
-from semfov.head import Flat, HeadAgent, Panorama, Speeds
+from semfov.head import Flat, Panorama, Speeds
 from semfov.head.episode import live
 from semfov.sensor.sphere import Regions
 from semfov.viz.head import animate_head, plot_head_path

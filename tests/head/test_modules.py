@@ -5,8 +5,9 @@ from functools import cache
 import torch
 
 from semfov import Eye, Foveation
+from semfov.agents import HeadAgent
 from semfov.belief.observers import LearnedMap, Target
-from semfov.head import ExploreGain, HeadAgent, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
 from tests.base_tester import BaseTester
 from tests.small import Blobs, detections, evidence, look, mapping, rand
 

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
 from semfov.decision import CloserLook, Decision
 from semfov.errors import DataError
-from semfov.head import Flat, HeadPath, Panorama, Views
+from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write
-from semfov.paths import GazeRecord, Moment, Record
-from semfov.zoom import Lattice, Objects, ZoomPath
+from semfov.paths import GazeRecord, HeadPath, Moment, Record, ZoomPath
+from semfov.zoom import Lattice, Objects
 from semfov.zoom.glances import Glance, around, on_lattice
 
 CLASSES = ("background", "cup", "cat")

@@ -12,8 +12,9 @@ from semfov.decision import Decision
 from semfov.experiments import run_report
 from semfov.experiments.config import DataConfig, PolicyConfig, SearchConfig
 from semfov.experiments.summary import Curve
+from semfov.paths import ZoomPath
 from semfov.report import Pool, write_page, zoom_data
-from semfov.zoom import Lattice, Objects, ZoomPath
+from semfov.zoom import Lattice, Objects
 from semfov.zoom.glances import Glance, on_lattice
 
 

@@ -271,7 +271,7 @@ def test_synonyms_are_no_class_names_and_suggest_only_known_classes():
         class_index("mug", ("person", "dog"), "target")
 
 
-@pytest.mark.parametrize("target", ["", "qqqq", 0, 3, -1, True, 1.0, None, ["cup"], torch.ones(2)])
+@pytest.mark.parametrize("target", ["", "qqqq", 0, 3, -1, 10**12, True, 1.0, None, ["cup"], torch.ones(2)])
 def test_invalid_targets_are_refused(target, agent, zooming):
     for search in (agent.search, zooming.search, zooming.find_all):
         with pytest.raises(SemfovError, match=r"^target: (expected a name, or a whole number from 1 to 2|unknown)"):
@@ -279,8 +279,9 @@ def test_invalid_targets_are_refused(target, agent, zooming):
 
 
 ARGUMENTS = [
-    ("shifts", -1), ("shifts", 2.5), ("shifts", None), ("seed", -1), ("seed", 1.5), ("start", 12), ("start", -1),
-    ("start", "middle"), ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
+    ("shifts", -1), ("shifts", 10**9), ("shifts", 2.5), ("shifts", None), ("seed", -1), ("seed", 2**64), ("seed", 1.5),
+    ("seed", None), ("start", 12), ("start", -1), ("start", True), ("start", "middle"),
+    ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
     ("give_up", float("nan")),
 ]  # fmt: skip
 

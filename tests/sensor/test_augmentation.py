@@ -12,10 +12,7 @@ import semfov.sensor
 from semfov import foveate
 from semfov.errors import InputError
 from semfov.sensor import RandomFoveation
-
-
-def draw(*shape, dtype=torch.float32, device=None):
-    return torch.rand(shape, dtype=dtype, generator=torch.Generator().manual_seed(sum(shape))).to(device)
+from tests.small import draw
 
 
 @pytest.mark.parametrize("settings", [{}, {"levels": 3, "growth": 1.0, "convention": "opencv"}])
@@ -55,7 +52,7 @@ def test_fixations_and_widths_are_uniformly_distributed():
 
 
 def test_same_on_batch():
-    image = draw(1, 3, 24, 32).expand(4, -1, -1, -1)
+    image = draw(1, 3, 24, 32, dtype=torch.float32).expand(4, -1, -1, -1)
     augment = RandomFoveation((3.0, 30.0), same_on_batch=True, p=1.0)
     view = augment(image)
     assert len(augment._params["gaze"].unique(dim=0)) == len(augment._params["sigma"].unique()) == 1
@@ -63,7 +60,7 @@ def test_same_on_batch():
 
 
 def test_equal_parameters_or_seeds_give_equal_views():
-    image = draw(4, 3, 24, 32)
+    image = draw(4, 3, 24, 32, dtype=torch.float32)
     augment = RandomFoveation((3.0, 30.0))
     torch.manual_seed(3)
     view = augment(image)
@@ -75,7 +72,7 @@ def test_equal_parameters_or_seeds_give_equal_views():
 
 
 def test_the_given_share_of_images_is_foveated():
-    image = draw(200, 1, 6, 7)
+    image = draw(200, 1, 6, 7, dtype=torch.float32)
     assert torch.equal(RandomFoveation(1.0, p=0.0)(image), image)
     augment = RandomFoveation(1.0, p=0.3)
     torch.manual_seed(0)
@@ -86,7 +83,7 @@ def test_the_given_share_of_images_is_foveated():
 
 @pytest.mark.parametrize("keepdim", [False, True])
 def test_one_image(keepdim):
-    image = draw(3, 24, 32)
+    image = draw(3, 24, 32, dtype=torch.float32)
     assert RandomFoveation(5.0, p=1.0, keepdim=keepdim)(image).shape == (image.shape if keepdim else (1, 3, 24, 32))
 
 
@@ -104,9 +101,12 @@ def test_gradients():
 
 
 def test_boxes_masks_and_keypoints_are_not_changed(device):
-    image, mask = draw(2, 3, 40, 56, device=device), (draw(2, 1, 40, 56, device=device) > 0.5).float()
+    image, mask = (
+        draw(2, 3, 40, 56, device=device, dtype=torch.float32),
+        (draw(2, 1, 40, 56, device=device, dtype=torch.float32) > 0.5).float(),
+    )
     boxes = torch.tensor([[[3.0, 4.0, 20.0, 30.0], [0.0, 0.0, 55.0, 39.0]]], device=device).expand(2, 2, 4)
-    points = 30 * draw(2, 5, 2, device=device)
+    points = 30 * draw(2, 5, 2, device=device, dtype=torch.float32)
     augment = AugmentationSequential(
         RandomFoveation((4.0, 8.0), p=1.0), data_keys=["input", "bbox_xyxy", "mask", "keypoints"]
     )
@@ -119,7 +119,7 @@ def test_boxes_masks_and_keypoints_are_not_changed(device):
 
 
 def test_boxes_are_moved_only_by_a_flip_before_the_foveation():
-    image, boxes = draw(2, 3, 40, 56), torch.tensor([[[3.0, 4.0, 20.0, 30.0]]]).expand(2, 1, 4)
+    image, boxes = draw(2, 3, 40, 56, dtype=torch.float32), torch.tensor([[[3.0, 4.0, 20.0, 30.0]]]).expand(2, 1, 4)
     keys = ["input", "bbox_xyxy"]
     both = AugmentationSequential(RandomHorizontalFlip(p=1.0), RandomFoveation(6.0, p=1.0), data_keys=keys)
     view, moved = both(image, boxes)
@@ -131,7 +131,7 @@ def test_boxes_are_moved_only_by_a_flip_before_the_foveation():
 
 @pytest.mark.slow
 def test_compiles_to_one_graph():
-    image = draw(2, 3, 24, 32)
+    image = draw(2, 3, 24, 32, dtype=torch.float32)
     augment = RandomFoveation((3.0, 30.0), p=1.0)
     augment(image)
     params = copy.deepcopy(augment._params)
@@ -142,7 +142,7 @@ def test_compiles_to_one_graph():
 
 def test_works_in_a_data_loader():
     augment = RandomFoveation(5.0, p=1.0, keepdim=True)
-    loader = DataLoader([(augment(draw(3, 16, 20)), 0)] * 2, batch_size=2)
+    loader = DataLoader([(augment(draw(3, 16, 20, dtype=torch.float32)), 0)] * 2, batch_size=2)
     assert next(iter(loader))[0].shape == (2, 3, 16, 20)
 
 

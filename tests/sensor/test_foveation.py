@@ -8,17 +8,9 @@ from hypothesis import strategies as st
 from semfov import Foveation, foveate
 from semfov.errors import InputError
 from semfov.sensor import laplacian_pyramid
+from tests.small import close, draw
 
 CONVENTIONS = ("kornia", "opencv")
-
-
-def draw(*shape, dtype=torch.float64, device=None, seed=0):
-    generator = torch.Generator().manual_seed(seed + sum(shape))
-    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
-
-
-def close(a, b, tolerance=1e-12):
-    torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

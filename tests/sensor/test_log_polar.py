@@ -9,16 +9,7 @@ from hypothesis import strategies as st
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.sensor import LogPolar, from_log_polar, gaussian_pyramid, log_polar
-from tests.small import Blobs
-
-
-def draw(*shape, dtype=torch.float64, device=None, seed=0):
-    generator = torch.Generator().manual_seed(seed + sum(shape))
-    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
-
-
-def close(a, b, tolerance=1e-12):
-    torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
+from tests.small import Blobs, close, draw
 
 
 def cubic(t):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from semfov import foveate
 from semfov.errors import InputError
 from semfov.sensor import laplacian_pyramid, pyramid, pyrdown, pyrup
+from tests.small import draw
 
 CONVENTIONS = ("kornia", "opencv")
 # Sides of one pixel, even and odd ones, and both in either order; `test_pyramid_equals_plain_loops` draws more.
@@ -22,11 +23,6 @@ ENLARGED = sorted(
     | {(size, shorter) for size in ((1, 1), (5, 4), (163, 162)) for shorter in SHORTER}
 )
 sizes = st.tuples(st.integers(1, 24), st.integers(1, 24))
-
-
-def draw(*shape, dtype=torch.float64, device=None):
-    generator = torch.Generator().manual_seed(sum(shape))
-    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
 
 
 def close(a, b, tolerance=2e-6):

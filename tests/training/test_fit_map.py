@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from eval.explore import main as explore
-from semfov import Detections, Grid
+from semfov import Grid
 from semfov.belief import MapEvidence
 from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
@@ -18,6 +18,7 @@ from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
 from semfov.training.map_evidence import FitMapConfig, frequencies, objective, train, train_gain
 from semfov.training.map_examples import MapExampleLooks, make_map_examples
+from tests.small import scattered
 from train.fit_map import main
 
 GRID = Grid(4, 4, (640, 480))
@@ -25,13 +26,8 @@ CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def random_detections(index, most=5):
-    """Random detections from every cell of a scene."""
-    generator = torch.Generator().manual_seed(index)
-    corner = torch.rand(CELLS, most, 2, generator=generator) * 400
-    boxes = torch.cat([corner, corner + 20 + torch.rand(CELLS, most, 2, generator=generator) * 150], -1)
-    scores = (3 * torch.rand(CELLS, most, len(CLASSES) + 1, generator=generator)).softmax(-1)
-    return Detections(boxes, scores, torch.rand(CELLS, most, generator=generator) < 0.6)
+def random_detections(index):
+    return scattered(index, GRID, len(CLASSES))
 
 
 @pytest.fixture(scope="module")

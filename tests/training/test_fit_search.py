@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Detections, Grid
+from semfov import Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.look_features import look_features
 from semfov.belief.observers import Target
@@ -21,6 +21,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.training.evidence import JUDGED, FitSearchConfig, choose_thresholds, judge, objective, searches, train
 from semfov.training.evidence_examples import ExampleLooks, make_examples
+from tests.small import scattered
 from train.fit_search import main
 
 GRID = Grid(4, 4, (640, 480))
@@ -28,13 +29,8 @@ CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def random_detections(index, most=5):
-    """Random detections from every cell of a scene."""
-    generator = torch.Generator().manual_seed(index)
-    corner = torch.rand(CELLS, most, 2, generator=generator) * 400
-    boxes = torch.cat([corner, corner + 20 + torch.rand(CELLS, most, 2, generator=generator) * 150], -1)
-    scores = (3 * torch.rand(CELLS, most, len(CLASSES) + 1, generator=generator)).softmax(-1)
-    return Detections(boxes, scores, torch.rand(CELLS, most, generator=generator) < 0.6)
+def random_detections(index):
+    return scattered(index, GRID, len(CLASSES))
 
 
 @pytest.fixture(scope="module")

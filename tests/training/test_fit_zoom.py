@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from semfov.agents.windows import search
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
@@ -25,7 +26,6 @@ from semfov.training.zoom_settings import FitZoomConfig
 from semfov.training.zoom_verification import fit_closer, sought_in, unverified, verify
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.search import search
 from tests.small import Coloured, Tiles
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")

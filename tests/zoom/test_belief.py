@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+from semfov.agents import ZoomAgent
+from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.belief import ZoomBelief, before_of
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.gist import Gist

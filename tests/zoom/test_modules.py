@@ -2,7 +2,8 @@
 
 import torch
 
-from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+from semfov.agents import ZoomAgent
+from semfov.zoom import GlimpseEvidence, ZoomEye
 from tests.base_tester import BaseTester, TensorTester
 from tests.small import Blobs, rand
 

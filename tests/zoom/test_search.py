@@ -6,10 +6,11 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from semfov.agents import ZoomAgent
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 from semfov.viz.zoom import plot_zoom_path
-from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, merge
+from semfov.zoom import GlimpseEvidence, ZoomEye, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 from semfov.zoom.lattice import Lattice
 

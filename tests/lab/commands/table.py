@@ -159,12 +159,13 @@ COMMANDS = {
         same={"no store": ("--store", "false")},
         refused=((("--people", "nobody.csv"), "nobody.csv"),),
     ),
+    "eval.demo": Command(workers=False),
     "eval.human search": Command(refused=((("--people", "nobody.json"), "nobody.json"),)),
     "train.fit_fom": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "4", "--holdout", "2", "--shard", "1", "--method", "newton"),
         files=(MODEL, "report.md"),
         others=("manifest.json", "reliability.png"),
-        parts="out/samples/*/*.safetensors",
+        parts="cache/samples/*/*.safetensors",
         same={"other shards": ("--shard", "3")},
     ),
     "train.fit_search": Command(

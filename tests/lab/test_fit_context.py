@@ -1,14 +1,12 @@
 """`python -m train.fit_context`: counts and ratios against loops, weights against a grid search, and the command."""
 
 import json
-import math
 
 import pytest
 import torch
 
 from semfov import Grid
 from semfov.belief import ContextPrior
-from semfov.belief.context_table import read_table
 from semfov.training.context import count_pairs, cross_fit, judge, occupation, shrunk_ratio
 from semfov.training.context_weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
 from semfov.training.places import FitContextConfig, Places
@@ -167,21 +165,3 @@ def test_command_writes_a_prior_from_annotations(tmp_path):
     assert shared.metadata["table"]["source"] == "guesses"
     assert str(tmp_path) not in json.dumps(shared.metadata)
     assert "From a table" in (tmp_path / "again" / "report.md").read_text()
-
-
-def test_word_vectors_make_a_table(tmp_path):
-    words = {"person": "1 0", "dog": "1 1", "cat": "1 0.9", "car": "-1 0"}
-    vectors = tmp_path / "vectors.txt"
-    vectors.write_text("".join(f"{word} {vector}\n" for word, vector in words.items()))
-    call = ["--data.limit", "8", "--holdout", "2", "--min_objects", "1", "--out", str(tmp_path / "out")]
-    assert main([*call, "--embeddings", str(vectors)]) == 0
-    prior = ContextPrior.from_pretrained(tmp_path / "out" / "coco.safetensors")
-    table = read_table(tmp_path / "out" / "similarities.csv")
-    dog, cat, bus = (table.rows.index(name) for name in ("dog", "cat", "bus"))
-    cosine = 1.9 / math.sqrt(2 * 1.81)
-    assert float(table.values[dog, cat]) == pytest.approx(cosine, abs=1e-4)
-    assert table.values[bus].isnan().all()
-    near = prior.cooccurrence[1:, 1:, 0]
-    assert float(near[dog, cat]) > float(near[dog, table.rows.index("car")])
-    assert bool((near[bus] == 0).all())
-    assert main([*call, "--embeddings", str(vectors), "--table", str(vectors)]) == 1

@@ -18,13 +18,12 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, PerPrice, SearchGain
-from semfov.head.path import HeadPath
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 from semfov.head.world import World
 from semfov.io.compatibility import learned_for
 from semfov.io.shipped import shipped_model
-from semfov.paths import Ending
+from semfov.paths import Ending, HeadPath
 from semfov.sensor.foveation import Foveation
 
 SIGMA = 100.0

@@ -3,25 +3,33 @@
 from typing import Any, Self
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture
-from semfov.decision import MOST as CLOSER
-from semfov.decision import check_thresholds
+from semfov.decision import MOST, OUTCOMES, Decision, Verifier, check_thresholds, settle
+from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
+from semfov.paths.endings import Ending
+from semfov.paths.windows import ZoomPath
+from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
-from semfov.zoom.glances import LiveGlances
-from semfov.zoom.path import ZoomPath
-from semfov.zoom.search import find_all, search
+from semfov.zoom.glances import Glance, Glances, LiveGlances
+from semfov.zoom.objects import merge
+from semfov.zoom.search import find_everything, look_for
+from semfov.zoom.tally import Tally
 
-MOST = 1_000_000
+LIMIT = 1_000_000
 """Limit of passes and batches, more than any picture has windows."""
 
 Picture = LargePicture | ImageLike
+
+DEFAULTS = Thresholds(0.9, 0.005)
+"""Thresholds of searches whose evidence has none."""
 
 
 class ZoomAgent(nn.Module):
@@ -98,9 +106,9 @@ class ZoomAgent(nn.Module):
         passes: int = 24,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int = MOST,
     ) -> ZoomPath:
-        """Search for one object of a class and decide whether the picture holds one (`semfov.zoom.search.search`).
+        """Search for one object of a class and decide whether the picture holds one (`semfov.agents.windows.search`).
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
         (`semfov.zoom.closer`).
@@ -123,7 +131,7 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        check_whole(passes, "passes", 1, MOST)
+        check_whole(passes, "passes", 1, LIMIT)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
@@ -142,7 +150,7 @@ class ZoomAgent(nn.Module):
     def find_all(
         self, picture: Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
     ) -> ZoomPath:
-        """Find all objects of a class (`semfov.zoom.search.find_all`).
+        """Find all objects of a class (`semfov.agents.windows.find_all`).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
@@ -179,8 +187,8 @@ class ZoomAgent(nn.Module):
         return self._find(picture, None, passes, batch, worth)
 
     def _find(self, picture: Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:
-        check_whole(passes, "passes", 1, MOST)
-        check_whole(batch, "batch", 1, MOST)
+        check_whole(passes, "passes", 1, LIMIT)
+        check_whole(batch, "batch", 1, LIMIT)
         check_number(worth, "worth", 0, float("inf"))
         return find_all(
             self._open(picture), self.evidence, self.classes, target, passes=passes, batch=batch, worth=worth
@@ -188,3 +196,139 @@ class ZoomAgent(nn.Module):
 
     def _open(self, picture: Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
+
+
+def search(
+    glances: Glances,
+    evidence: GlimpseEvidence,
+    classes: tuple[str, ...],
+    target: int,
+    *,
+    passes: int = 24,
+    confirm: float | None = None,
+    give_up: float | None = None,
+    closer: int = MOST,
+) -> ZoomPath:
+    """Search a picture for one object of a class and decide whether it is there.
+
+    Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
+    such a place (`semfov.decision.Verifier`). Without closer looks it is `found` when the picture holds it with
+    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+
+    When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
+    if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
+    passes are used up.
+
+    Args:
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
+        target: class 1..K.
+        passes: largest number of passes of the detector, closer looks included.
+        confirm: probability from which on the target is found: with closer looks, that it is at the place; otherwise,
+            that the picture holds it. None takes the threshold of the evidence.
+        give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
+            of the evidence.
+        closer: largest number of closer looks; 0 decides without them, as does evidence without fitted verification.
+
+    Returns:
+        The looks, the objects of the class, and the decision.
+    """
+    thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
+    seen: list[Glance] = []
+    values: list[float] = []
+
+    def close_up(box: Tensor) -> Detections:
+        seen.append(look_closely(glances, box))
+        return seen[-1].detections
+
+    verifier, model = None, evidence.verification
+    if closer and model is not None and model.thresholds is not None:
+        places, at = CandidateBoxes(target, thresholds.confirm), model.thresholds.changed(confirm, thresholds.give_up)
+        verifier = Verifier(model, places, close_up, at, closer)
+    else:
+        thresholds = thresholds.changed(confirm)
+    tally: Tally | None = None
+    ended, presence = 0, None
+    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
+        tally = tally or Tally(belief)
+        tally.add(glance)
+        seen.append(glance)
+        values.append(value)
+        presence = None
+        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
+            presence = tally.presence(ahead)
+            if verifier is None:
+                state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
+                ended = int(settle(*state, thresholds))
+            else:
+                room, look = passes - len(seen), WindowLook(glance.detections, len(seen), presence, tally.best, ahead)
+                verifier.see(look, last=ahead == 0 or room <= 1)
+                values += [place.probability for place in verifier.look_closely(room)]
+                ended = verifier.outcome()
+        if ended or len(seen) == passes:
+            break
+    assert tally is not None
+    if verifier is not None and verifier.looks:
+        decision = verifier.decision(over=ended > 0)
+    else:
+        presence = tally.presence(ahead) if presence is None else presence
+        decision = Decision(OUTCOMES[ended], presence, None, tally.box if OUTCOMES[ended] == "found" else None)
+    decided = ended > 0 or decision.outcome == "found"
+    ending: Ending = "decision" if decided else "passes" if len(seen) == passes else "windows"
+    return ZoomPath(
+        lattice=glances.lattice,
+        classes=classes,
+        target=target,
+        glances=tuple(seen),
+        values=tuple(values),
+        objects=merge(seen, target),
+        decision=decision,
+        ending=ending,
+        closer=() if verifier is None else tuple(verifier.looks),
+    )
+
+
+def find_all(
+    glances: Glances,
+    evidence: GlimpseEvidence,
+    classes: tuple[str, ...],
+    target: int | None = None,
+    *,
+    passes: int = 24,
+    batch: int = 1,
+    worth: float = 0.01,
+) -> ZoomPath:
+    """Find all objects of a class, or of all classes, with a limited number of passes of the detector.
+
+    Args:
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
+        target: class 1..K; None for all classes.
+        passes: largest number of passes of the detector.
+        batch: number of windows that are chosen jointly and looked at together.
+        worth: the exploration ends when no look is expected to find more new objects than this.
+
+    Returns:
+        The looks and the objects.
+    """
+    seen: list[Glance] = []
+    values: list[float] = []
+    ending: Ending = "price"
+    with torch.inference_mode():
+        for glance, value in find_everything(glances, evidence, target, batch=batch, worth=worth):
+            seen.append(glance)
+            values.append(value)
+            if len(seen) == passes:
+                ending = "passes"
+                break
+    return ZoomPath(
+        lattice=glances.lattice,
+        classes=classes,
+        target=target,
+        glances=tuple(seen),
+        values=tuple(values),
+        objects=merge(seen, target),
+        ending=ending,
+    )
