@@ -17,6 +17,7 @@ from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
 from semfov.decision import (
     MOST,
+    OUTCOMES,
     CandidateCells,
     Verifier,
     check_thresholds,
@@ -262,7 +263,7 @@ class ActivePerception(nn.Module):
             outcome = outcome_of(wanted, grid, goal, thresholds, 0.5 if confirm is None else confirm)
         scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
         index = class_meant(last.belief, index)
-        scanpath = replace(scanpath, found=ended == 1, target=index)
+        scanpath = replace(scanpath, found=OUTCOMES[ended] == "found", target=index)
         if goal is not None:
             return replace(scanpath, ending="box") if ended else scanpath
         if ended:

@@ -1,6 +1,7 @@
 """An agent that moves its eye and turns its head."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -8,15 +9,16 @@ from torch import Tensor, nn
 
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
-from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index
+from semfov.decision import Decision, conclude, place_known, settle
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
-from semfov.head.episode import live, look_around
+from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, PerPrice, SearchGain
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
@@ -127,7 +129,10 @@ class HeadAgent(nn.Module):
     ) -> HeadPath:
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerPrice`).
 
-        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`.
+        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`. A search
+        that ends without it decides that the target is absent if every cell that can be seen was fixated, or is less
+        probable than one that was never seen, and no cell holds the target with a probability of one half.
+        Otherwise it is undecided (`semfov.decision.settle`).
 
         Args:
             world: the scene, a `semfov.head.Panorama` or `Flat`.
@@ -153,7 +158,8 @@ class HeadAgent(nn.Module):
         gain = SearchGain(views, foresight)
         observer = SceneObserver(Target(self.target_evidence), views, prior=prior)
         acquire: Callable[[int], AcquisitionFunction] = lambda action: PerPrice(gain, self.speeds, action)  # noqa: E731
-        return self._look(views, observer, acquire, index, start, passes, seconds, confirm, seed)
+        thresholds = Thresholds(confirm, prior, confirm)
+        return self._look(views, observer, acquire, index, start, passes, seconds, thresholds, seed)
 
     def explore(
         self, world: World, *, start: int | None = None, passes: int = 40, seconds: float = 30.0, seed: int = 0
@@ -176,7 +182,7 @@ class HeadAgent(nn.Module):
         views = self.views(world)
         gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
         acquire: Callable[[int], AcquisitionFunction] = lambda action: PerPrice(gain, self.speeds, action)  # noqa: E731
-        return self._look(views, observer, acquire, None, start, passes, seconds, 1.0, seed)
+        return self._look(views, observer, acquire, None, start, passes, seconds, None, seed)
 
     @torch.inference_mode()
     def _look(
@@ -188,7 +194,7 @@ class HeadAgent(nn.Module):
         start: int | None,
         passes: int,
         seconds: float,
-        confirm: float,
+        thresholds: Thresholds | None,
         seed: int,
     ) -> HeadPath:
         check_whole(passes, "passes", 1, 1_000_000)
@@ -197,7 +203,8 @@ class HeadAgent(nn.Module):
         middle = views.tiling[0][len(views.tiling[0]) // 2]
         first = middle[len(middle) // 2] * views.cells + views.cells // 2 + 5 if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
-        actions, times, seen, maps, found = list[int](), list[float](), list[Detections](), list[Tensor](), False
+        actions, times, seen, maps = list[int](), list[float](), list[Detections](), list[Tensor]()
+        decision, found = None, False
         for step in look_around(
             views, live(self.eye, views), observer, acquire, first,
             target=target, speeds=self.speeds, passes=passes, seconds=seconds, seed=seed,
@@ -209,7 +216,9 @@ class HeadAgent(nn.Module):
             actions.append(step.action)
             times.append(step.seconds)
             seen.append(step.detections)
-            found = target is not None and float(told[views.gaze_cell[step.action]]) >= confirm
+            if target is not None and thresholds is not None:
+                decision = decide_look(views, step, target, thresholds)
+                found = decision.outcome == "found"
             if found:
                 break
         ending: Ending = "decision" if found else "passes" if len(actions) == passes else "seconds"
@@ -224,5 +233,27 @@ class HeadAgent(nn.Module):
             detections=tuple(seen),
             maps=torch.stack(maps),
             found=found,
+            decision=decision,
             ending=ending,
         )
+
+
+def decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:
+    """Decide after a look, by the rule of all searches (`semfov.decision.settle`); only the present gaze can find.
+
+    Args:
+        views: the possible views and fixations.
+        step: the look.
+        target: class 1..K.
+        thresholds: the thresholds; `give_up` is compared with the cells that can be seen and were not fixated.
+
+    Returns:
+        The decision. Its cell is one of the scene, and its box is in pixels of the view.
+    """
+    belief, cell = step.belief, views.gaze_cell[step.action]
+    cells = belief.probability(target).double()
+    looked = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
+    left = belief.chance(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
+    outcome = int(settle(belief.presence(target).double(), looked, left, thresholds))
+    decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
+    return replace(decision, cell=int(cell)) if decision.outcome == "found" else decision

@@ -11,7 +11,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import MATCHED, Verification, match
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, CloseUp, Look
 from semfov.decision.closer_look import CloserLook
-from semfov.decision.rule import OUTCOMES, Decision, surely, verified
+from semfov.decision.rule import OUTCOMES, Decision, verified
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole
@@ -227,7 +227,7 @@ class Verifier(Generic[Look]):
         """Choose the place that is to be looked at closely."""
         self._last = last
         recent = [chance for chance, each in zip(self._chances, self.verdicts, strict=True) if self._recent(each)]
-        sure = any(chance >= surely(self.thresholds.confirm) for chance in recent)
+        sure = verified(recent, self.presence, self.thresholds.confirm, over=False) > 0
         last = last or self.places.left < self.thresholds.give_up
         self.candidate = None if self._spent or sure else self.places.due(self.thresholds.place, last=last)
 

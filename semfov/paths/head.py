@@ -62,7 +62,8 @@ class HeadPath(GazeRecord):
         detections: detections of each look, a batch of one, with boxes in pixels of its view.
         maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
             exploration.
-        found: whether the last look found the target.
+        found: whether the last look found the target; the `cell` of the decision is then one of the scene, and its
+            `box` is in pixels of the last view.
 
     Example::
 

@@ -6,9 +6,13 @@ import pytest
 import torch
 
 from semfov.agents import HeadAgent
+from semfov.agents.head import decide_look
+from semfov.belief.target_evidence import Thresholds
+from semfov.detection import Detections
 from semfov.errors import InputError
 from semfov.head import Flat, Panorama, Speeds
-from semfov.head.episode import live
+from semfov.head.belief import SceneBelief
+from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
 from semfov.viz.head import animate_head, plot_head_path
 
@@ -105,3 +109,47 @@ def test_arguments_are_checked(agent, panorama):
     ):
         with pytest.raises(InputError, match=message):
             agent.search(world, **arguments)
+
+
+def test_a_search_is_found_by_the_cell_at_the_gaze_and_says_so_in_its_decision(agent, panorama):
+    world = Panorama(panorama)
+    for target, confirm in (("blue", 0.0), ("blue", 0.2), ("red", 0.05), ("green", 1.0)):
+        path = agent.search(world, target, passes=6, confirm=confirm)
+        at_the_gaze = [float(path.maps[n, path.views.gaze_cell[a]]) for n, a in enumerate(path.actions)]
+        assert [chance >= confirm for chance in at_the_gaze] == [False] * (len(path) - 1) + [path.found]
+        assert path.found == (path.decision.outcome == "found")
+        assert path.decision.probability == float(path.maps[-1].max())
+        if path.found:
+            assert path.decision.cell == int(path.views.gaze_cell[path.actions[-1]])
+            assert path.ending == "decision"
+        else:
+            # Most of the scene was not seen yet.
+            assert path.decision.outcome == "undecided"
+            assert (path.decision.cell, path.decision.box) == (None, None)
+    assert agent.explore(world, passes=1).decision is None
+
+
+@pytest.mark.parametrize(
+    ("examined", "unfixated", "outcome"),
+    [
+        (0.1, 0.03, "undecided"),  # a cell that was never seen is worth a look
+        (0.1, 0.02, "absent"),
+        (0.6, 0.02, "undecided"),  # probably there, but not where the eye looked
+        (0.6, 0.65, "undecided"),
+        (0.71, 0.9, "found"),
+    ],
+)
+def test_without_a_find_the_rule_of_all_searches_decides(agent, panorama, examined, unfixated, outcome):
+    views = agent.views(Panorama(panorama))
+    cells, here = len(views.world.scene), int(views.gaze_cell[5])
+    values = torch.full((1, cells, 2), unfixated)
+    values[0, ~views.reachable] = 0.5 if outcome != "absent" else 0.03
+    values[0, here] = examined
+    fixated = torch.zeros(1, cells, dtype=torch.bool)
+    fixated[0, here] = True
+    nothing = torch.zeros(1, cells)
+    belief = SceneBelief(values, nothing, nothing.long(), fixated, torch.ones(1), (None,) * len(views))
+    step = HeadStep(5, 0.2, belief, Detections.empty(1, 4))
+    decision = decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
+    assert decision.outcome == outcome
+    assert decision.cell == (here if outcome == "found" else None)
