@@ -17,7 +17,7 @@ from semfov.envs.gazes import Gazes, Score
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.experiments.zoom_orders import overview
-from semfov.paths.windows import ZoomPath
+from semfov.paths import ZoomPath
 from semfov.viz.animation import render
 from semfov.viz.zoom import plot_zoom_path
 from semfov.zoom.belief import ZoomBelief

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from semfov.errors import check, lookup
-from semfov.experiments.attention import attend_all
 from semfov.experiments.candidates import Candidate, load_models, make_strategy
 from semfov.experiments.config import RunConfig, SaliencyModel
 from semfov.experiments.looking import Looking
+from semfov.experiments.looks import one_thread
 from semfov.experiments.presets import label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.setup import fovea_of
 from semfov.gaze.policies import Task
+from semfov.gaze.templates import at_points
 
 
 class PolicyLooking(Looking):
@@ -67,9 +69,17 @@ class PolicyLooking(Looking):
         return Candidate(strategy, saliency=saliency, weight=self.config.saliency.weight)
 
     def attention(self, index: int) -> Tensor:
-        """Attention to every class in the cells of a scene, from every cell; computed at each call, never stored."""
-        assert self.models.templates is not None
-        return attend_all(self.eye, self.models.templates, self.scenes[index].image, self.grid(index))
+        """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""
+        templates, found = self.models.templates, []
+        assert templates is not None
+        with one_thread(), torch.inference_mode():
+            image, grid = self.scenes[index].image, self.grid(index)
+            view, points = self.eye.open(image[None]), grid.centres.to(image)
+            for point in points:
+                canvas = self.eye.foveated(view, point[None])
+                maps = templates(self.eye.detector.features(canvas))
+                found.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
+            return torch.cat(found)
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
