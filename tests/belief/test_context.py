@@ -180,12 +180,6 @@ def test_weights_of_zero_change_nothing(prior, looks):
     torch.testing.assert_close(after.present, plain.probability(1))
 
 
-def test_gradients_reach_the_presence(prior):
-    generator = torch.Generator().manual_seed(4)
-    presence = torch.rand(1, 20, 4, generator=generator, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: prior.double()(p, GRID, 1), presence)
-
-
 def test_a_prior_saved_and_loaded_is_the_same_up_to_half_precision(tmp_path, prior):
     prior.save(tmp_path / "toy.safetensors")
     loaded = ContextPrior.from_pretrained(tmp_path / "toy.safetensors")

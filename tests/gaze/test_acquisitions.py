@@ -110,13 +110,6 @@ def test_a_batch_gives_the_values_of_each_episode_alone(name):
         torch.testing.assert_close(alone, together[row : row + 1], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name not in BLIND])
-def test_gradients(name):
-    function, known = EVERY[name](), beliefs()
-    beta = known.beta.requires_grad_()
-    assert torch.autograd.gradcheck(lambda b: function(DirichletBelief(b, known.closest), visits()), beta)
-
-
 @pytest.mark.parametrize("name", BLIND)
 def test_functions_that_ignore_the_belief_have_no_gradient(name):
     known = beliefs()
@@ -169,14 +162,6 @@ def test_values_depend_only_on_the_probability_of_the_target(name):
 def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cells():
     alone = target_belief(rand(3, 12), rand(3, 12, seed=1), GRID.cell_distance[[0, 6, 11]].double())
     assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
-
-
-def test_arguments_are_not_modified(name):
-    known, visited = beliefs(), visits()
-    EVERY[name]()(known, visited)
-    assert torch.equal(known.beta, beliefs().beta)
-    assert torch.equal(known.closest, beliefs().closest)
-    assert torch.equal(visited, visits())
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "Static"])

@@ -208,6 +208,25 @@ class TestIdealObserver(TensorTester):
         return policies.IdealObserver(model())
 
 
+class TableTester(PolicyTester):
+    """For policies that need a table of every scene, seen from the fixated cell."""
+
+    @staticmethod
+    def call(module, beta, closest):
+        table = rand(12, 12) if module.table == "saliency" else rand(12, 3, 12)
+        return module.in_scene(2, GRID, table, torch.tensor([3, 5]))(DirichletBelief(beta, closest), closest == 0)
+
+
+class TestSaliencyMaximum(TableTester):
+    def make(self):
+        return policies.SaliencyMaximum()
+
+
+class TestTemplateSearch(TableTester):
+    def make(self):
+        return policies.TemplateSearch()
+
+
 class TestCloser(PolicyTester):
     def make(self):
         return policies.Closer()

@@ -20,12 +20,6 @@ def test_value_equals_the_loop(dtype, device):
             assert float(got[episode, x]) == pytest.approx(sum(others) / (first + sum(others)), rel=1e-6)
 
 
-def test_gradients():
-    beta = torch.rand(1, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
-    none = torch.zeros(1, 3, dtype=torch.bool)
-    assert torch.autograd.gradcheck(lambda b: ObjectEvidence()(DirichletBelief(b), none), (beta,))
-
-
 def test_a_belief_about_one_target_is_refused():
     cells, one = torch.zeros(1, 3), torch.zeros(1)
     about_one = TargetBelief(cells, cells, cells, cells, cells, one, one, cells.bool(), cells, cells, one)

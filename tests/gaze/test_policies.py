@@ -1,8 +1,5 @@
 """Policies by name: errors, state as modules, copies and pickling."""
 
-import copy
-import pickle
-
 import pytest
 import torch
 
@@ -111,30 +108,6 @@ def test_a_user_defined_policy_is_registered_under_its_name():
 
 
 SCENELESS = [name for name in policy_names("search") if POLICIES[name].table is None]
-
-
-@pytest.mark.parametrize("name", [name for name in SCENELESS if name != "random"])
-def test_a_copied_or_pickled_search_policy_gives_equal_values(name, means):
-    policy = named_policy(name, "search", means)
-    beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
-    expected = values_of(policy(1, GRID), beta)
-    assert bool(expected.isfinite().all())
-    for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
-        assert torch.equal(values_of(other(1, GRID), beta), expected)
-        mine = {tensor.data_ptr() for tensor in policy.state_dict().values()}
-        assert mine.isdisjoint(tensor.data_ptr() for tensor in other.state_dict().values())
-        if name != "non-predictive":
-            assert other.model is not means.model
-
-
-@pytest.mark.parametrize(
-    "name", ["random", "kl", "surprise", "two-peaks", "expected-accuracy", "closer-look", "objects"]
-)
-def test_a_copied_or_pickled_exploration_policy_gives_equal_values(name, means):
-    policy = named_policy(name, "exploration", means)
-    beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
-    for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
-        assert torch.equal(values_of(other(None, GRID), beta), values_of(policy(None, GRID), beta))
 
 
 def test_a_missing_model_is_an_error_when_the_policy_is_made():

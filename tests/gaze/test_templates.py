@@ -34,12 +34,6 @@ def test_attention_is_the_cosine(dtype, device):
             assert float(got[batch, k, row, column]) == pytest.approx(expected, abs=1e-5)
 
 
-def test_gradients():
-    model = make_templates(torch.float64)
-    features = torch.randn(1, 5, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    assert torch.autograd.gradcheck(model, (features.requires_grad_(),))
-
-
 def test_points_of_the_image_are_sampled_on_the_letterboxed_canvas():
     """The image is a ramp, so the value at a point is its x-coordinate."""
     ramp = torch.linspace(0.5, 79.5, 80).expand(1, 3, 60, 80) / 80
