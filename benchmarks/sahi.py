@@ -28,6 +28,7 @@ from semfov.experiments.looks import one_thread
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
 from semfov.experiments.zoom_orders import raster, slices
 from semfov.observation.matching import box_iou
+from semfov.zoom.episode import look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything
@@ -156,9 +157,9 @@ def compare(config: ZoomConfig) -> None:
             for name, how in merging.items():
                 boxes, labels, passes = sliced(run, index, **how)
                 outcomes[name].add(boxes, labels, annotation, passes)
-            same = raster(glances, slices(glances.lattice, config.slice, config.overlap))
-            chosen = list(islice((look for look, _ in find_everything(glances, run.evidence, run.target)), passes))
-            ways = {names[0]: list(same), names[1]: chosen, names[2]: chosen[: passes // 2]}
+            same = look_by_look(glances, raster(slices(glances.lattice, config.slice, config.overlap)), None)
+            chosen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
+            ways = {names[0]: [turn.glance for turn in same], names[1]: chosen, names[2]: chosen[: passes // 2]}
             for name, looks in ways.items():
                 found = merge(looks, run.target, score=FOUND)
                 outcomes[name].add(found.boxes, found.labels, annotation, len(looks))

@@ -250,11 +250,12 @@ def search(
         thresholds = thresholds.changed(confirm)
     tally: Tally | None = None
     ended, presence = 0, None
-    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
-        tally = tally or Tally(belief)
+    for turn in look_for(glances, evidence, target, confirm=float("inf")):
+        glance, ahead = turn.glance, turn.ahead
+        tally = tally or Tally(turn.belief)
         tally.add(glance)
         seen.append(glance)
-        values.append(value)
+        values.append(turn.worth)
         presence = None
         if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
             presence = tally.presence(ahead)
@@ -317,9 +318,9 @@ def find_all(
     values: list[float] = []
     ending: Ending = "price"
     with torch.inference_mode():
-        for glance, value in find_everything(glances, evidence, target, batch=batch, worth=worth):
-            seen.append(glance)
-            values.append(value)
+        for turn in find_everything(glances, evidence, target, batch=batch, worth=worth):
+            seen.append(turn.glance)
+            values.append(turn.worth)
             if len(seen) == passes:
                 ending = "passes"
                 break

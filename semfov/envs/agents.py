@@ -18,8 +18,8 @@ from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.windows import action_of
 from semfov.errors import InputError, check
 from semfov.experiments.search_protocol import Episode
-from semfov.experiments.zoom_orders import overview
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 
 Cells = NDArray[np.int64]
@@ -118,7 +118,7 @@ class ZoomPolicyAgent:
         gaze, belief = self._gaze, self._gaze.belief
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
-        return action_of(gaze.glances.lattice, overview(gaze.glances) if choice is None else choice[0])
+        return action_of(gaze.glances.lattice, overview(gaze.glances.lattice) if choice is None else choice[0])
 
 
 class MaskedRandom:

@@ -16,12 +16,12 @@ from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes, Score
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
-from semfov.experiments.zoom_orders import overview
 from semfov.paths import ZoomPath
 from semfov.viz.animation import render
 from semfov.viz.zoom import plot_zoom_path
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.glances import Glance, Window, on_lattice
+from semfov.zoom.episode import look_by_look
+from semfov.zoom.glances import Glance, Window, on_lattice, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
@@ -169,7 +169,8 @@ class WindowGaze(Gazes):
         self.glances = self.scenery.glances(episode.scene)
         self.belief = ZoomBelief(self.glances.lattice, self.scenery.evidence, episode.target)
         self.looks, self.done = [], set()
-        self._see(overview(self.glances))
+        self._turns = look_by_look(self.glances, lambda looks, windows: [(self.window, 0.0)], self.belief)
+        self._see(overview(self.glances.lattice))
         self._result = self._rate()
 
     def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,10 +182,8 @@ class WindowGaze(Gazes):
         self.window = window
         if window in self.done:
             return
-        glance = self.glances.see([window])[0]
-        self.looks.append(glance)
+        self.looks.append(next(self._turns).glance)
         self.done.add(window)
-        self.belief.add(glance)
 
     def _rate(self) -> Tensor:
         scene, target = self.episodes[0]

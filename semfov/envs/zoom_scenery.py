@@ -18,8 +18,7 @@ from semfov.envs.scenery import Source
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.window_looking import SHOWN, WindowLooking, WindowLookingConfig, found_in
-from semfov.experiments.zoom_orders import overview
-from semfov.zoom.glances import Glance
+from semfov.zoom.glances import Glance, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
@@ -108,7 +107,7 @@ class ZoomScenery:
 
     def _list(self, scene: int) -> list[int]:
         glances = self.glances(scene)
-        first = glances.see([overview(glances)])[0]
+        first = glances.see([overview(glances.lattice)])[0]
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from semfov.experiments.window_looking import SHOWN, Tile, WindowLooking, Window
 from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
 from semfov.io.storage import checksum
+from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
@@ -111,8 +112,8 @@ class ZoomRun(WindowLooking, SceneRun):
         glances = self.glances(index)
         records: list[Record] = []
         measures = self.config.measures
-        for name, looks in self._finding(index, glances) if "recall" in measures else ():
-            seen = [*islice(looks, self.config.passes)]
+        for name, turns in self._finding(index, glances) if "recall" in measures else ():
+            seen = [turn.glance for turn in islice(turns, self.config.passes)]
             records.append(self._recall(name, index, seen))
             if name in ("slices, raster", "ours"):
                 records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
@@ -126,22 +127,26 @@ class ZoomRun(WindowLooking, SceneRun):
         glances.save()
         return records, watch.seconds
 
-    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Glance]]]:
+    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Turn[Any]]]]:
         """Every way of looking for all objects, with its name in tables."""
-        cut = self.slices(index, glances.lattice)
+        cut, lattice = self.slices(index, glances.lattice), glances.lattice
         annotation, target = self.annotation(index), self.target
-        yield "slices, raster", raster(glances, cut)
-        yield "slices, random", shuffled(glances, cut, [self.config.seed, index])
-        yield "slices, ranked by the overview", ranked(glances, cut, target, most=False)
-        yield "quad-tree, best first", quad_tree(glances, target, most=False)
-        yield "ours", (glance for glance, _ in find_everything(glances, self.evidence, target))
-        yield "ours, four at a time", (g for g, _ in find_everything(glances, self.evidence, target, batch=4))
+        orders = {
+            "slices, raster": raster(cut),
+            "slices, random": shuffled(cut, [self.config.seed, index]),
+            "slices, ranked by the overview": ranked(cut, target, most=False),
+            "quad-tree, best first": quad_tree(lattice, target, most=False),
+        }
+        for name, order in orders.items():
+            yield name, look_by_look(glances, order, None)
+        yield "ours", find_everything(glances, self.evidence, target)
+        yield "ours, four at a time", find_everything(glances, self.evidence, target, batch=4)
         if self.observation is not None:
             observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
-            yield "by the observation model", (g for g, _ in find_everything(glances, observed, target))
+            yield "by the observation model", find_everything(glances, observed, target)
         found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
-        every = [*half_steps(glances.lattice)][1:]
-        yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
+        every = [*half_steps(lattice)][1:]
+        yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], found, self.config.passes), None)
 
     def _decisions(self, index: int, glances: Glances) -> list[Record]:
         """Search for classes that are present and for classes that are absent."""
@@ -186,17 +191,20 @@ class ZoomRun(WindowLooking, SceneRun):
         limit = len(cut) + 1
         records: list[Record] = []
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
-            ways = {
-                "slices, raster": raster(glances, cut),
-                "slices, random": shuffled(glances, cut, [self.config.seed, index, target]),
-                "slices, ranked by the overview": ranked(glances, cut, target, most=True),
-                "quad-tree, best first": quad_tree(glances, target, most=True),
-                "ours": (glance for glance, *_ in look_for(glances, self.evidence, target, slices=cut)),
-                "ours, free windows": (g for g, *_ in look_for(glances, self.evidence, target, closest=True)),
+            orders = {
+                "slices, raster": raster(cut),
+                "slices, random": shuffled(cut, [self.config.seed, index, target]),
+                "slices, ranked by the overview": ranked(cut, target, most=True),
+                "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
             }
-            for name, looks in ways.items():
+            ways: dict[str, Iterator[Turn[Any]]] = {
+                **{name: look_by_look(glances, order, None) for name, order in orders.items()},
+                "ours": look_for(glances, self.evidence, target, slices=cut),
+                "ours, free windows": look_for(glances, self.evidence, target, closest=True),
+            }
+            for name, turns in ways.items():
                 passes, hit = 0, False
-                for glance in islice(looks, limit):
+                for glance in (turn.glance for turn in islice(turns, limit)):
                     passes += 1
                     hit = glance.window.level >= closest and float(glance.show[target - 1]) >= SHOWN
                     if hit:

@@ -1,13 +1,15 @@
-"""Orders in which to look at the windows of a picture: baselines for the learned choice of windows."""
+"""Orders in which to look at the windows of a picture after the overview: baselines for the learned choice."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Glances, Window, around, on_lattice
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.policy import Choice
 
 
 def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
@@ -23,54 +25,63 @@ def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
     return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
 
 
-def raster(glances: Glances, windows: Sequence[Window]) -> Iterator[Glance]:
-    """The overview, then the windows in their order."""
-    yield from glances.see([overview(glances)])
-    for window in windows:
-        yield from glances.see([window])
+def raster(windows: Sequence[Window]) -> Order:
+    """The windows in their order."""
+    return lambda looks, done: [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
 
 
-def shuffled(glances: Glances, windows: Sequence[Window], seed: Sequence[int]) -> Iterator[Glance]:
-    """The overview, then the windows in random order."""
+def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
+    """The windows in random order."""
     order = np.random.Generator(np.random.PCG64(list(seed))).permutation(len(windows))
-    yield from raster(glances, [windows[n] for n in order])
+    return raster([windows[n] for n in order])
 
 
-def ranked(glances: Glances, windows: Sequence[Window], target: int | None, *, most: bool) -> Iterator[Glance]:
-    """The overview, then the windows in descending order of the overview's raw scores in them.
+def ranked(windows: Sequence[Window], target: int | None, *, most: bool) -> Order:
+    """The windows in descending order of the overview's raw scores in them.
 
     Args:
-        glances: the looks at the picture.
         windows: windows to look at.
         target: class 1..K; None: any class.
         most: rank a window by its highest score; false: by the sum of its scores.
 
-    Yields:
-        The looks in this order.
+    Returns:
+        The order.
     """
-    first = glances.see([overview(glances)])[0]
-    yield first
-    values = torch.tensor([raw(first, window, target, most=most) for window in windows])
-    for place in values.argsort(descending=True, stable=True).tolist():
-        yield from glances.see([windows[place]])
+    ranking: list[Choice] = []
+
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+        if len(looks) == 1:
+            values = torch.tensor([raw(looks[0], window, target, most=most) for window in windows])
+            places = values.argsort(descending=True, stable=True).tolist()
+            ranking.extend((windows[place], float(values[place])) for place in places)
+        return ranking[len(looks) - 1 : len(looks)]
+
+    return order
 
 
-def quad_tree(glances: Glances, target: int | None, *, most: bool) -> Iterator[Glance]:
-    """Best first: the overview, then repeatedly the quarter of a seen window with the highest raw score."""
-    lattice = glances.lattice
-    first = glances.see([overview(glances)])[0]
-    yield first
-    frontier = _quarters(lattice, first, target, most)
+def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
+    """Best first: repeatedly the quarter of a seen window with the highest raw score.
+
+    Args:
+        lattice: lattice of the picture.
+        target: class 1..K; None: any class.
+        most: rank a window by its highest score; false: by the sum of its scores.
+
+    Returns:
+        The order.
+    """
+    frontier: list[tuple[float, Window]] = []
     # Quarters at the right and bottom borders are moved inside the picture, where two of them may coincide.
-    known = {window for _, window in frontier}
-    while frontier:
+    known = set[Window]()
+
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+        new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in known]
+        known.update(window for _, window in new)
+        frontier.extend(new)
         frontier.sort(key=lambda entry: (-entry[0], entry[1].level, entry[1].cells))
-        _, window = frontier.pop(0)
-        glance = glances.see([window])[0]
-        yield glance
-        new = [entry for entry in _quarters(lattice, glance, target, most) if entry[1] not in known]
-        known |= {window for _, window in new}
-        frontier += new
+        return [frontier.pop(0)[::-1]] if frontier else []
+
+    return order
 
 
 def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) -> list[tuple[float, Window]]:
@@ -107,20 +118,29 @@ def raw(glance: Glance, window: Window, target: int | None, *, most: bool) -> fl
     return float(scores.max() if most else scores.sum())
 
 
-def oracle(
-    glances: Glances, windows: Sequence[Window], found: Callable[[Glance], Tensor], most: int
-) -> Iterator[Glance]:
-    """The overview, then repeatedly the window that shows most of the objects not seen before."""
-    first = glances.see([overview(glances)])[0]
-    yield first
-    seen, looks = found(first), glances.see(windows)
-    told = torch.stack([found(glance) for glance in looks])
-    for _ in range(min(most, len(windows)) - 1):
-        best = int((told & ~seen).sum(-1).argmax())
-        seen = seen | told[best]
-        yield looks[best]
+def oracle(glances: Glances, windows: Sequence[Window], found: Callable[[Glance], Tensor], most: int) -> Order:
+    """Repeatedly the window that shows most of the objects not seen before.
 
+    Args:
+        glances: the looks at the picture.
+        windows: windows to look at.
+        found: which objects a look finds, `(M,)`.
+        most: largest number of looks, the overview included.
 
-def overview(glances: Glances) -> Window:
-    """The window with the whole picture."""
-    return on_lattice(glances.lattice, (0, 0, 0))
+    Returns:
+        The order.
+    """
+    shown = torch.stack([found(glance) for glance in glances.see(windows)])
+    seen: list[Tensor] = []
+
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+        if len(looks) >= min(most, len(windows)):
+            return []
+        if len(looks) == 1:
+            seen.append(found(looks[0]))
+        new = (shown & ~torch.stack(seen).any(0)).sum(-1)
+        best = int(new.argmax())
+        seen.append(shown[best])
+        return [(windows[best], float(new[best]))]
+
+    return order

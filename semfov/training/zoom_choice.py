@@ -108,9 +108,9 @@ def mean_recall(
         path = find_everything(looks, model)
         count = 0
         for _ in range(passes):
-            glance = next(path, None)
-            if glance is not None:
-                seen.append(glance[0])
+            turn = next(path, None)
+            if turn is not None:
+                seen.append(turn.glance)
                 count = int(found_in(seen, annotation).sum())
             # When no window is left, the number of found objects stays the same for the remaining passes.
             found += count

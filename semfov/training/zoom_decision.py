@@ -20,8 +20,10 @@ from semfov.metrics.calibration import BinarySums
 from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
 from semfov.training.evidence import Bounds, choose_thresholds
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.episode import Turn
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.search import Turn, look_for
+from semfov.zoom.search import look_for
 from semfov.zoom.tally import Tally
 
 JUDGED = (1, 4, 8, 16)
@@ -62,7 +64,7 @@ def searches_of(
     passes: int,
     seed: int,
     title: str,
-) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn, Tally]]]]:
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], Tally]]]]:
     """Search every mosaic for some present classes and for as many absent ones, without decisions.
 
     Args:
@@ -86,7 +88,7 @@ def searches_of(
         looks.save()
 
 
-def _tallied(turns: Iterable[Turn]) -> Iterator[tuple[Turn, Tally]]:
+def _tallied(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBelief], Tally]]:
     """The turns of a search, each with the facts about the search after it."""
     tally: Tally | None = None
     for turn in turns:

@@ -61,6 +61,11 @@ def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
     return Window((x, y, magnification), level, (column, row, column + span, row + span))
 
 
+def overview(lattice: Lattice) -> Window:
+    """The window with the whole picture."""
+    return on_lattice(lattice, (0, 0, 0))
+
+
 def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
     """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
     x1, y1, x2, y2 = box

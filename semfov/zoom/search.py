@@ -1,28 +1,12 @@
-"""Loops over the windows of a picture: for one object of a class, or for all objects."""
+"""Episodes over the windows of a picture: for one object of a class, or for all objects."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
-
-
-class Turn(NamedTuple):
-    """A turn of a search: one look.
-
-    Attributes:
-        glance: result of the look.
-        worth: value of the look when it was chosen.
-        ahead: value of the best look that is left after it.
-        belief: belief after it.
-    """
-
-    glance: Glance
-    worth: float
-    ahead: float
-    belief: ZoomBelief
 
 
 def look_for(
@@ -33,7 +17,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
-) -> Iterator[Turn]:
+) -> Iterator[Turn[ZoomBelief]]:
     """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
 
     Args:
@@ -47,25 +31,24 @@ def look_for(
     Yields:
         Each turn.
     """
-    belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
-    window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
+    belief, last = ZoomBelief(glances.lattice, evidence, target), glances.lattice.levels - 1
     allowed = None if slices is None else set(slices)
-    while True:
-        glance = glances.see([window])[0]
-        done.add(window)
-        belief.add(glance)
+
+    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
         choice = best_hit(belief, done, closest=closest) if slices is None else best_slice(belief, slices, done)
-        yield Turn(glance, worth, 0.0 if choice is None else choice[1], belief)
-        last = window.level == glances.lattice.levels - 1
-        confirms = window in allowed if allowed is not None else last or not closest
-        if choice is None or (confirms and float(glance.show[target - 1]) >= confirm):
-            return
-        window, worth = choice
+        return [] if choice is None else [choice]
+
+    def ends(glance: Glance) -> bool:
+        window = glance.window
+        confirms = window in allowed if allowed is not None else window.level == last or not closest
+        return confirms and float(glance.show[target - 1]) >= confirm
+
+    yield from look_by_look(glances, best, belief, ends=ends)
 
 
 def find_everything(
     glances: Glances, evidence: Rates, target: int | None = None, *, batch: int = 1, worth: float = 0.0
-) -> Iterator[tuple[Glance, float]]:
+) -> Iterator[Turn[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
 
     Args:
@@ -76,15 +59,12 @@ def find_everything(
         worth: the exploration ends when no look is expected to find more new objects than this.
 
     Yields:
-        The result of each look, and the number of new objects that it was expected to find.
+        Each turn; the value of a look is the number of new objects that it is expected to find.
     """
-    belief, done = ZoomBelief(glances.lattice, evidence, target or 0), set[Window]()
-    chosen: list[Choice] = [(on_lattice(glances.lattice, (0, 0, 0)), float("inf"))]
-    while chosen:
-        looks = glances.see([window for window, _ in chosen], hints=False)
-        for glance, (_, value) in zip(looks, chosen, strict=True):
-            done.add(glance.window)
-            belief.add(glance)
-            yield glance, value
+    belief = ZoomBelief(glances.lattice, evidence, target or 0)
+
+    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
         chosen = jointly(lambda taken: best_find(belief, taken, belief.foresight), belief, done, batch)
-        chosen = [choice for choice in chosen if choice[1] > worth]
+        return [choice for choice in chosen if choice[1] > worth]
+
+    yield from look_by_look(glances, best, belief, hints=False)

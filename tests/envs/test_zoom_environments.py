@@ -21,8 +21,7 @@ from semfov.envs import (
 )
 from semfov.envs.registration import IDS
 from semfov.envs.windows import window_of
-from semfov.experiments.zoom_orders import overview
-from semfov.zoom.glances import on_lattice
+from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.search import find_everything, look_for
 
@@ -80,7 +79,7 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
             over = terminated or truncated
         seen = [glance.window for glance in env.gazes.looks]
         steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target, confirm=2.0)
-        assert seen == [glance.window for (glance, *_), _ in zip(steps, seen, strict=False)]
+        assert seen == [turn.glance.window for turn, _ in zip(steps, seen, strict=False)]
         assert terminated == zoom_scenery.found(env.gazes.looks, 0, target)
         assert not zoom_scenery.found(env.gazes.looks[:-1], 0, target)
         assert reward == pytest.approx(terminated - 0.05)
@@ -101,7 +100,7 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
         total += reward
     assert len(env.gazes.looks) == info["passes"] == 6
     steps = find_everything(zoom_scenery.glances(0), zoom_scenery.evidence)
-    expected = [glance.window for (glance, _), _ in zip(steps, range(6), strict=False)]
+    expected = [turn.glance.window for turn, _ in zip(steps, range(6), strict=False)]
     assert [glance.window for glance in env.gazes.looks] == expected
     assert total == pytest.approx(10 * (info["result"] - before) - 0.5 * 5)
     assert info["result"] > before
@@ -182,5 +181,5 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
         raise AssertionError("the detector was called")
 
     monkeypatch.setattr(again.eye, "glance", refuse)
-    kept = again.glances(0).see([overview(again.glances(0))])[0]
+    kept = again.glances(0).see([overview(again.glances(0).lattice)])[0]
     assert torch.equal(kept.show, env.gazes.looks[0].show)

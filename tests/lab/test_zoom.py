@@ -12,6 +12,7 @@ from semfov.experiments.zoom import ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables
 from semfov.experiments.zoom_orders import quad_tree, ranked, raster, shuffled, slices
 from semfov.zoom import GlimpseEvidence
+from semfov.zoom.episode import look_by_look
 from semfov.zoom.lattice import Lattice
 from tests.small import Tiles
 
@@ -137,12 +138,12 @@ def test_orders_look_at_every_slice_once(config):
     run = ZoomRun(config)
     glances = run.glances(0)
     cut = run.slices(0, glances.lattice)
-    for looks in (raster(glances, cut), shuffled(glances, cut, [1]), ranked(glances, cut, None, most=False)):
-        windows = [glance.window for glance in looks]
+    for order in (raster(cut), shuffled(cut, [1]), ranked(cut, None, most=False)):
+        windows = [turn.glance.window for turn in look_by_look(glances, order, None)]
         assert windows[0].level == 0
         assert set(windows[1:]) == set(cut)
         assert len(windows) == len(cut) + 1
-    tree = [glance.window for glance in quad_tree(glances, 1, most=True)]
+    tree = [turn.glance.window for turn in look_by_look(glances, quad_tree(glances.lattice, 1, most=True), None)]
     assert len(tree) == len(set(tree))
 
 
