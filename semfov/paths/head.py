@@ -191,8 +191,10 @@ class HeadPath(GazeRecord):
         views = Views(_world(record["world"]), record["fields"], fovea=record["fovea"])
         actions, cells = tensors["actions"], len(views.world.scene)
         check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
-        maps = tensors["maps"]
+        maps, decision = tensors["maps"], shared["decision"]
         check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
+        cell = None if decision is None else decision.cell
+        check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)
         return {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": tuple(record["seconds"])}
 
 

@@ -251,6 +251,11 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         ({**tensors, "actions": tensors["actions"] + 10**6}, values, "actions: expected numbers below"),
         ({**tensors, "maps": tensors["maps"][:, 1:]}, values, "maps: expected values of"),
         (tensors, {**values, "world": world}, "world.reach: expected a value"),
+        (
+            tensors,
+            {**values, "decision": {"outcome": "found", "probability": 0.9, "cell": 10**6, "place": None}},
+            "decision.cell",
+        ),
     ):
         write(file, parts, record)
         with pytest.raises(DataError, match=message):
