@@ -66,6 +66,7 @@ def test_own_policy_needs_fewer_gaze_shifts(run):
     assert found[0][2] == found[1][2] != "0"
 
 
+@pytest.mark.lab
 def test_learned_gaze_finds_more_than_random_gaze(run):
     output = run("learned_gaze", "--scenes", 2, "--steps", 50)
     found = re.findall(r"^([\w-]+): of (\d+) targets .* (\d+) % within 1, (\d+) % within 3", output, re.MULTILINE)
@@ -93,6 +94,7 @@ def test_own_detector_gets_an_observation_model(run, tmp_path):
     assert int(np.sum(model.metadata["counts"])) == int(re.search(r"fitted to (\d+)", output)[1])
 
 
+@pytest.mark.lab
 def test_a_trained_agent_finds_more_than_random_gaze(run, tmp_path):
     pytest.importorskip("sb3_contrib")
     small = ["--scenes", 2, "--steps", 6000, "--grid", 5, 4, "--shifts", 10, "--cache", tmp_path]
