@@ -6,8 +6,8 @@ import torch
 
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
-from semfov.experiments.candidates import Candidate
-from semfov.experiments.search_protocol import Episode, run_episodes
+from semfov.runs.candidates import Candidate
+from semfov.runs.search_protocol import Episode, run_episodes
 from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30

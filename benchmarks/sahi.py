@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.tables import table
+from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
 from semfov.detection.detector import Detector
-from semfov.experiments.command import run_command
-from semfov.experiments.looks import one_thread
-from semfov.experiments.zoom import ZoomConfig, ZoomRun
-from semfov.experiments.zoom_orders import raster, slices
 from semfov.observation.matching import box_iou
+from semfov.runs.command import run_command
+from semfov.runs.looks import one_thread
+from semfov.runs.zoom_orders import raster, slices
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.objects import merge

@@ -38,13 +38,13 @@ from semfov.data.word_vectors import WordVectors, spread
 from semfov.decision import MOST
 from semfov.detection.load import check_detector
 from semfov.errors import InputError, check
-from semfov.experiments.command import run_command
-from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.io.manifest import Manifest
 from semfov.live import RATE
 from semfov.paths import ZoomPath
 from semfov.paths.stimulus import reduced
 from semfov.report import Pool, episode_data, write_page, zoom_data
+from semfov.runs.command import run_command
+from semfov.runs.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of

@@ -15,9 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration import CalibrationConfig, judge_beliefs
-from eval.decide import DecideConfig, search_and_decide
+from eval.calibration.config import CalibrationConfig
+from eval.calibration.evaluation import judge_beliefs
+from eval.decide import search_and_decide
+from eval.decide.config import DecideConfig
 from eval.explore import explore
+from eval.explore.config import ExploreConfig
 from eval.page import paper
 from eval.page.curves import OBJECTS
 from eval.page.experiments import STUDIES, ResultsConfig, experiments
@@ -39,10 +42,10 @@ from eval.page.tables import (
     told_table,
 )
 from eval.search import search
+from eval.search.config import SearchConfig
 from semfov.errors import DataError, lookup
-from semfov.experiments.command import run_command
-from semfov.experiments.config import ExploreConfig, SearchConfig
 from semfov.io.files import write_text
+from semfov.runs.command import run_command
 
 NOT_RUN = ["*Not run yet.*"]
 

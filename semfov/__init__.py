@@ -21,7 +21,7 @@ from semfov.zoom import ZoomEye
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
-    from semfov.training.detector import fit_detector
+    from semfov.fit.detector import fit_detector
 
 __all__ = [
     "ActivePerception",
@@ -70,7 +70,7 @@ def __getattr__(name: str) -> Any:
         return CocoScenes
     if name == "fit_detector":
         # Training needs imports that would make the import of the package slow.
-        from semfov.training.detector import fit_detector
+        from semfov.fit.detector import fit_detector
 
         return fit_detector
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -91,7 +91,7 @@ def test_the_wheel_contains_the_licence(built):
 def test_the_sdist_contains_the_files_that_the_tests_need(built):
     names = names_in(built, "*.tar.gz")
     assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "Makefile"} <= names
-    assert {"tests/conftest.py", "eval/search.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names
+    assert {"tests/conftest.py", "eval/search/__init__.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names
     assert not [name for name in names if name.startswith((".venv/", "build/", "runs/", ".git/"))]
 
 

@@ -80,9 +80,9 @@ SUBPACKAGES = [
     "metrics",
     "viz",
     "report",
-    "experiments",
+    "runs",
     "envs",
-    "training",
+    "fit",
 ]
 OUTSIDE = ("eval", "train", "tests", "benchmarks", "examples", "docs", "hubconf")
 

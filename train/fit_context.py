@@ -16,9 +16,9 @@ Use the prior with `--policies [target-evidence] --belief.context both` and
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.context import fit_context
-from semfov.training.places import FitContextConfig
+from semfov.runs.command import run_command
+from train.context.fit import fit_context
+from train.context.settings import FitContextConfig
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,9 +20,9 @@ continue. `semfov.fit_detector` does the same in Python.
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.detector import fit_folder
-from semfov.training.detector_settings import FitDetectorConfig
+from semfov.fit.detector import fit_folder
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.runs.command import run_command
 
 MODEL = "the detector: a name or a file, as for semfov.load_detector"
 

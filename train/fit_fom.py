@@ -15,9 +15,9 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.observation import fit_fom
-from semfov.training.observation_settings import FitConfig
+from semfov.fit.observation import fit_fom
+from semfov.fit.observation_settings import FitConfig
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

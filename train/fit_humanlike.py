@@ -14,8 +14,8 @@ draws fixations from the model.
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.humanlike import FitHumanlikeConfig, fit_humanlike
+from semfov.runs.command import run_command
+from train.humanlike.fit import FitHumanlikeConfig, fit_humanlike
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,8 +15,8 @@ Use it with `python -m eval.explore --policies [learned-map] --belief.map_model 
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.map_evidence import FitMapConfig, fit_map
+from semfov.fit.map_evidence import FitMapConfig, fit_map
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

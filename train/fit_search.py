@@ -16,8 +16,8 @@ Use the model with `--policies [target-evidence] --belief.target_model runs/fit_
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.evidence import FitSearchConfig, fit_search
+from semfov.fit.evidence import FitSearchConfig, fit_search
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,8 +15,8 @@ Use the best exponent with `--belief.tempering τ`, or as the `tempering` of one
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.tempering import FitTemperingConfig, fit_tempering
+from semfov.fit.tempering import FitTemperingConfig, fit_tempering
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,8 +14,8 @@ Use the model with `--policies [ivsn] --templates runs/fit_templates/<name>.safe
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.templates import FitTemplatesConfig, fit_templates
+from semfov.runs.command import run_command
+from train.templates import FitTemplatesConfig, fit_templates
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

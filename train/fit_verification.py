@@ -15,9 +15,9 @@ looks are stored, photograph by photograph, in the folder `cache`: the same comm
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.verification import fit_verification
-from semfov.training.verification_settings import FitVerificationConfig
+from semfov.fit.verification import fit_verification
+from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -13,9 +13,9 @@ looking is interrupted, repeat the command to continue.
 import sys
 from collections.abc import Sequence
 
-from semfov.experiments.command import run_command
-from semfov.training.zoom import fit_zoom
-from semfov.training.zoom_settings import FitZoomConfig
+from semfov.fit.zoom import fit_zoom
+from semfov.fit.zoom_settings import FitZoomConfig
+from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

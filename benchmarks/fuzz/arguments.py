@@ -12,8 +12,8 @@ from torch import Tensor
 from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
 from semfov import ActivePerception, Eye, Foveation, Scanpath, observers, policies
 from semfov.detection import Candidates, Detector
-from semfov.experiments import config as settings
-from semfov.experiments.settings import Range
+from semfov.runs import config as settings
+from semfov.runs.settings import Range
 
 NUMBERS: list[Any] = [
     -(10**12), -2, -1, 0, 1, 2, 3, 7, 11, 12, 50, 10_000, 10_001, 2**31, 2**63 - 1, 2**63, 10**30,

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from benchmarks.fuzz.models import changed
 from benchmarks.fuzz.runner import choose, draw_rng
-from semfov.experiments.parts import Parts
-from semfov.experiments.store import cell_store
 from semfov.io import storage
+from semfov.runs.results import Parts
+from semfov.runs.store import cell_store
 
 RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]
 SECONDS = {"look": 0.5, "random": 1.25}

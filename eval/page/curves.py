@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from semfov.experiments.parts import Record
 from semfov.metrics.averages import Array, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
+from semfov.runs.results import Record
 
 OBJECTS = "right_without_background"
 

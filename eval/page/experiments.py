@@ -6,21 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration import CalibrationConfig
-from eval.decide import DecideConfig
-from semfov.experiments.config import (
+from eval.calibration.config import CalibrationConfig
+from eval.decide.config import DecideConfig
+from eval.explore.config import ExploreConfig
+from eval.search.config import SearchConfig
+from semfov.runs.config import (
     BeliefConfig,
     DataConfig,
     DetectorConfig,
-    ExploreConfig,
     PolicyConfig,
     ProtocolConfig,
     RunConfig,
-    SearchConfig,
     SensorConfig,
 )
-from semfov.experiments.presets import Choice
-from semfov.experiments.settings import Count, Settings, Workers
+from semfov.runs.presets import Choice
+from semfov.runs.settings import Count, Settings, Workers
 from semfov.sensor.named import SensorName
 
 DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from eval.comparison.summary import Array
 from eval.page.curves import per_image, records_of, repetition_error
 from eval.page.findings import LAST
 from eval.page.tables import Runs, columns
-from semfov.experiments.summary import Array
 from semfov.viz.style import save_figure
 
 

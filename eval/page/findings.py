@@ -8,8 +8,8 @@ import numpy as np
 
 from eval.page.curves import behind, difference, per_image, records_of, spans
 from eval.page.tables import Runs, columns
-from semfov.experiments.tables import table
 from semfov.metrics.averages import Array
+from semfov.runs.tables import table
 
 LAST = {"search": 30, "explore": 20}
 

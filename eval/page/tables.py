@@ -19,10 +19,10 @@ from eval.page.curves import (
 )
 from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
-from semfov.experiments.presets import label as name_of
-from semfov.experiments.tables import table
 from semfov.metrics.averages import standard_error
 from semfov.metrics.search import random_search
+from semfov.runs.presets import label as name_of
+from semfov.runs.tables import table
 
 Runs = dict[str, Experiment]
 
@@ -204,7 +204,7 @@ def central(cells: NDArray[np.int64], size: int = 10) -> tuple[NDArray[np.bool_]
 def photographs(runs: Runs) -> list[str]:
     """Table of the photographs of the page: their number, their objects and targets, and how many show a person."""
     from semfov.detection.coco_classes import COCO_CLASSES
-    from semfov.experiments.setup import make_scenes
+    from semfov.runs.setup import make_scenes
 
     run = runs["search-published-nano"]
     scenes = make_scenes(run.data, COCO_CLASSES)

@@ -17,8 +17,8 @@ from semfov.envs.environment import GazeEnv, ZoomEnv
 from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.windows import action_of
 from semfov.errors import InputError, check
-from semfov.experiments.search_protocol import Episode
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.runs.search_protocol import Episode
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 

@@ -20,9 +20,9 @@ from semfov.envs.looks import SceneLooks
 from semfov.envs.scenery import Scenery
 from semfov.episode import Memory, Sight, Step, attend
 from semfov.errors import check, check_whole
-from semfov.experiments.search_protocol import Episode
 from semfov.metrics.exploration import count_right
 from semfov.paths import Scanpath, Stimulus, trace
+from semfov.runs.search_protocol import Episode
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation
 

@@ -18,8 +18,10 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, check_whole
-from semfov.experiments.candidates import Candidate
-from semfov.experiments.config import (
+from semfov.gaze.policies import Task
+from semfov.metrics.exploration import answers_of
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import (
     BeliefConfig,
     DataConfig,
     DetectorConfig,
@@ -28,11 +30,9 @@ from semfov.experiments.config import (
     RunConfig,
     SensorConfig,
 )
-from semfov.experiments.exploration_protocol import Exploration, explorations_of, explore_noise
-from semfov.experiments.policy_looking import PolicyLooking
-from semfov.experiments.search_protocol import Episode, episodes_of, tie_noise
-from semfov.gaze.policies import Task
-from semfov.metrics.exploration import answers_of
+from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise
+from semfov.runs.policy_looking import PolicyLooking
+from semfov.runs.search_protocol import Episode, episodes_of, tie_noise
 from semfov.sensor.named import SensorName
 
 Source = Scenes | str | Path | None

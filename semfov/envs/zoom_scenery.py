@@ -16,8 +16,8 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.data.sources import PHOTOGRAPHS
 from semfov.envs.scenery import Source
 from semfov.errors import DataError, InputError, check, check_whole
-from semfov.experiments.config import DataConfig, DetectorConfig
-from semfov.experiments.window_looking import SHOWN, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.window_looking import SHOWN, WindowLooking, WindowLookingConfig, found_in
 from semfov.zoom.glances import Glance, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge

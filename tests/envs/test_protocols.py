@@ -3,16 +3,12 @@
 import gymnasium
 import pytest
 
+from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreRun
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    ExploreConfig,
-    PolicyConfig,
-    ProtocolConfig,
-    SearchConfig,
-)
-from semfov.experiments.runs import ExploreRun, SearchRun
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 

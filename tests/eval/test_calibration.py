@@ -8,9 +8,9 @@ import torch
 
 from eval.calibration import main
 from semfov.belief import MapEvidence, TargetEvidence
-from semfov.experiments.config import DetectorConfig, SensorConfig
-from semfov.experiments.setup import make_eye
 from semfov.metrics.calibration import BinarySums
+from semfov.runs.config import DetectorConfig, SensorConfig
+from semfov.runs.setup import make_eye
 
 BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")

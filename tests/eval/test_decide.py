@@ -5,13 +5,15 @@ import json
 import pytest
 import torch
 
-from eval.decide import main, mean, share, summary
+from eval.decide import main
+from eval.decide.report import summary
 from semfov.belief import TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
-from semfov.experiments.config import DetectorConfig, SensorConfig
-from semfov.experiments.setup import make_eye
 from semfov.metrics.presence import area_under_roc, hits_at
+from semfov.runs.config import DetectorConfig, SensorConfig
+from semfov.runs.setup import make_eye
+from semfov.runs.tables import mean, share
 
 POLICIES = [
     "target-evidence",

@@ -9,21 +9,15 @@ import pytest
 import torch
 
 from eval.explore import explore, main
+from eval.explore.config import ExploreConfig
+from eval.explore.references import FUSED, PAINTED
+from eval.explore.run import ExploreRun
 from semfov import observers
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    DetectorConfig,
-    ExploreConfig,
-    ProtocolConfig,
-    SaliencyConfig,
-)
-from semfov.experiments.presets import presets
-from semfov.experiments.references import FUSED, PAINTED
-from semfov.experiments.runs import ExploreRun
-from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.gaze.policies import POLICIES
 from semfov.gaze.saliency import VOCUS2
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SaliencyConfig
+from semfov.runs.presets import presets
+from semfov.runs.saliency_store import SaliencyStore, saliency_table
 
 pytestmark = pytest.mark.weights
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.explore.config import ExploreConfig
 from eval.page import paper
 from eval.page.curves import behind
 from eval.page.experiments import ResultsConfig, experiments
@@ -13,9 +14,10 @@ from eval.page.figures import FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
 from eval.page.tables import agreement, central, first_fixations, paired, summary
 from eval.results import TABLES, WHOLE, fill
+from eval.search.config import SearchConfig
 from semfov.errors import InputError
-from semfov.experiments.config import ExploreConfig, SearchConfig, SensorConfig
-from semfov.experiments.presets import label
+from semfov.runs.config import SensorConfig
+from semfov.runs.presets import label
 
 ROOT = Path(__file__).parents[2]
 

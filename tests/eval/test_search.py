@@ -10,13 +10,14 @@ import torch
 import yaml
 
 from eval.search import main, search
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
 from semfov.detection import Detections
-from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SearchConfig
-from semfov.experiments.looks import look_from
-from semfov.experiments.presets import label, presets
-from semfov.experiments.runs import SearchRun
-from semfov.experiments.store import cell_store
 from semfov.gaze.policies import POLICIES
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.looks import look_from
+from semfov.runs.presets import label, presets
+from semfov.runs.store import cell_store
 
 pytestmark = pytest.mark.weights
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from eval.words.run import WordsConfig, differences, told, words
 from semfov.belief import ContextPrior
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import InputError
-from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
-from semfov.experiments.words import WordsConfig, differences, told, words
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 
 pytestmark = pytest.mark.weights
 

@@ -7,11 +7,11 @@ from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.errors import InputError
-from semfov.experiments.candidates import Models, make_strategy
-from semfov.experiments.config import BeliefConfig, PolicyConfig
-from semfov.experiments.presets import label, presets, resolve
 from semfov.gaze.acquisition import CloserLook, ExpectedGain
 from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, SaliencyMaximum, named_policy, policy_names
+from semfov.runs.candidates import Models, make_strategy
+from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.presets import label, presets, resolve
 from semfov.strategy import Strategy
 
 GRID = Grid(5, 4, (50, 40))

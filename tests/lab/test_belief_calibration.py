@@ -6,28 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.calibration.beliefs import BANDS, CELLS, LOOKS, BeliefCalibrationRun
+from eval.calibration.beliefs_report import add_up, curves, landings, pooled, write_belief_report
+from eval.search.config import SearchConfig
 from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.episode import StoredLooks, rollout
-from semfov.experiments.belief_calibration import BANDS, CELLS, LOOKS, BeliefCalibrationRun
-from semfov.experiments.belief_calibration_report import add_up, curves, landings, pooled, write_belief_report
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    DetectorConfig,
-    ProtocolConfig,
-    SearchConfig,
-    SensorConfig,
-)
-from semfov.experiments.scene_run import finish
-from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.setup import make_eye, published_model
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.calibration import BinarySums
 from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.runs.scene_run import finish
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.setup import make_eye, published_model
 
 BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
 

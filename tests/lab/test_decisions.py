@@ -7,27 +7,22 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eval.decide.config import DecisionConfig
+from eval.decide.run import DecisionRun, landing, overlap, quarters, sharp_place
 from semfov import DataError, Detections, DirichletBelief, Grid, InputError
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    DetectorConfig,
-    ProtocolConfig,
-    SensorConfig,
-)
-from semfov.experiments.decisions import DecisionConfig, DecisionRun, landing, overlap, quarters, sharp_place
-from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.setup import make_eye
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Predictive
 from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.setup import make_eye
 
 AT = Thresholds(0.5, 0.375)
 PUBLISHED = ["published belief", "published belief, a detection at the gaze"]

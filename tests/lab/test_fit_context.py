@@ -7,9 +7,9 @@ import torch
 
 from semfov import Grid
 from semfov.belief import ContextPrior
-from semfov.training.context import count_pairs, cross_fit, judge, occupation, shrunk_ratio
-from semfov.training.context_weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
-from semfov.training.places import FitContextConfig, Places
+from train.context.fit import count_pairs, cross_fit, judge, occupation, shrunk_ratio
+from train.context.settings import FitContextConfig, Places
+from train.context.weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
 from train.fit_context import main
 
 EDGES = (0.0, 0.3)

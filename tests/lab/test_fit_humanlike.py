@@ -20,9 +20,9 @@ from semfov.gaze import GazeHabits, Habitual, acquisition
 from semfov.gaze.acquisition import NegativeEntropy
 from semfov.gaze.choice import drawn_by
 from semfov.observation.foveal import FovealObservationModel
-from semfov.training.habits import AGES, EDGES, ORDER, Halves, fit_terms, habits_of
-from semfov.training.viewings import Choices, cells_of, choices_in, values_in
 from train.fit_humanlike import main
+from train.humanlike.habits import AGES, EDGES, ORDER, Halves, fit_terms, habits_of
+from train.humanlike.viewings import Choices, cells_of, choices_in, values_in
 
 GRID = Grid(4, 3, (80, 60))
 

@@ -11,9 +11,9 @@ from semfov.detection.architectures import yolov3_tiny
 from semfov.detection.darknet import Darknet
 from semfov.errors import InputError
 from semfov.gaze import ClassTemplates
-from semfov.training.templates import TemplateSums, objects_of
 from tests.small import Fixed
 from train.fit_templates import main
+from train.templates import TemplateSums, objects_of
 
 
 def test_features_are_the_input_of_the_last_convolution():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from eval.head import report as head_report
+from eval.head.run import HeadConfig, HeadRun, answers_of, raster
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.scene import Annotation, Scene
-from semfov.experiments import head_report
-from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
 from tests.small import Tiles
 
@@ -45,12 +45,12 @@ class NoiseScenes:
 
 @pytest.fixture(params=["panorama", "mosaic"])
 def config(request, tmp_path, monkeypatch):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles())
-    monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: NoiseScenes())
+    monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles())
+    monkeypatch.setattr("eval.head.run.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
-    monkeypatch.setattr("semfov.experiments.head.make_target_evidence", lambda name, eye: models[0])
-    monkeypatch.setattr("semfov.experiments.head.make_map_evidence", lambda name, eye: models[1])
+    monkeypatch.setattr("eval.head.run.make_target_evidence", lambda name, eye: models[0])
+    monkeypatch.setattr("eval.head.run.make_map_evidence", lambda name, eye: models[1])
     return HeadConfig(
         scene=request.param,
         scenes=2,

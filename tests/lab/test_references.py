@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from eval.explore.references import FUSED, PAINTED, sharp_maps
 from semfov import Detections, Grid
-from semfov.experiments.exploration_protocol import counts_of
-from semfov.experiments.references import FUSED, PAINTED, sharp_maps
+from semfov.runs.exploration_protocol import counts_of
 
 GRID = Grid(5, 4, (100, 60))
 

@@ -5,21 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.comparison.replay import replay
+from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreRun
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
 from semfov import ActivePerception
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap
 from semfov.episode import rollout
-from semfov.experiments import exploration_protocol, search_protocol
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    ExploreConfig,
-    PolicyConfig,
-    ProtocolConfig,
-    SearchConfig,
-)
-from semfov.experiments.replay import replay
-from semfov.experiments.runs import ExploreRun, SearchRun
+from semfov.runs import exploration_protocol, search_protocol
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 
 pytestmark = pytest.mark.weights
 

@@ -5,17 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreRun
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
 from semfov.errors import InputError
-from semfov.experiments.config import (
-    BeliefConfig,
-    DataConfig,
-    ExploreConfig,
-    PolicyConfig,
-    ProtocolConfig,
-    SaliencyConfig,
-    SearchConfig,
-)
-from semfov.experiments.runs import ExploreRun, SearchRun
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SaliencyConfig
 
 pytestmark = pytest.mark.weights
 

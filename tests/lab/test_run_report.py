@@ -6,11 +6,15 @@ import re
 import numpy as np
 import pytest
 
-import semfov.experiments.run_report as module
-from semfov.experiments import explore_report, search_report
-from semfov.experiments.config import BeliefConfig, DataConfig, ExploreConfig, ProtocolConfig, SearchConfig
-from semfov.experiments.run_report import choose_episodes, write_run_report
-from semfov.experiments.runs import ExploreRun, SearchRun
+import eval.comparison.page as module
+from eval.comparison.page import choose_episodes, write_run_report
+from eval.explore import report as explore_report
+from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreRun
+from eval.search import report as search_report
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
+from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 
 pytestmark = pytest.mark.weights
 

@@ -7,10 +7,11 @@ import statistics
 import numpy as np
 import pytest
 
-from semfov.experiments import explore_report, search_report
-from semfov.experiments.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv
-from semfov.experiments.tables import percent
+from eval.comparison.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv
+from eval.explore import report as explore_report
+from eval.search import report as search_report
 from semfov.metrics.exploration import success_rate
+from semfov.runs.tables import percent
 
 # Gaze shift at which each search found its target (-1: not found), by image and repetition.
 FOUND = {"one": [0, 1, -1], "two": [1, 1, 2], "three": [-1, 2, 0]}

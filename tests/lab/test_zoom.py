@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov.experiments import zoom_report
-from semfov.experiments.config import DataConfig
-from semfov.experiments.zoom import ZoomConfig, ZoomRun
-from semfov.experiments.zoom_decisions import decision_tables
-from semfov.experiments.zoom_orders import quad_tree, ranked, raster, shuffled, slices
+from eval.zoom import report as zoom_report
+from eval.zoom.decisions import decision_tables
+from eval.zoom.run import ZoomConfig, ZoomRun
+from semfov.runs.config import DataConfig
+from semfov.runs.zoom_orders import quad_tree, ranked, raster, shuffled, slices
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.lattice import Lattice
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("kept_scenes")
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles())
+    monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles())
     torch.manual_seed(0)
     GlimpseEvidence(3, 8).save(tmp_path / "model.safetensors")
     return ZoomConfig(

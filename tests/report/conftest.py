@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from eval.comparison import page as run_report
+from eval.comparison.summary import Curve
+from eval.search.config import SearchConfig
 from semfov import Detections, Grid, Scanpath
 from semfov.decision import Decision
-from semfov.experiments import run_report
-from semfov.experiments.config import DataConfig, PolicyConfig, SearchConfig
-from semfov.experiments.summary import Curve
 from semfov.paths import ZoomPath
 from semfov.report import Pool, write_page, zoom_data
+from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice, Objects
 from semfov.zoom.glances import Glance, on_lattice
 

@@ -12,8 +12,8 @@ from torch.nn import functional as F
 from semfov.agents import ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
+from semfov.fit.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
-from semfov.training.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.evidence import CASE, features
 from semfov.zoom.glances import LiveGlances

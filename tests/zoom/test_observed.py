@@ -9,10 +9,10 @@ from semfov import FovealObservationModel
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import InputError
-from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows
+from semfov.fit.misses import count_misses
 from semfov.observation.matching import box_iou
-from semfov.training.misses import count_misses
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.observed import ObservedRates
@@ -51,8 +51,8 @@ def test_every_nth_mosaic_is_made_of_held_out_photographs():
 @pytest.fixture
 def sampler(detector, monkeypatch, tmp_path):
     detector.classes = ("person", "cat", "cup")
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: detector)
-    monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (160, 120))
+    monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: detector)
+    monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
     settings = MosaicSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
     return settings.sampler(tmp_path)

@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.training.zoom_examples import LookedAt, ZoomExample
-from semfov.training.zoom_survey import CountedLook, SurveyExample, fit_survey, judge_survey
+from semfov.fit.zoom_examples import LookedAt, ZoomExample
+from semfov.fit.zoom_survey import CountedLook, SurveyExample, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.gist import Gist

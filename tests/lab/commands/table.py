@@ -16,8 +16,8 @@ from semfov import FovealObservationModel
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.fixations import Fixations, write_table
-from semfov.experiments.config import DetectorConfig, SensorConfig
-from semfov.experiments.setup import make_eye
+from semfov.runs.config import DetectorConfig, SensorConfig
+from semfov.runs.setup import make_eye
 from semfov.zoom import GlimpseEvidence
 from tests.colours import CLASSES, write_network, write_photographs
 

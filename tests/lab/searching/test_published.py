@@ -5,9 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from eval.human.searching.trials import in_cells, read_searches, shift_found
 from semfov import Grid
 from semfov.data.fixations import by_picture
-from semfov.experiments.searching.trials import in_cells, read_searches, shift_found
 from semfov.metrics.scanpath import mean_performance, multimatch, performance_area, tfp_auc
 
 pytestmark = pytest.mark.shared

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from eval.human.searching.scores import People
+from eval.human.searching.screens import Screens
+from eval.human.searching.trials import drawn_searches, goal_cells, in_cells, read_searches, shift_found
 from semfov import Grid
 from semfov.data.fixations import Fixations, write_ruarte
 from semfov.errors import DataError
-from semfov.experiments.searching.scores import People
-from semfov.experiments.searching.screens import Screens
-from semfov.experiments.searching.trials import drawn_searches, goal_cells, in_cells, read_searches, shift_found
 from semfov.metrics.search import random_search
 
 SCREEN = (320, 240)

@@ -8,12 +8,12 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
+from eval.human.viewing.density import at, fit, log_densities, standardised
+from eval.human.viewing.raster import Habits, blurred, enlarged, events_of
+from eval.human.viewing.rows import people_maps
 from semfov import Grid
 from semfov.data.fixations import Fixations
 from semfov.errors import InputError
-from semfov.experiments.viewing.density import at, fit, log_densities, standardised
-from semfov.experiments.viewing.raster import Habits, blurred, enlarged, events_of
-from semfov.experiments.viewing.rows import people_maps
 
 
 def person(points, subject="1"):

@@ -2,13 +2,13 @@
 
 import torch
 
+from eval.human.viewing.follow import FineLooks, follow
 from semfov import Detections, Grid
 from semfov.belief.observers import Landing, Semantic
 from semfov.episode import StoredLooks, rollout
-from semfov.experiments.candidates import Candidate
-from semfov.experiments.viewing.follow import FineLooks, follow
 from semfov.gaze.choice import Given
 from semfov.gaze.policies import Closer, Objects
+from semfov.runs.candidates import Candidate
 from semfov.strategy import Strategy
 
 GRID = Grid(3, 2, (90, 60))

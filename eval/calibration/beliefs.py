@@ -1,0 +1,192 @@
+"""Calibration of beliefs: how well each cell's probability of the target agrees with where the target is.
+
+All beliefs are updated with the looks of the same searches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from eval.comparison.run import Run
+from eval.decide.run import landing, seen_on_landing
+from eval.search.config import SearchConfig
+from semfov.belief.grid import Grid
+from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
+from semfov.errors import InputError
+from semfov.eye import Eye
+from semfov.gaze.acquisition import AcquisitionFunction, Uniform
+from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
+from semfov.gaze.policies import NonPredictive, Task
+from semfov.metrics.calibration import BinarySums
+from semfov.runs.config import PolicyConfig
+from semfov.runs.presets import label
+from semfov.runs.results import Record
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.setup import make_map_evidence, make_target_evidence
+
+LOOKS = (1, 5, 15)
+"""Numbers of looks after which beliefs are evaluated."""
+
+BANDS = (0.14, 0.24, 0.34)
+"""Edges between bands of eccentricity, as fractions of the image's longer side.
+
+In photographs of usual proportions no two centres of 10 × 10 cells lie exactly this far apart, so that rounding does
+not decide which band a cell belongs to.
+"""
+
+FIXATED, FARTHEST = "fixated", f"{BANDS[-1]:.2f} - …"
+CELLS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
+"""Groups of cells: the fixated cells, then all others by their distance from the closest fixation."""
+
+ALL_CLASSES = {
+    "raw": PolicyConfig("non-predictive"),
+    "published": PolicyConfig("non-predictive", "calibrated"),
+    "tempered": PolicyConfig("non-predictive", tempering=0.5),
+}
+"""Beliefs fused by Kaplan's rule: from raw scores, from calibrated scores, and from raw scores tempered by 0.5."""
+
+LEARNED, MAP = "learned", "learned map"
+
+Model = TypeVar("Model")
+
+
+class BeliefCalibrationRun(Run):
+    """Two searches in every scene, for a present class and for an absent class, that do not stop at the target.
+
+    The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief
+    guides it. All beliefs are updated with the same looks.
+
+    Args:
+        config: settings of the run; its `policies` are ignored.
+
+    Attributes:
+        observers: the observer that maintains each belief, by the belief's name in the tables.
+        left_out: for each belief without a shipped model, the reason why it is left out.
+    """
+
+    task: Task = "search"
+    config: SearchConfig
+
+    def __init__(self, config: SearchConfig) -> None:
+        super().__init__(replace(config, policies=tuple(ALL_CLASSES.values())))
+        self.left_out: dict[str, str] = {}
+        belief = self.config.belief
+        evidence = self._if_shipped(LEARNED, make_target_evidence, belief.target_model)
+        evidence_map = self._if_shipped(MAP, make_map_evidence, belief.map_model)
+        self.models = replace(self.models, evidence=evidence, map=evidence_map)
+        self.observers: dict[str, Observer] = {
+            name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
+        }
+        if evidence is not None:
+            self.observers[LEARNED] = Target(evidence)
+        if evidence_map is not None:
+            self.observers[MAP] = LearnedMap(evidence_map)
+
+    def _if_shipped(self, name: str, make: Callable[[str | None, Eye], Model], model: str | None) -> Model | None:
+        """Load the model that the settings name, or else the shipped model; None where none is shipped."""
+        try:
+            return make(model, self.eye)
+        except InputError as error:
+            if model is not None:
+                raise
+            self.left_out[name] = str(error)
+            return None
+
+    def _key(self) -> str:
+        what = ["belief calibration", super()._key(), LOOKS, BANDS, BinarySums.EDGES.tolist()]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    @property
+    def guide(self) -> str:
+        """Name of the belief that guides the gaze."""
+        return LEARNED if LEARNED in self.observers else "tempered"
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run both searches of a scene; returns their records, and the seconds that each stage took."""
+        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
+        watch = Stopwatch()
+        area = self.config.data.max_target_area or 1.0
+        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
+        if not classes:
+            return [], watch.seconds
+        covered = grid.footprint(annotation.boxes)
+        detections = self.detections(index)
+        watch.lap("look")
+        records: list[Record] = []
+        for target in classes:
+            scene = self.scenes.ids[index]
+            start = torch.randint(len(grid), (1,), generator=generator_for("start", protocol.seed, scene, target))
+            noise = noise_for(protocol, len(grid), scene, target, 0)[None]
+            goal = covered[annotation.labels == target].any(0)
+            with torch.inference_mode():
+                search = self._search(target, start, noise, goal, KnownLooks(detections, grid, target))
+            records.append({"scene": scene, "target": target, "present": bool(goal.any()), **search})
+        watch.lap("believe")
+        return records, watch.seconds
+
+    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: KnownLooks) -> Record:
+        most = min(self.config.protocol.shifts + 1, LOOKS[-1])
+
+        def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
+            return list(rollout(looks, self.observers[name], acquisition, start, choice, most=most))
+
+        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(noise)))
+        path = torch.cat([step.cell for step in led])
+        beliefs: dict[str, Record] = {}
+        for name in self.observers:
+            steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
+            judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in LOOKS if n <= len(steps)}
+            beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
+        return {"seen": seen_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
+
+
+class KnownLooks(Looks):
+    """Precomputed looks at one image from the centres of its cells; likelihoods are computed look by look.
+
+    Args:
+        detections: detections from every cell, a batch of X·Y.
+        grid: the grid over the image.
+        target: the class to search for.
+    """
+
+    def __init__(self, detections: Detections, grid: Grid, target: int) -> None:
+        self.detections, self.grid, self.target = detections, grid, target
+        self.like = detections.scores
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """The precomputed looks from `cell`; the fixations are the centres of the cells."""
+        detections = self.detections[cell]
+        return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
+
+
+def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
+    """Sums over the cells of a search after a step, by group of cells.
+
+    Args:
+        step: a step of one search.
+        target: the target's class, 1..K.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+
+    Returns:
+        `BinarySums.record` of every group of `CELLS` that is not empty.
+    """
+    belief = step.belief
+    band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))
+    group = band.masked_fill(step.visited[0], 0)
+    probability = belief.probability(target)[0]
+    return {
+        name: BinarySums.of(probability[group == number], goal[group == number]).record()
+        for number, name in enumerate(CELLS)
+        if (group == number).any()
+    }

@@ -1,0 +1,192 @@
+"""Output of a run that evaluates the calibration of beliefs: tables, sums, and a reliability diagram."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from eval.calibration.beliefs import BANDS, CELLS, MAP, BeliefCalibrationRun
+from eval.comparison.summary import sensing
+from eval.decide.run import LANDINGS, LANDINGS_TOLD, landing_cells
+from semfov.errors import DataError
+from semfov.io.files import write_text
+from semfov.metrics.calibration import BinarySums
+from semfov.runs.results import Record
+from semfov.runs.scene_run import gather
+from semfov.runs.tables import table
+from semfov.viz import plot_cell_reliability
+from semfov.viz.style import save_figure
+
+Sums = dict[tuple[str, int, str], BinarySums]
+"""Sums over predictions by belief, number of looks, and group of cells."""
+
+HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
+
+
+def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
+    """Write the tables, the sums and the figure of a finished run.
+
+    Args:
+        run: the finished run.
+
+    Returns:
+        The tables as Markdown, and the files that were written.
+
+    Raises:
+        DataError: no scene has a class that may be searched for.
+    """
+    records, _ = gather(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise target_area")
+    sums = add_up(records)
+    text = summary(records, sums, run)
+    files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
+    for name, content in files.items():
+        write_text(run.config.out / name, content)
+    groups = (
+        f"distance from the closest fixation, as a fraction of the longer side, after {judged_after(sums)[-1]} looks"
+    )
+    figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
+    return text, [*(run.config.out / name for name in files), figure]
+
+
+def add_up(records: Iterable[Record]) -> Sums:
+    """Add up the sums of all searches."""
+    sums: Sums = defaultdict(BinarySums.nothing)
+    for record in records:
+        for belief, told in record["beliefs"].items():
+            for looks, groups in told["looks"].items():
+                for group, values in groups.items():
+                    sums[belief, int(looks), group] += BinarySums.from_record(values)
+    return dict(sums)
+
+
+def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
+    """Sums over all cells, whatever their group."""
+    return sum((sums[belief, looks, group] for group in CELLS if (belief, looks, group) in sums), BinarySums.nothing())
+
+
+def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) -> str:
+    """The tables, as Markdown."""
+    beliefs = list(run.observers)
+    there = sum(record["present"] for record in records)
+    by_looks = [["looks", "belief", "cells", *HEAD]]
+    for looks in judged_after(sums):
+        rows = [(belief, pooled(sums, belief, looks)) for belief in beliefs]
+        by_looks += [[str(looks), belief, str(each.count), *figures(each)] for belief, each in rows]
+    last = judged_after(sums)[-1]
+    by_distance = [["distance", "belief", "cells", *HEAD]]
+    for group in CELLS:
+        told = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
+        by_distance += [[group, belief, str(each.count), *figures(each)] for belief, each in told]
+    notes = [
+        f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
+    ]
+    if MAP in beliefs:
+        notes.append(
+            f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
+            "classes are present, so its probabilities are expected to be too low."
+        )
+    every = pooled(sums, beliefs[0], last)
+    alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
+    return "\n".join(
+        [
+            f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} of them for a class that "
+            f"is present. The {run.guide} belief guides the gaze, which does not stop at the target; all beliefs are "
+            f"updated with the same looks. A constant prediction of {every.rate:.4f}, the share of cells that hold the "
+            f"target, would have an NLL of {alone.nll:.4f}, a Brier score of {alone.brier:.4f} and an ECE of 0.",
+            "",
+            *table(by_looks),
+            "",
+            f"After {last} looks, by distance from the closest fixation, as a fraction of the image's longer side; "
+            "fixated cells are a group of their own.",
+            "",
+            *table(by_distance),
+            "",
+            LANDINGS_TOLD,
+            "",
+            *table([["belief", *LANDINGS], *landings(records)]),
+            "",
+            *[line for note in notes for line in (note, "")],
+        ]
+    )
+
+
+def judged_after(sums: Sums) -> list[int]:
+    """The numbers of looks for which there are sums."""
+    return sorted({looks for _, looks, _ in sums})
+
+
+def figures(sums: BinarySums) -> list[str]:
+    """The measures as cells of a table row."""
+    return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
+
+
+def landings(records: Sequence[Record]) -> list[list[str]]:
+    """Rows of the table about the first look on the target (`landing`)."""
+    landed = [record for record in records if record["seen"] is not None]
+    return [
+        [belief, *landing_cells([(record["beliefs"][belief]["landing"], record["seen"]) for record in landed])]
+        for belief in records[0]["beliefs"]
+    ]
+
+
+def beliefs_csv(sums: Sums) -> str:
+    """All measures as CSV: a row for each belief, number of looks and group of cells."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"])
+    for belief, looks, group, each in named(sums):
+        values = each.nll, each.brier, each.ece, each.probability, each.rate
+        rows.writerow([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
+    return text.getvalue()
+
+
+def beliefs_json(sums: Sums) -> str:
+    """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
+    told = [
+        {"belief": belief, "looks": looks, "cells": group, **each.record()}
+        for belief, looks, group, each in named(sums)
+    ]
+    return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": told}) + "\n"
+
+
+def named(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+    """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
+    for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
+        yield belief, looks, "all", pooled(sums, belief, looks)
+        for group in CELLS:
+            if (belief, looks, group) in sums:
+                yield belief, looks, group, sums[belief, looks, group]
+
+
+def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
+    """The arguments of `plot_cell_reliability`.
+
+    Args:
+        sums: sums over all searches.
+
+    Returns:
+        The bins of the reliability diagram by number of looks and belief, and the expected calibration error by belief
+        and group of cells after the last look.
+    """
+    beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), judged_after(sums)
+    panels = {
+        f"after {looks} looks" if looks > 1 else "after 1 look": {
+            belief: pooled(sums, belief, looks).bins for belief in beliefs
+        }
+        for looks in numbers
+    }
+    last = numbers[-1]
+    errors = {
+        belief: {group: sums[belief, last, group].ece for group in CELLS if (belief, last, group) in sums}
+        for belief in beliefs
+    }
+    return panels, errors

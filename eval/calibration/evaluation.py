@@ -1,0 +1,97 @@
+"""How well scores, and beliefs about a target, agree with the annotated objects."""
+
+from dataclasses import asdict, replace
+
+import torch
+import yaml
+
+import semfov
+from eval.calibration.beliefs import LOOKS, BeliefCalibrationRun
+from eval.calibration.beliefs_report import write_belief_report
+from eval.calibration.config import CalibrationConfig
+from eval.comparison.summary import announce
+from eval.search.config import SearchConfig
+from semfov.io.files import write_text
+from semfov.metrics.calibration import Calibration, calibration
+from semfov.runs.config import BeliefConfig, ProtocolConfig
+from semfov.runs.samples import Samples, SampleSettings, collect
+from semfov.runs.scene_run import finish
+from semfov.runs.setup import make_observation, plain, published_model
+from semfov.runs.tables import table
+from semfov.runs.workers import rank
+from semfov.viz import plot_reliability
+from semfov.viz.style import save_figure
+
+
+def judge(config: CalibrationConfig) -> None:
+    """Evaluate scores, then beliefs."""
+    judge_scores(config)
+    if config.beliefs:
+        judge_beliefs(config)
+
+
+def judge_scores(config: CalibrationConfig) -> None:
+    """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
+    settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
+    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    if rank() > 0:
+        return
+    model = make_observation(config.model, sampler.foveal_eye)
+    with torch.inference_mode():
+        calibrated = model.calibrate(samples.scores, samples.distance)
+    predictions = {"raw": samples.scores, "calibrated": calibrated}
+    text = "\n".join(calibration_table(model, predictions, samples)) + "\n"
+    write_text(config.out / "calibration.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    figure = plot_reliability({name: (p, samples.labels) for name, p in predictions.items()})
+    written = [config.out / "calibration.md", config.out / "config.yaml"]
+    announce(text, [*written, save_figure(figure, config.out / "reliability.png")])
+
+
+def judge_beliefs(config: CalibrationConfig) -> None:
+    """Search, and write how well the probabilities of beliefs agree with which cells hold the target."""
+    search = SearchConfig(
+        data=replace(config.data, max_target_area=config.target_area),
+        detector=config.detector,
+        sensor=config.sensor,
+        belief=BeliefConfig(
+            *config.grid,
+            model=config.model or published_model(config.detector, config.sensor),
+            target_model=config.target_model,
+            map_model=config.map_model,
+        ),
+        protocol=ProtocolConfig(shifts=LOOKS[-1] - 1, seed=config.seed),
+        out=config.out,
+        cache=config.cache,
+        workers=config.workers,
+    )
+    run = BeliefCalibrationRun(search)
+    finish(run, "believing")
+    if rank() == 0:
+        announce(*write_belief_report(run))
+
+
+def calibration_table(
+    model: semfov.FovealObservationModel, predictions: dict[str, torch.Tensor], samples: Samples
+) -> list[str]:
+    """Measures of raw and of calibrated scores by level of distance, and over all levels."""
+    level = model.level(samples.distance)
+    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
+    rows = [["distance", "scores", "detections", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]]
+    for number in range(len(edges)):
+        everything = number == len(edges) - 1
+        chosen = torch.ones_like(level, dtype=torch.bool) if everything else level == number
+        label = "all" if everything else f"{edges[number]} - {edges[number + 1]}"
+        for name, probabilities in predictions.items():
+            rows.append([label, name, *figures(calibration(probabilities[chosen], samples.labels[chosen]))])
+    return table(rows)
+
+
+def figures(result: Calibration) -> list[str]:
+    """The measures as cells of a table row."""
+    return [
+        str(result.count),
+        *(f"{value:.3f}" for value in (result.nll, result.brier, result.ece)),
+        f"{result.classwise_ece:.4f}",
+        f"{result.accuracy:.3f}",
+    ]

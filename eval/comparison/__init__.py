@@ -1,0 +1,1 @@
+"""Policies compared in the same scenes: what the studies of search and exploration share."""

@@ -1,0 +1,111 @@
+"""Settings of an experiment from a folder of fitted models."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+from semfov.errors import InputError, check
+from semfov.gaze.policies import POLICIES
+from semfov.model_folder import ModelFolder
+from semfov.runs.config import DetectorConfig, PolicyConfig, RunConfig, SensorConfig
+from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
+from semfov.runs.presets import Choice, resolve
+
+Config = TypeVar("Config", bound=RunConfig)
+
+
+def with_models(config: Config) -> Config:
+    """Complete settings with the detector, sensor, grid and models of the folder that `models` names.
+
+    If the settings also give a detector or weights, these are the new locations of the folder's files. The preset
+    `recommended` stands for the policy of the folder's agent. Default policies that need a model that the folder lacks
+    are left out.
+
+    Args:
+        config: the settings.
+
+    Returns:
+        The completed settings; `config` itself if it names no folder.
+
+    Raises:
+        InputError: a policy given in the settings needs a model that the folder lacks, or a setting is given twice.
+        DataError: it is no folder of models, or a file is missing or changed.
+    """
+    if config.models is None:
+        return config
+    folder = ModelFolder(config.models)
+    for name in ("model", "target_model", "map_model"):
+        given = getattr(config.belief, name)
+        check(given is None, f"belief.{name}", "null, since models defines it", given)
+    files = {part: folder.file(part) for part in ("observation", "evidence", "map")}
+    names = {"model": "observation", "target_model": "evidence", "map_model": "map"}
+    columns, rows = folder.manifest.grid
+    told: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
+    belief = replace(config.belief, columns=columns, rows=rows, **told)  # type: ignore[arg-type]
+    detector = detector_of(folder, config.detector)
+    named = type(config)().policies != config.policies
+    policies = tuple(recommended(folder, config) if each == "recommended" else each for each in config.policies)
+    chosen = []
+    for policy in policies:
+        missing = next((part for part in needs(policy, config) if files[part] is None), None)
+        if missing is None:
+            chosen.append(policy)
+        elif named:
+            why = folder.manifest.parts[missing].why if missing in folder.manifest.parts else "not fitted"
+            raise InputError(
+                f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
+            )
+    config = replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
+    return config
+
+
+def verification_of(models: Path) -> str | None:
+    """The model of verification of a folder, if its agent uses one."""
+    folder = ModelFolder(models)
+    return _text(folder.file("verification")) if folder.used("verification") else None
+
+
+def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
+    """The settings of a folder's detector; name and weights in `given` are the new locations of its files."""
+    moved = None if given.name == DetectorConfig().name else given.name
+    source, options = folder.detector_source(moved, given.weights)
+    known = {field.name for field in fields(DetectorConfig)}
+    options = {name: value for name, value in options.items() if name in known}
+    if options.get("classes") is not None:
+        options["classes"] = tuple(options["classes"])
+    if "weights" in options:
+        options["weights"] = Path(options["weights"])
+    return DetectorConfig(name=source, **{"background": None, **options})
+
+
+def sensor_of(folder: ModelFolder) -> SensorConfig:
+    """The settings of a folder's sensor."""
+    return SensorConfig(**folder.manifest.sensor)
+
+
+def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
+    """The policy that the agent of a folder uses."""
+    if config.task == "exploration":
+        return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
+    if folder.used("evidence"):
+        return EVIDENCE
+    if not folder.used("tempering"):
+        return "non-predictive-raw"
+    settings = folder.manifest.parts["tempering"].settings
+    return PolicyConfig(
+        "non-predictive", settings["scores"], tempering=settings["exponent"], footprint=settings["footprint"]
+    )
+
+
+def needs(choice: Choice, config: RunConfig) -> list[str]:
+    """Parts of the folder that a policy needs."""
+    policy = resolve(choice, config.task)
+    if policy.policy == EVIDENCE:
+        return ["evidence"]
+    learned = ["map"] if policy.scores == "learned" else []
+    model = policy.policy in POLICIES and POLICIES[policy.policy].needs_model
+    return [*learned, *(["observation"] if model or policy.scores == "calibrated" else [])]
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)

@@ -1,0 +1,131 @@
+"""The HTML page of a run: curves, tables, and some episodes to step through."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from eval.comparison.replay import replay
+from eval.comparison.run import Run
+from eval.comparison.summary import LAST_COLUMN, Array, Curve, curve_rows
+from semfov.report.curves import curves_html, table_html
+from semfov.report.episode import Data, Pool, episode_data
+from semfov.report.page import write_page
+from semfov.runs.results import Record
+from semfov.runs.setup import plain
+from semfov.viz.views import foveated_views
+
+WHERE = ("out", "cache", "workers")
+"""Settings of folders and processes, which do not change the results and are left out of the page."""
+
+LIMIT = 4_500_000
+"""Size of a page in bytes from which no further episode is added."""
+
+
+def write_run_report(
+    run: Run,
+    records: list[Record],
+    curves: Mapping[str, dict[str, Curve]],
+    *,
+    titles: Mapping[str, str],
+    label: str,
+    shifts: Sequence[int],
+    others: Mapping[str, Array] | None = None,
+    episodes: int = 18,
+) -> Path:
+    """Write `report.html` to the folder of a run.
+
+    Args:
+        run: the finished run.
+        records: the records of its episodes.
+        curves: curves by average and policy.
+        titles: descriptions of the averages.
+        label: the quantity that the curves show, in percent.
+        shifts: gaze shifts for which the tables give values.
+        others: reference curves of the first average that belong to no policy.
+        episodes: show at least this many episodes, unless the page grows too large.
+
+    Returns:
+        The path of the page.
+    """
+    sections = []
+    for order, (average, policies) in enumerate(curves.items()):
+        first = next(iter(policies.values()))
+        added = dict(others or {}) if order == 0 else {}
+        means = {**{name: curve.mean for name, curve in policies.items()}, **added}
+        errors = {name: curve.over_images for name, curve in policies.items()}
+        at = [n for n in shifts if n < len(first.mean)]
+        rows = [["policy", *(str(n) for n in at), LAST_COLUMN], *curve_rows(policies, at)]
+        rows += [[name, *(f"{100 * curve[n]:.1f}" for n in at), ""] for name, curve in added.items()]
+        caption = f"{label} after n gaze shifts ± standard error over {first.images} images, {first.episodes} episodes"
+        title = escape(titles[average])
+        sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
+        sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
+    told = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
+    settings = escape(yaml.safe_dump(told, sort_keys=False))
+    sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
+    pool = Pool()
+    data = _episodes(run, choose_episodes(records, list(run.policies), episodes), pool)
+    title = f"semfov: {run.task} with {run.eye.detector.name}"
+    return write_page(run.config.out / "report.html", title, data, pool, sections="\n".join(sections))
+
+
+def choose_episodes(records: list[Record], policies: Sequence[str], count: int) -> list[Record]:
+    """Choose records to show: in each scene the same episode with all policies side by side.
+
+    The episode of a scene is the one from the first start, in searches for the commonest target.
+
+    Args:
+        records: the records of all episodes.
+        policies: the policies in the order in which they are shown.
+        count: scenes are added until there are at least this many records.
+
+    Returns:
+        The chosen records.
+    """
+    order = {policy: number for number, policy in enumerate(policies)}
+    groups: dict[Any, list[Record]] = defaultdict(list)
+    for record in records:
+        if record["repetition"] == 0 and record.get("commonest", True) and record["policy"] in order:
+            groups[record["scene"]].append(record)
+    chosen: list[Record] = []
+    for group in groups.values():
+        if len(chosen) >= count:
+            break
+        chosen += sorted(group, key=lambda record: order[record["policy"]])
+    return chosen
+
+
+def _episodes(run: Run, records: Sequence[Record], pool: Pool) -> list[Data]:
+    data, size, settings = [], 0, run.eye.settings()
+    for record in records:
+        if len(pool) + size > LIMIT:
+            break
+        index = list(run.scenes.ids).index(record["scene"])
+        scene, scanpath = run.scenes[index], replay(run, index, record)
+        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        boxes = None if scanpath.target is None else scene.boxes[scene.labels == scanpath.target]
+        name = f"{scene.name}, {record['policy']}"
+        data.append(
+            episode_data(
+                scanpath,
+                scene.image,
+                views,
+                pool,
+                name=name,
+                settings=settings,
+                boxes=boxes,
+                classes=10,
+                width=256,
+                quality=60,
+            )
+        )
+        size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
+        size += 7 * scanpath.values.numel()
+    return data

@@ -1,0 +1,58 @@
+"""Replays recorded episodes, with the detections and the belief at each fixation."""
+
+from dataclasses import replace
+
+import torch
+
+from eval.comparison.run import Run
+from semfov.belief.observers import LearnedMap, Observer, Semantic
+from semfov.episode import StoredLooks, rollout
+from semfov.errors import InputError
+from semfov.gaze.choice import Given
+from semfov.paths import Scanpath, trace
+from semfov.runs.results import Record
+from semfov.runs.setup import make_map_evidence
+
+
+def replay(run: Run, index: int, record: Record) -> Scanpath:
+    """Replay a recorded episode.
+
+    A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
+    the learned map of the recommended agent or, if none is shipped for the eye, a map by Kaplan's rule from tempered
+    scores.
+
+    Args:
+        run: the run that made the record.
+        index: index of the scene.
+        record: a record of `episodes.jsonl`.
+
+    Returns:
+        The scanpath.
+    """
+    grid, candidate = run.grid(index), run.candidate(record["policy"], index)
+    cue = record.get("cue")
+    cells = torch.tensor([record["cells"]])
+    looks = StoredLooks(run.detections(index), grid, None if cue is None else torch.tensor([cue]))
+    steps = rollout(
+        looks,
+        candidate.observer,
+        lambda _, cell: candidate.acquisition(cue, grid, cell),
+        cells[:, 0],
+        Given(cells),
+        most=cells.shape[1],
+    )
+    beside: Observer | None = None
+    if not isinstance(candidate.observer, Semantic | LearnedMap):
+        beside = _map_beside(run)
+    with torch.no_grad():
+        scanpath = trace(steps, grid, ("background", *run.scenes.classes), cue, beside)
+    found = record.get("found_at", -1) >= 0
+    # The time to read the store is not the duration of the episode.
+    return replace(scanpath, target=record.get("target"), found=found, seconds=())
+
+
+def _map_beside(run: Run) -> Observer:
+    try:
+        return LearnedMap(make_map_evidence(run.config.belief.map_model, run.eye))
+    except InputError:
+        return Semantic(len(run.scenes.classes) + 1, tempering=0.5)

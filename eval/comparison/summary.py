@@ -1,0 +1,207 @@
+"""Output that all runs share: tables, per-episode records and the manifest."""
+
+import csv
+import io
+import json
+import platform
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+
+from eval.comparison.run import Run
+from semfov.io.code import commit
+from semfov.io.compatibility import recommended
+from semfov.io.files import inside, write_text
+from semfov.io.storage import checksum
+from semfov.metrics.averages import standard_error
+from semfov.runs.results import Record
+from semfov.runs.scene_run import gather
+from semfov.runs.setup import fovea_of, plain
+from semfov.runs.tables import percent
+from semfov.version import __version__
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A measure after 0, 1, … gaze shifts: its mean, and its standard errors over images and over repetitions."""
+
+    mean: Array
+    over_images: Array
+    over_repetitions: Array
+    images: int
+    episodes: int
+
+
+def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> Curve:
+    """Average episodes: first over the episodes of each image, then over images.
+
+    Args:
+        records: records of one policy.
+        measure: maps an episode's record to its measure after 0, 1, … gaze shifts.
+
+    Returns:
+        The mean curve with its standard errors.
+    """
+    images: dict[Any, list[Array]] = defaultdict(list)
+    repetitions: dict[int, dict[Any, list[Array]]] = defaultdict(lambda: defaultdict(list))
+    for record in records:
+        curve = measure(record)
+        images[record["scene"]].append(curve)
+        repetitions[record["repetition"]][record["scene"]].append(curve)
+
+    def per_image(groups: dict[Any, list[Array]]) -> Array:
+        return np.stack([np.mean(group, axis=0) for group in groups.values()])
+
+    means = per_image(images)
+    return Curve(
+        means.mean(0),
+        standard_error(means),
+        standard_error(np.stack([per_image(groups).mean(0) for groups in repetitions.values()])),
+        len(means),
+        sum(map(len, images.values())),
+    )
+
+
+def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
+    """Records of all scenes, sorted by policy, and the seconds that each stage took."""
+    records, seconds = gather(run)
+    order = {policy: number for number, policy in enumerate(run.policies)}
+    records.sort(key=lambda record: order.get(record["policy"], len(order)))
+    return records, seconds
+
+
+def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
+    """Mean value of each scene, from pairs of scene and value.
+
+    Args:
+        values: the pairs.
+
+    Returns:
+        The mean by scene.
+
+    >>> by_scene([(7, 1.0), (7, 2.0), (8, 5.0)])
+    {7: 1.5, 8: 5.0}
+    """
+    scenes: dict[Any, list[float]] = defaultdict(list)
+    for scene, value in values:
+        scenes[scene].append(value)
+    return {scene: float(np.mean(group)) for scene, group in scenes.items()}
+
+
+def write_summary(out: Path, name: str, text: str, records: list[Record]) -> list[Path]:
+    """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
+    files = {f"{name}.md": text, "records.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
+    for file, content in files.items():
+        write_text(out / file, content)
+    return [out / file for file in files]
+
+
+def write_files(
+    run: Run,
+    program: str,
+    tables: dict[str, str],
+    records: list[Record],
+    seconds: dict[str, float],
+) -> list[Path]:
+    """Write tables (text by file name), records, settings and manifest; returns the paths of all files."""
+    files = {
+        **tables,
+        "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
+        "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
+        "manifest.json": json.dumps(manifest(run, program, seconds), indent=2) + "\n",
+    }
+    for name, text in files.items():
+        write_text(inside(run.config.out, name), text)
+    return [run.config.out / name for name in files]
+
+
+def announce(summary: str, written: Iterable[Path]) -> None:
+    """Print the tables and the paths of the written files."""
+    print(summary)
+    print("written:")
+    for path in written:
+        print(f"  {path}")
+
+
+def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
+    """The curves as CSV, with one row for each average, policy and number of gaze shifts.
+
+    Args:
+        curves: curves by average and policy.
+        head: column headings of the averages and of the values.
+
+    Returns:
+        The text of the CSV file.
+    """
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    average, value = head
+    errors = ["error_over_images", "error_over_repetitions"]
+    rows.writerow([average, "policy", "shifts", value, *errors, "images", "episodes"])
+    for average, policies in curves.items():
+        for policy, curve in policies.items():
+            for shift in range(len(curve.mean)):
+                figures = (f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions))
+                rows.writerow([average, policy, shift, *figures, curve.images, curve.episodes])
+    return text.getvalue()
+
+
+def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:
+    """A table row for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
+    return [
+        [
+            name,
+            *(percent(curve.mean[n], curve.over_images[n]) for n in shifts),
+            f"{100 * curve.over_repetitions.max():.2f}",
+        ]
+        for name, curve in curves.items()
+    ]
+
+
+LAST_COLUMN = "max. SEM over repetitions"
+"""Heading of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
+
+
+def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
+    """Provenance of the results: versions, commit, checksums and seed; and the time that each stage took."""
+    return {
+        "command": ["python", "-m", program, *sys.argv[1:]],
+        "commit": commit(),
+        "versions": {
+            "semfov": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+        "machine": platform.machine(),
+        "run_key": run.key,
+        "code_sha256": run.code,
+        "store_key": run.store.key,
+        "saliency_keys": {name: store.key for name, store in run.saliency_stores.items()},
+        "scenes_sha256": run.scenes.fingerprint,
+        "eye": run.eye.settings(),
+        "model_sha256": None if run.models.observation is None else checksum(run.models.observation.state_dict()),
+        "seed": run.config.protocol.seed,
+        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
+    }
+
+
+def sensing(run: Run) -> str:
+    """Detector, sensor and observation model of a run, as text for titles."""
+    sensor, model = run.config.sensor, run.config.belief.model
+    spread = fovea_of(run.eye)
+    what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"
+    if run.models.observation is None:
+        return what
+    own = model or recommended(run.eye.detector.name, float(spread.growth))
+    return f"{what}, observation model {Path(own).stem}"

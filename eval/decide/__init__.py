@@ -1,0 +1,54 @@
+"""Decide whether a target is present, where, and how surely: `python -m eval.decide` measures the agent's decisions.
+
+    python -m eval.decide --data.root DIR --data.annotations instances.json --out runs/decide
+
+Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
+for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
+rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
+published belief with the same thresholds and with the rule of the published agent, and one sharp look at the whole
+photograph. Detections from every cell are stored and shared with `python -m eval.search`.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+from eval.comparison.model_folder import verification_of, with_models
+from eval.comparison.summary import announce, sensing
+from eval.decide.config import DecideConfig, DecisionConfig
+from eval.decide.report import probabilities, summary
+from eval.decide.run import DecisionRun
+from semfov.errors import DataError
+from semfov.io.files import write_text
+from semfov.runs.command import run_command
+from semfov.runs.scene_run import finish, gather
+from semfov.runs.workers import rank
+from semfov.viz.presence import plot_roc
+from semfov.viz.style import save_figure
+
+
+def search_and_decide(config: DecideConfig) -> None:
+    """Run the searches, and write their tables, records and ROC curves."""
+    settings = {each.name: getattr(config, each.name) for each in fields(config)}
+    completed = with_models(DecisionConfig(**settings))
+    if completed.models is not None and completed.verification is None:
+        # A model of verification that is given explicitly takes the place of the folder's.
+        completed = replace(completed, verification=verification_of(completed.models))
+    run = DecisionRun(completed)
+    finish(run, "deciding")
+    if rank() > 0:
+        return
+    records, _ = gather(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    text = summary(records, sensing(run))
+    files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
+    for name, content in files.items():
+        write_text(config.out / name, content)
+    picture = save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")
+    announce(text, [*(config.out / name for name in files), picture])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(search_and_decide, DecideConfig, __doc__, arguments)

@@ -1,0 +1,304 @@
+"""Searches for classes that are present and for classes that are absent, each until it reaches a decision."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+
+import torch
+from torch import Tensor
+
+from eval.comparison.run import Run
+from eval.decide.config import DecisionConfig
+from semfov.belief.belief import Belief
+from semfov.belief.grid import Grid
+from semfov.belief.look_features import highest_score
+from semfov.belief.observers import Semantic, Target
+from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
+from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
+from semfov.detection.detections import Detections
+from semfov.episode import Step, Stopwatch, StoredLooks
+from semfov.errors import InputError, check
+from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.matching import box_iou
+from semfov.runs.looks import Box, photograph_looks
+from semfov.runs.remembered import RememberedLooks
+from semfov.runs.results import Record
+from semfov.runs.search_protocol import choose_classes, search_steps
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.setup import make_observation, make_verification, published_model
+from semfov.strategy import Strategy
+
+Rule = Callable[[Step, int, Grid], Tensor]
+"""Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
+
+AGENT, UNVERIFIED, RANDOM, PUBLISHED, AT_THE_GAZE = (
+    "target-evidence",
+    "target-evidence, no closer looks",
+    "random gaze",
+    "published belief",
+    "published belief, a detection at the gaze",
+)
+"""Ways to search: the agent's, with closer looks and without; the agent's belief with random gaze; and the paper's
+belief and gaze with two rules."""
+
+SEEN_FROM = 0.5
+"""Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
+
+
+class DecisionRun(Run):
+    """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
+
+    The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
+    thresholds as the others, and, without thresholds, as soon as a detection at the gaze shows the target.
+
+    Args:
+        config: settings of the run.
+    """
+
+    task: Task = "search"
+    config: DecisionConfig
+
+    def __init__(self, config: DecisionConfig) -> None:
+        context = config.belief.context
+        check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
+        # The key of the run, which the base makes first, depends on this model.
+        self.verification: Verification | None = None
+        super().__init__(config)
+        evidence = self.models.evidence
+        assert evidence is not None
+        chosen = evidence.thresholds or Thresholds(0.9, 0.05)
+        self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
+        # The shipped model was fitted with the shipped evidence.
+        if config.closer and (config.verification or config.belief.target_model is None):
+            self.verification = make_verification(config.verification, self.eye)
+        self.verified = {AGENT, RANDOM} if self.verification is not None else set()
+        # All share one observer, so that the likelihoods of the looks are computed only once.
+        observer = Target(evidence)
+        learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
+        self.compared: dict[str, tuple[Strategy, Rule]] = {
+            AGENT: (learned, self._by_thresholds),
+            **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
+            RANDOM: (random, self._by_thresholds),
+        }
+        model = self._published()
+        if model is not None:
+            self.models = replace(self.models, observation=model)
+            published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
+            self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
+
+    def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
+        return decide(step, target, self.thresholds)
+
+    def _verifier(self, closer: Callable[[Box], Detections], grid: Grid, target: int) -> Verifier[Step]:
+        """The closer looks of one search."""
+        assert self.verification is not None
+        assert self.verification.thresholds is not None
+        config = self.config
+        thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
+        candidates = CandidateCells(grid, target)
+        return Verifier(
+            self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
+        )
+
+    def _published(self) -> FovealObservationModel | None:
+        """The observation model of the published belief; None if the settings name none and none is shipped."""
+        name = self.config.belief.model
+        try:
+            return make_observation(name or published_model(self.config.detector, self.config.sensor), self.eye)
+        except InputError:
+            if name is not None:
+                raise
+            return None
+
+    def _key(self) -> str:
+        evidence, config = self.models.evidence, self.config
+        assert evidence is not None
+        chosen = asdict(evidence.thresholds) if evidence.thresholds else None
+        given = [config.confirm, config.give_up, config.place, config.closer]
+        model = self.verification
+        verified = None
+        if model is not None:
+            assert model.thresholds is not None
+            verified = [asdict(model.thresholds), *(each.tolist() for each in model.parameters())]
+        what = ["decisions", super()._key(), chosen, given, verified]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run all searches of a scene; returns their records, and the seconds that each stage took."""
+        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
+        watch = Stopwatch()
+        area = self.config.data.max_target_area or 1.0
+        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
+        covered = grid.footprint(annotation.boxes)
+        records: list[Record] = []
+        if not classes:
+            return records, watch.seconds
+        detections = self.detections(index)
+        with torch.inference_mode():
+            image = self.scenes[index].image[None]
+            sharp = self.eye.detector(image)
+            tiles = [self.eye.detector(tile) for tile in quarters(image)]
+        watch.lap("look")
+        closer: RememberedLooks[int | Box, Detections] = RememberedLooks(
+            lambda: photograph_looks(self.eye, lambda: image, grid)
+        )
+        for target in classes:
+            goal = covered[annotation.labels == target].any(0)
+            start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
+            cell = torch.randint(len(grid), (1,), generator=start)
+            noise = noise_for(protocol, len(grid), self.scenes.ids[index], target, 0)[None]
+            common = {
+                "scene": self.scenes.ids[index],
+                "target": target,
+                "present": bool(goal.any()),
+                "sharp": float(highest_score(sharp, target)),
+                "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
+                "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
+            }
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            for name, (strategy, judge) in self.compared.items():
+
+                def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
+                    return judge(step, target, grid)
+
+                verifier = self._verifier(closer, grid, target) if name in self.verified else None
+                with torch.inference_mode():
+                    steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
+                    last, seen = steps[-1], torch.cat([step.cell for step in steps])
+                    if verifier is not None:
+                        decision = verifier.conclude()
+                    else:
+                        # If a detection at the gaze has ended the search, the target's place is the fixated cell.
+                        place = int(last.cell) if judge is at_the_gaze else None
+                        shown = [detections[cell] for cell in seen.split(1)]
+                        decision = conclude(int(rule(last)), last.belief, shown, grid, target, place)
+                closely = 0 if verifier is None else len(verifier.looks)
+                records.append(
+                    {
+                        "policy": name,
+                        **common,
+                        "outcome": decision.outcome,
+                        "probability": decision.probability,
+                        "place": decision.place,
+                        "looks": len(steps) + closely,
+                        "closer": closely,
+                        "right_place": None if decision.cell is None else bool(goal[decision.cell]),
+                        "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
+                        "landing": landing([step.belief for step in steps], seen, goal, target),
+                        "landing_seen": seen_on_landing(steps, seen, goal, target, grid),
+                    }
+                )
+        watch.lap("search")
+        return records, watch.seconds
+
+
+def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
+    """The rule that ends a search when a detection at the gaze shows the target with a score of `SEEN_FROM` or more."""
+    return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
+
+
+def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> Record | None:
+    """Whether the centre of the target's most confident detection lies on the target, and how well its box fits.
+
+    Args:
+        seen: detections of one look, a batch of one.
+        grid: the grid over the image.
+        target: the target's class, 1..K.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        boxes: `(M, 4)`, the target's annotated boxes.
+
+    Returns:
+        A record with `right` and `overlap`; None if no detection has a score for the target.
+    """
+    score = seen.scores[0, :, target] * seen.mask[0]
+    if not bool((score > 0).any()):
+        return None
+    box = seen.boxes[0, int(score.argmax())]
+    cell = int(grid.footprint(box[None], "soft")[0].argmax())
+    return {"right": bool(goal[cell]), "overlap": overlap(box, boxes)}
+
+
+def quarters(image: Tensor) -> list[Tensor]:
+    """The four quarters of pictures `(B, C, H, W)`."""
+    row, column = image.shape[-2] // 2, image.shape[-1] // 2
+    rows = image[..., :row, :], image[..., row:, :]
+    return [part for half in rows for part in (half[..., :column], half[..., column:])]
+
+
+def overlap(box: Tensor | None, boxes: Tensor) -> float | None:
+    """Largest intersection over union of a box with any of `boxes`; None if either is missing."""
+    if box is None or not len(boxes):
+        return None
+    return float(box_iou(box[None], boxes).max())
+
+
+def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> list[float] | None:
+    """Probability of the target in the first fixated cell that overlaps it, before and after that look.
+
+    Args:
+        beliefs: the belief after each look.
+        cells: the fixated cells in order.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        target: the target's class, 1..K.
+
+    Returns:
+        The two probabilities; None if no look lands on the target, or if already the first one does.
+    """
+    hits = goal[cells].nonzero()[:, 0].tolist()
+    if not hits or hits[0] == 0:
+        return None
+    pair = beliefs[hits[0] - 1 : hits[0] + 1]
+    return [float(belief.probability(target)[0, cells[hits[0]]]) for belief in pair]
+
+
+def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
+    """Whether the first look that lands on the target sees it.
+
+    The look sees the target if the target is the best class of a detection over the fixated cell.
+
+    Args:
+        steps: the steps of the search.
+        path: the fixated cells in order.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        target: the target's class, 1..K.
+        grid: the grid over the image.
+
+    Returns:
+        Whether it does; None if no look lands on the target, or if already the first one does (as in `landing`).
+    """
+    hits = goal[path].nonzero()[:, 0].tolist()
+    if not hits or hits[0] == 0:
+        return None
+    step = steps[hits[0]]
+    return bool(confirms(step.detections, grid, step.cell, target, 0.0))
+
+
+LANDINGS = ["landings", "p", "seen", "p, seen", "not seen", "p, not seen"]
+"""Column headings of `landing_cells`."""
+
+LANDINGS_TOLD = (
+    "Probability of the target in the first fixated cell that overlaps it (the landing), before and after that look. "
+    "The target counts as seen where it is the best class of a detection over that cell."
+)
+"""Caption of the table of landings."""
+
+
+def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
+    """Cells of a table row: number of landings and mean probabilities before and after, of all, seen, and not seen.
+
+    Args:
+        landed: for each landing, the probabilities before and after it (`landing`), and whether the target was seen.
+
+    Returns:
+        The cells under the headings `LANDINGS`.
+    """
+    cells: list[str] = []
+    for group in (landed, [each for each in landed if each[1]], [each for each in landed if not each[1]]):
+        means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]
+        cells += [str(len(group)), " → ".join(f"{value:.3f}" for value in means) or "-"]
+    return cells

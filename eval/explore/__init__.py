@@ -1,0 +1,32 @@
+"""Scene exploration: `python -m eval.explore` learns what is where in photographs by moving a fovea.
+
+Without arguments it explores the embedded scenes, which need no data set. With a COCO-format data set:
+
+    python -m eval.explore --data.root val2017 --data.annotations instances_val2017.json --out runs/explore_val
+
+Detections from every cell are stored and shared with `python -m eval.search`. To continue a stopped run, give the same
+command again.
+"""
+
+from collections.abc import Sequence
+
+from eval.comparison.model_folder import with_models
+from eval.explore.config import ExploreConfig
+from eval.explore.report import report
+from eval.explore.run import ExploreRun
+from semfov.runs.command import run_command
+from semfov.runs.scene_run import finish
+from semfov.runs.workers import rank
+
+
+def explore(config: ExploreConfig) -> None:
+    """Run a scene exploration experiment and write its tables, figures and records."""
+    run = ExploreRun(with_models(config))
+    finish(run, "exploring")
+    if rank() == 0:
+        report(run)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(explore, ExploreConfig, __doc__, arguments)

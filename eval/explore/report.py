@@ -1,0 +1,100 @@
+"""Output of an exploration run: the share of rightly named cells after each gaze shift, counted in three ways."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from eval.comparison.page import write_run_report
+from eval.comparison.summary import (
+    LAST_COLUMN,
+    Array,
+    Curve,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    sensing,
+    write_files,
+)
+from eval.explore.run import ExploreRun
+from semfov.errors import DataError
+from semfov.metrics.exploration import success_rate
+from semfov.runs.results import Record
+from semfov.runs.tables import table
+from semfov.viz.style import save_figure
+
+SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+"""Gaze shifts at which tables show the success rate."""
+
+ANSWERS = {
+    "all classes": ("right", "as published: the answer is the most probable class, background included"),
+    "without background": ("right_without_background", "the answer is the most probable class other than background"),
+    "whole grid": ("right_everywhere", "all cells count: background is right where there is no object"),
+}
+"""Ways to count answers: the field of the records, and a description."""
+
+
+def report(run: ExploreRun) -> None:
+    """Write all output of a finished run, and print the tables."""
+    records, seconds = collect(run)
+    if not records:
+        raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
+    # The reference of one sharp look comes after the policies.
+    names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
+    curves = {answer: success(records, list(names), answer) for answer in ANSWERS}
+    summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
+    written = write_files(run, "eval.explore", tables, records, seconds)
+    written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles={name: title for name, (_, title) in ANSWERS.items()},
+            label="cells with the right class (%)",
+            shifts=SHIFTS,
+        )
+    )
+    announce(summary, written)
+
+
+def success(records: list[Record], policies: Sequence[str], answer: str) -> dict[str, Curve]:
+    """Success rate of each policy after each gaze shift."""
+    measure = partial(_rate, field=ANSWERS[answer][0])
+    return {policy: curve_of((r for r in records if r["policy"] == policy), measure) for policy in policies}
+
+
+def _rate(record: Record, field: str) -> Array:
+    return success_rate(record[field], record["grid_cells" if field == "right_everywhere" else "object_cells"])
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
+    """The tables that the run prints: success rates with standard errors over images."""
+    shifts = [n for n in SHIFTS if n <= last]
+    head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
+    lines = []
+    for answer, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
+            "percentage of cells with a right answer after n gaze shifts, among the cells with objects unless all "
+            "cells count, ± standard error over images)",
+            "",
+            *table([head, *curve_rows(policies, shifts)]),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
+    """Draw the success rate against gaze shifts."""
+    from semfov.viz import plot_success_rate
+
+    figure = plot_success_rate(
+        {name: curve.mean for name, curve in curves.items()},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Exploration, {answer}\n{sensing(run)}",
+    )
+    return save_figure(figure, run.config.out / f"success_rate_{answer.replace(' ', '_')}.png")

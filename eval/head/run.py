@@ -1,0 +1,310 @@
+"""Experiments with an eye in a head that turns: search and exploration over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief.observers import LearnedMap, Target
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Scenes
+from semfov.episode import Stopwatch
+from semfov.errors import DataError, check
+from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.head.belief import SceneObserver
+from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, Gain, PerPrice, Scan, SearchGain
+from semfov.head.panoramas import Panoramas
+from semfov.head.speeds import Speeds
+from semfov.head.views import Views
+from semfov.head.world import Boxes, Flat, Panorama, Places, World
+from semfov.io.storage import checksum
+from semfov.metrics.exploration import right_cells
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.looks import SOURCES, tight
+from semfov.runs.remembered import RememberedLooks
+from semfov.runs.results import Record
+from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
+from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
+from semfov.runs.store import DetectionStore
+
+OURS = "ours"
+"""Name of the method that the others are compared with."""
+
+MOSAIC = 240.0
+"""Width in degrees of a mosaic of 4 × 4 photographs."""
+
+LOOKS = (*SOURCES, "semfov.head.views", "semfov.head.panoramas", "semfov.data.mosaics", "semfov.head.episode")
+"""Modules that turn a scene into looks; all modules that they import count, too."""
+
+Degrees = Annotated[float, Range(1, 170)]
+
+
+@dataclass(frozen=True)
+class HeadConfig(Settings):
+    """An eye in a head that turns, in scenes larger than its field of view: search and exploration.
+
+    Args:
+        data: the photographs from which scenes are composed (without a root: the embedded scenes).
+        detector: the detector, which is applied to each foveated view.
+        scene: `panorama`, photographs on a sphere around the viewer, or `mosaic`, photographs side by side in front.
+        scenes: number of panoramas or mosaics to compose.
+        targets: number of classes to search for in each scene, drawn at random; 0 leaves out the searches.
+        explore: whether to run explorations, too.
+        fields: fields of view in degrees; with several, the head can zoom.
+        width: width of a scene in pixels: of a panorama's 360 degrees, or of a mosaic, which is 240 degrees wide.
+        passes: largest number of looks in an episode.
+        seconds: longest duration of an episode, in simulated seconds.
+        speeds: speeds of eye and head.
+        dwell: number of looks from each pose of a head that scans the scene in a fixed order.
+        foresight: in searches, weight of what a look reveals away from the gaze, relative to a find at the gaze.
+        prior: probability that a cell that was never seen holds the target.
+        unseen: in explorations, assumed probability that the first fixation of a cell names it right.
+        seed: random seed of scenes, targets, starts and tie-breaking.
+        out: folder for tables, records and figures.
+        cache: folder for the stored looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    scene: Literal["panorama", "mosaic"] = "panorama"
+    scenes: Count = 20
+    targets: Whole = 3
+    explore: bool = True
+    fields: tuple[Degrees, ...] = (60.0,)
+    width: Annotated[int, Range(64, 65_536)] = 2560
+    passes: Annotated[int, Range(1, 10_000)] = 60
+    seconds: Positive = 20.0
+    speeds: Speeds = field(default_factory=Speeds)
+    dwell: Count = 2
+    foresight: Weight = FORESIGHT
+    prior: Share = PRIOR
+    unseen: Weight = UNSEEN
+    seed: Seed = 0
+    out: Path = Path("runs/head")
+    cache: Path | None = None
+    store: bool = True
+    workers: Workers | None = None
+
+
+class HeadRun(SceneRun):
+    """Scenes, eye and models of a run; every process builds its own from the settings.
+
+    Attributes:
+        scenes: the panoramas or mosaics.
+    """
+
+    config: HeadConfig
+
+    def __init__(self, config: HeadConfig) -> None:
+        self.config = config
+        check(0 < config.prior < 1, "prior", "a probability above 0 and below 1", config.prior)
+        self.eye = make_eye(config.detector, SensorConfig())
+        self.fovea = SensorConfig().fovea
+        self.target_evidence, self.map_evidence = (
+            make_target_evidence(None, self.eye),
+            make_map_evidence(None, self.eye),
+        )
+        photographs = make_scenes(config.data, self.eye.detector.classes)
+        if not len(photographs):
+            raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
+        self.scenes: Scenes = (
+            Panoramas(photographs, width=config.width, count=config.scenes, seed=config.seed)
+            if config.scene == "panorama"
+            else Mosaics(
+                photographs,
+                4,
+                4,
+                tile=(config.width // 4, config.width * 3 // 16),
+                count=config.scenes,
+                seed=config.seed,
+            )
+        )
+        looks, components = {"eye": self.eye.settings(), "fields": config.fields}, len(self.eye.detector.classes) + 1
+        self.store = DetectionStore(cache_folder(config.cache) / "head", looks, LOOKS, components)
+
+    def _key(self) -> str:
+        besides = ("out", "cache", "store", "workers", "data", "detector")
+        protocol = {name: value for name, value in asdict(self.config).items() if name not in besides}
+        models = [checksum(model.state_dict()) for model in (self.target_evidence, self.map_evidence)]
+        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, models])
+
+    def world(self, index: int) -> World:
+        """The scene as a world in which the head looks around."""
+        image = self.scenes[index].image
+        return Panorama(image) if self.config.scene == "panorama" else Flat(image, degree=image.shape[-1] / MOSAIC)
+
+    def places(self, index: int) -> Places:
+        """The places of the scene's objects."""
+        scenes = self.scenes
+        return scenes.regions(index) if isinstance(scenes, Panoramas) else Boxes(scenes.annotation(index).boxes)
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run the searches and the exploration of a scene with every way of moving eye and head; returns records."""
+        watch, config = Stopwatch(), self.config
+        views = Views(self.world(index), config.fields, fovea=self.fovea)
+        store = self.store if config.store else None
+
+        def open_scene() -> Detect:
+            detect = live(self.eye, views)
+            return lambda action: tight(detect(action))
+
+        looks = RememberedLooks(open_scene, store, lambda: self.scenes.digest(index))
+        watch.lap("scene")
+        try:
+            with torch.inference_mode():
+                records = self._searches(index, views, looks)
+                watch.lap("search")
+                if config.explore:
+                    records += self._explorations(index, views, looks)
+                watch.lap("exploration")
+        finally:
+            looks.save()  # even when the run is stopped
+        return records, watch.seconds
+
+    def ways(self, gain: Gain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
+        """Every way of moving eye and head, by its name in the tables: its acquisition function after an action."""
+        views, config = gain.views, self.config
+        pose = start // views.cells
+        order = raster(views, pose)
+        shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
+        return {
+            OURS: lambda action: PerPrice(gain, config.speeds, action),
+            "ours, half a view apart": lambda action: PerPrice(gain, config.speeds, action, range(len(views))),
+            "ours, blind to prices": lambda action: PerPrice(gain, None, action),
+            "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
+            "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),
+            "random head and eye": lambda action: Anywhere(views),
+            "eye alone": lambda action: Scan(gain, [pose], 1, action),
+        }
+
+    def start(self, index: int, views: Views, what: int) -> int:
+        """First action of the episodes for a target (0: an exploration): the centre of a random view of the tiling."""
+        generator = np.random.Generator(np.random.PCG64([self.config.seed, index, what]))
+        poses = [*chain(*views.tiling[0])]
+        return int(generator.choice(poses)) * views.cells + views.cells // 2 + 5
+
+    def targets(self, index: int) -> list[int]:
+        """The classes to search for in a scene."""
+        generator = np.random.Generator(np.random.PCG64([self.config.seed, index]))
+        legal = self.scenes.targets(index)
+        return sorted(generator.permutation(legal)[: self.config.targets].tolist())
+
+    def _searches(self, index: int, views: Views, looks: Detect) -> list[Record]:
+        config, records = self.config, list[Record]()
+        places, labels = self.places(index), self.scenes.annotation(index).labels
+        gain = SearchGain(views, config.foresight)
+        observer = SceneObserver(Target(self.target_evidence), views, prior=config.prior)
+        for target in self.targets(index):
+            wanted, start = places[labels == target], self.start(index, views, target)
+            if bool(rests_on(views, start, wanted).any()):
+                continue  # no search starts on its target
+            for name, acquire in self.ways(gain, start).items():
+                steps, found = list[HeadStep](), False
+                for step in self._steps(views, looks, observer, acquire, start, target, index):
+                    steps.append(step)
+                    found = bool(rests_on(views, step.action, wanted).any())
+                    if found:
+                        break
+                records.append(
+                    {
+                        "task": "search",
+                        "way": name,
+                        "scene": self.scenes.ids[index],
+                        "target": self.scenes.classes[target - 1],
+                        "found": found,
+                        "passes": len(steps),
+                        "seconds": steps[-1].seconds,
+                        "turns": turns(steps, views),
+                        "actions": [step.action for step in steps],
+                    }
+                )
+        return records
+
+    def _steps(self, views, looks, observer, acquire, start, target, index):  # type: ignore[no-untyped-def]
+        config = self.config
+        return look_around(
+            views, looks, observer, acquire, start, target=target, speeds=config.speeds, passes=config.passes,
+            seconds=config.seconds, seed=[config.seed, index, target or 0],
+        )  # fmt: skip
+
+    def _explorations(self, index: int, views: Views, looks: Detect) -> list[Record]:
+        answers = answers_of(views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes))
+        area, config = views.world.area * answers.any(-1), self.config
+        gain, observer = (
+            ExploreGain(views, self.map_evidence, config.unseen),
+            SceneObserver(LearnedMap(self.map_evidence), views),
+        )
+        start, records = self.start(index, views, 0), list[Record]()
+        for name, acquire in self.ways(gain, start).items():
+            seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
+            for step in self._steps(views, looks, observer, acquire, start, None, index):
+                # A cell that was never seen gets no answer, even if the prior favours a class.
+                told = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
+                right = (right_cells(told, answers)[0] * area).sum() / area.sum()
+                besides = (right_cells(told[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
+                seconds.append(step.seconds)
+                success.append(float(right))
+                objects.append(float(besides))
+                actions.append(step.action)
+            records.append(
+                {
+                    "task": "exploration",
+                    "way": name,
+                    "scene": self.scenes.ids[index],
+                    "seconds": seconds,
+                    "success": success,
+                    "objects": objects,
+                    "actions": actions,
+                }
+            )
+        return records
+
+
+def turns(steps: list[HeadStep], views: Views) -> int:
+    """Number of times that the head moved."""
+    poses = [step.action // views.cells for step in steps]
+    return sum(one != other for one, other in pairwise(poses))
+
+
+def raster(views: Views, pose: int) -> list[int]:
+    """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
+    rows = next(rows for rows in views.tiling if any(pose in row for row in rows))
+    snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(rows)))]
+    at = snake.index(pose)
+    return snake[at:] + snake[:at]
+
+
+def answers_of(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
+    """Which classes are right for each cell of the scene, those of the objects that overlap it.
+
+    A cell and an object overlap if the object contains the cell's centre, or the cell contains one of the points
+    sampled over the object. Cells that no view shows have no answer.
+
+    Args:
+        views: the views of the scene.
+        places: the places of the objects.
+        labels: `(M,)`, the classes of the objects, 1..K.
+        classes: number of classes K.
+
+    Returns:
+        `(S, K+1)` boolean, for the S cells of the scene.
+    """
+    world = views.world
+    samples = places.samples()
+    cells = world.cell_of(samples.flatten(0, 1)).view(samples.shape[:2])
+    overlap = torch.zeros(len(places), len(world.scene), dtype=torch.bool).scatter(-1, cells, True)
+    overlap |= places.contain(world.centres)
+    overlap &= views.reachable
+    return overlap.T.float() @ F.one_hot(labels, classes + 1).float() > 0

@@ -1,0 +1,58 @@
+"""Compare models with people: how soon they find the same targets, and how well they predict where people look.
+
+Visual search: models from files of scanpaths, random baselines, and semfov's policies on the available pictures:
+
+    python -m eval.human search --people human_scanpaths --files "[elm.json, nnIBS.json]" --pictures "[val2017]"
+
+Free viewing: exploration policies, saliency, centre bias and random gaze, compared with people fixation by fixation:
+
+    python -m eval.human viewing --people fixations.json --data.root images --detector.name yolox-nano
+
+To continue a stopped run, give the same command again.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from eval.human.searching.compare import compare
+from eval.human.searching.config import PeopleSearchConfig
+from eval.human.viewing.config import ViewingConfig
+from eval.human.viewing.report import report
+from eval.human.viewing.run import ViewingRun
+from eval.human.viewing.scores import halves, score_all
+from eval.human.viewing.sequences import score_sequences
+from semfov.runs.command import run_command
+from semfov.runs.scene_run import finish
+from semfov.runs.workers import rank
+
+
+def viewing(config: ViewingConfig) -> None:
+    """Compare policies with people who view pictures freely."""
+    run = ViewingRun(config)
+    finish(run, "following people")
+    if rank() == 0:
+        fitted, reported = halves(run)
+        scored = score_all(run, fitted, reported)
+        report(run, scored, score_sequences(scored, reported), reported)
+
+
+JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
+    "search": (compare, PeopleSearchConfig),
+    "viewing": (viewing, ViewingConfig),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] not in JOBS:
+        print(__doc__)
+        got = repr(given[0]) if given else "nothing"
+        print(
+            f"expected {' or '.join(JOBS)} as the first argument, got {got}; add --help to see its settings",
+            file=sys.stderr,
+        )
+        return 0 if given in (["--help"], ["-h"]) else 2
+    job, config = JOBS[given[0]]
+    return run_command(job, config, __doc__, given[1:])

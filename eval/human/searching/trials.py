@@ -1,0 +1,138 @@
+"""Scanpaths of searches, reduced to cells and cut at the target, as Ruarte et al. (2025) compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semfov.belief.grid import Grid
+from semfov.data.fixations import Fixations, read_ruarte, read_table
+from semfov.errors import DataError
+from semfov.metrics.scanpath import found_at, merge_close
+from semfov.runs.seeds import generator_for
+
+Array = NDArray[np.float64]
+
+
+def read_searches(path: Path, screen: tuple[int, int], subject: str | None = None) -> list[Fixations]:
+    """Read the scanpaths of a file, or of all JSON files of a folder.
+
+    Args:
+        path: a table (`.csv`), a JSON file in the format of Ruarte et al., or a folder of such JSON files.
+        screen: `(width, height)` of the screen in pixels.
+        subject: name of the searcher (None: the name given in the file).
+
+    Returns:
+        The scanpaths in screen pixels.
+
+    Raises:
+        DataError: the folder holds no JSON file, or a scanpath has no target or box.
+    """
+    if path.is_dir():
+        files = sorted(path.glob("*.json"))
+        if not files:
+            raise DataError(f"{path}: expected JSON files of scanpaths, found none")
+        return [each for file in files for each in read_searches(file, screen, subject)]
+    if path.suffix == ".csv":
+        found = [each.resized(screen) for each in read_table(path)]
+    else:
+        found = read_ruarte(path, screen=screen, subject=subject)
+    for each in found:
+        if each.target is None or each.box is None:
+            raise DataError(f"{path}: {each.picture}: expected a target and its box, by which searches are scored")
+    return found
+
+
+def shift_found(search: Fixations, longest: int) -> int:
+    """The gaze shift that found the target, from the file or else from the box; -1 if no fixation of `longest` did."""
+    assert search.box is not None
+    at = len(search) - 1 if search.found else -1
+    if search.found is None:
+        at = found_at(search.points + 0.5, search.box)
+    return at if at < longest else -1
+
+
+def goal_cells(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
+    """First and last column, and first and last row, of the cells that the target's box overlaps."""
+    assert search.box is not None
+    step = np.array(search.size) / (grid.columns, grid.rows)
+    first = np.floor(np.array(search.box[:2]) / step + 1e-9)
+    last = np.ceil(np.array(search.box[2:]) / step - 1e-9) - 1
+    return int(first[0]), int(last[0]), int(first[1]), int(last[1])
+
+
+def in_cells(search: Fixations, grid: Grid) -> Array:
+    """The fixated cells of a search, up to the first on the target.
+
+    Successive fixations in the same cell are merged into one (`merge_close`), and all fixations after the first one in
+    a cell of the target are left out. As in Ruarte et al., coordinates count from the left and top edges of the screen.
+
+    Args:
+        search: the scanpath.
+        grid: the grid over the screen.
+
+    Returns:
+        `(n, 2)`, column and row of each cell.
+    """
+    step = np.array(search.size) / (grid.columns, grid.rows)
+    path = merge_close(np.clip(np.floor(search.points / step), 0, (grid.columns - 1, grid.rows - 1)), (1, 1))
+    left, right, top, bottom = goal_cells(search, grid)
+    x, y = path.T
+    on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+    return path[: on.argmax() + 1] if on.any() else path
+
+
+def drawn_searches(
+    searches: Sequence[Fixations],
+    grid: Grid,
+    start: tuple[float, float],
+    density: Array,
+    *,
+    longest: int,
+    seed: int,
+    name: str,
+) -> list[Fixations]:
+    """Random searches that draw cell after cell, without replacement, from the same density in every picture.
+
+    Args:
+        searches: one search for each picture, which gives the target.
+        grid: the grid over the screen.
+        start: the first fixation, in pixels of the screen.
+        density: `(X·Y,)`, weights of the cells, 0 or more.
+        longest: largest number of fixations in a search, including the first.
+        seed: random seed of the draws.
+        name: name of the searcher.
+
+    Returns:
+        A search for each picture.
+    """
+    centres = grid.centres.numpy()
+    first = int(grid.cell_of(torch.tensor(start)))
+    drawn = []
+    for each in searches:
+        generator = generator_for("searches", seed, each.picture, name)
+        weights = torch.from_numpy(density).double().clone()
+        weights[first] = 0
+        others = weights.multinomial(longest - 1, generator=generator).numpy()
+        cells = np.concatenate([[first], others])
+        left, right, top, bottom = goal_cells(each, grid)
+        x, y = cells % grid.columns, cells // grid.columns
+        on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+        cells = cells[: on.argmax() + 1] if on.any() else cells
+        drawn.append(
+            Fixations(
+                each.picture,
+                name,
+                centres[cells].astype(np.float64),
+                each.size,
+                None,
+                each.target,
+                each.box,
+                bool(on.any()),
+            )
+        )
+    return drawn

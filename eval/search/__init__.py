@@ -1,0 +1,33 @@
+"""Visual search: `python -m eval.search` finds objects in photographs by moving a fovea.
+
+Without arguments it searches the embedded scenes, which need no data set. With a COCO-format data set:
+
+    python -m eval.search --data.root val2017 --data.annotations instances_val2017.json --out runs/val
+    python -m eval.search --config configs/paper_search.yaml --data.root ... --data.annotations ...
+    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # a folder of train.fit_detector
+
+To continue a stopped run, give the same command again.
+"""
+
+from collections.abc import Sequence
+
+from eval.comparison.model_folder import with_models
+from eval.search.config import SearchConfig
+from eval.search.report import report
+from eval.search.run import SearchRun
+from semfov.runs.command import run_command
+from semfov.runs.scene_run import finish
+from semfov.runs.workers import rank
+
+
+def search(config: SearchConfig) -> None:
+    """Run a visual search experiment and write its tables, figures and records."""
+    run = SearchRun(with_models(config))
+    finish(run, "searching")
+    if rank() == 0:
+        report(run)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(search, SearchConfig, __doc__, arguments)

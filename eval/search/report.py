@@ -1,0 +1,142 @@
+"""Output of a search run: cumulative performance as tables and curves, and a few scanpaths."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.comparison.page import write_run_report
+from eval.comparison.replay import replay
+from eval.comparison.summary import (
+    LAST_COLUMN,
+    Array,
+    Curve,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    sensing,
+    write_files,
+)
+from eval.search.run import SearchRun
+from semfov.errors import DataError
+from semfov.io.files import clean, inside
+from semfov.metrics.search import cumulative_performance, random_search
+from semfov.runs.results import Record
+from semfov.runs.tables import table
+from semfov.viz.style import save_figure
+from semfov.viz.views import foveated_views
+
+SHIFTS = (1, 5, 10, 15, 30)
+"""Gaze shifts at which tables show the cumulative performance."""
+
+AVERAGES = {
+    "all targets": "mean over images, every legal target of an image",
+    "commonest": "mean over images, the target class with most instances",
+}
+
+
+def report(run: SearchRun) -> None:
+    """Write all output of a finished run, and print the tables."""
+    records, seconds = collect(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    shifts = run.config.protocol.shifts
+    curves = {average: performance(records, list(run.policies), shifts, average) for average in AVERAGES}
+    expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
+    summary = summary_markdown(curves, expected, sensing(run))
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
+    written = write_files(run, "eval.search", tables, records, seconds)
+    written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles=AVERAGES,
+            label="targets found (%)",
+            shifts=SHIFTS,
+            others={"random, by formula": expected},
+        )
+    )
+    announce(summary, written)
+
+
+def performance(records: list[Record], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
+    """Cumulative performance of each policy, over all targets or over the commonest target of each image."""
+    measure = partial(_found, shifts=shifts)
+    counted = [record for record in records if record["commonest"] or average == "all targets"]
+    return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
+
+
+def _found(record: Record, shifts: int) -> Array:
+    return cumulative_performance(np.array([record["found_at"]]), shifts)
+
+
+def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
+    """Expected performance of random search for these targets (hypergeometric formula), mean over images."""
+    targets: dict[Any, dict[int, int]] = defaultdict(dict)
+    for record in records:
+        targets[record["scene"]][record["target"]] = len(record["goal"])
+    curves = [
+        np.mean([random_search(count, shifts, cells) for count in goals.values()], axis=0) for goals in targets.values()
+    ]
+    return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensing: str) -> str:
+    """The tables that the run prints: cumulative performance with standard errors over images."""
+    shifts = [n for n in SHIFTS if n < len(expected)]
+    head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
+    lines = []
+    for average, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
+            "percentage of targets found after n gaze shifts, not counting the first fixation, ± standard error over "
+            "images)",
+            "",
+        ]
+        rows = curve_rows(policies, shifts)
+        if average == "all targets":
+            rows.append(["random, by formula", *(f"{100 * expected[n]:.1f}" for n in shifts), ""])
+        lines += [*table([head, *rows]), ""]
+    return "\n".join(lines)
+
+
+def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Path:
+    """Draw the cumulative performance against gaze shifts."""
+    from semfov.viz import plot_cumulative_performance
+
+    figure = plot_cumulative_performance(
+        {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Visual search\n{sensing(run)}",
+    )
+    return save_figure(figure, run.config.out / "cumulative_performance.png")
+
+
+def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
+    """Draw a few episodes of the last policy in different scenes, preferring finds after two to six gaze shifts."""
+    from semfov.viz import plot_episode
+
+    last = [record for record in records if record["policy"] == list(run.policies)[-1]]
+    last.sort(key=lambda record: (record["found_at"] < 0, not 2 <= record["found_at"] <= 6))
+    chosen = list({record["scene"]: record for record in reversed(last)}.values())
+    chosen.sort(key=last.index)
+    paths = []
+    for record in chosen[: run.config.scanpaths]:
+        index = run.scenes.ids.index(record["scene"])
+        scene = run.scenes[index]
+        scanpath = replay(run, index, record)
+        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        boxes = scene.boxes[scene.labels == record["target"]]
+        # An id may be any text. Cleaned ids may coincide, so the scene's number is put before them.
+        told = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
+        path = inside(run.config.out, f"scanpath_{told}_{clean(record['target_name'])}.png")
+        paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), path))
+    return paths

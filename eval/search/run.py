@@ -1,0 +1,55 @@
+"""Visual search: all policies in one scene, from the photograph to the records."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import torch
+
+from eval.comparison.run import Run
+from eval.search.config import SearchConfig
+from semfov.episode import Stopwatch
+from semfov.gaze.policies import Task
+from semfov.runs.results import Record
+from semfov.runs.search_protocol import Episode, Outcome, episodes_of, run_episodes, tie_noise
+
+
+class SearchRun(Run):
+    """Visual search."""
+
+    task: Task = "search"
+    config: SearchConfig
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run all searches of a scene with all policies; returns records, and the seconds that each stage took."""
+        config, protocol = self.config, self.config.protocol
+        episodes = episodes_of(self.scenes, index, config.belief.columns, config.belief.rows, protocol)
+        watch = Stopwatch()
+        records: list[Record] = []
+        detections, grid = self.detections(index), self.grid(index)
+        watch.lap("look")
+        if not episodes:
+            return records, watch.seconds
+        noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
+        for name in self.policies:
+            candidate = self.candidate(name, index)
+            watch.lap("saliency")
+            with torch.inference_mode():
+                outcomes = run_episodes(
+                    episodes, candidate, detections, grid, noise, shifts=protocol.shifts, batch=protocol.batch
+                )
+            watch.lap(name)
+            records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
+        return records, watch.seconds
+
+    def _record(self, policy: str, episode: Episode, outcome: Outcome) -> Record:
+        fields = asdict(episode)
+        scene = fields.pop("scene")
+        return {
+            "policy": policy,
+            "scene": self.scenes.ids[scene],
+            **fields,
+            "target_name": self.scenes.classes[fields["target"] - 1],
+            "cells": list(outcome.cells),
+            "found_at": outcome.found_at,
+        }

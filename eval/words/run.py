@@ -1,0 +1,199 @@
+"""Does context help search? Compares searches with and without context, from the same starts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from eval.comparison.summary import Array, Curve, announce, collect, curve_of, manifest, sensing
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
+from semfov.belief import ContextPrior
+from semfov.belief.look_features import highest_score
+from semfov.errors import DataError, check
+from semfov.io.files import clean, inside, write_text
+from semfov.metrics.search import cumulative_performance
+from semfov.runs.config import (
+    BeliefConfig,
+    Context,
+    DataConfig,
+    DetectorConfig,
+    PolicyConfig,
+    ProtocolConfig,
+    SensorConfig,
+)
+from semfov.runs.results import Record
+from semfov.runs.scene_run import finish
+from semfov.runs.settings import Seed, Settings, Share, Weight, Workers
+from semfov.runs.setup import plain
+from semfov.runs.tables import table
+from semfov.runs.workers import rank
+
+SHIFTS = (1, 3, 5, 10, 30)
+"""Gaze shifts at which the table gives the share of targets found."""
+
+
+@dataclass(frozen=True)
+class WordsConfig(Settings):
+    """Search without context, with context counted from annotations, and with context from tables, each with a control.
+
+    Args:
+        data: the scenes to search.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief, a grid of class distributions.
+        protocol: the protocol of the experiment.
+        policy: the policy to which context is added: `target-evidence`, or a mapping such as `{policy: non-predictive,
+            tempering: 0.25, footprint: box_centre}`.
+        context: which context is added: `place`, `cooccurrence` or `both`.
+        counted: context counted from annotations, by name or file; it serves as the upper reference.
+        tables: contexts from tables, files of `train.fit_context --table`.
+        weights: weights of place and co-occurrence in all arms (null: the weights fitted with each context).
+        permuted: random seed of the control, in which the classes of each table are permuted.
+        missed: the first look counts as missing the target if the target's highest score in it is below this.
+        out: folder for tables, per-episode records and the manifest.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policy: str | PolicyConfig = "target-evidence"
+    context: Context = "both"
+    counted: str = "coco"
+    tables: tuple[Path, ...] = ()
+    weights: tuple[Weight, Weight] | None = None
+    permuted: Seed = 0
+    missed: Share = 0.1
+    out: Path = Path("runs/words")
+    cache: Path | None = None
+    workers: Workers | None = None
+
+
+class WordsRun(SearchRun):
+    """Searches that also record the target's highest score in the first look."""
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run all searches of a scene; each record also holds the target's highest score in the first look."""
+        records, seconds = super().outcomes(index)
+        if records:
+            scores = highest_score(self.detections(index), slice(None))  # type: ignore[arg-type]
+            for record in records:
+                record["first_score"] = round(float(scores[record["start"], record["target"]]), 6)
+        return records, seconds
+
+
+def words(config: WordsConfig) -> None:
+    """Run all arms, and write and print their results and differences."""
+    check(config.context != "none", "context", "place, cooccurrence or both", config.context)
+    arms = arms_of(config)
+    settings = {name: getattr(config, name) for name in ("data", "detector", "sensor", "belief", "protocol")}
+    settings |= {name: getattr(config, name) for name in ("out", "cache", "workers")}
+    run = WordsRun(SearchConfig(**settings, policies=tuple(arms.values()), scanpaths=0))
+    finish(run, "searching")
+    if rank() > 0:
+        return
+    records, seconds = collect(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    named = dict(zip(run.policies, arms, strict=True))
+    for record in records:
+        record["arm"] = named[record.pop("policy")]
+    text = "\n".join([f"{sensing(run)}, context: {config.context}", "", *told(records, list(arms), config)])
+    files = {
+        "words.md": text,
+        "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
+        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
+        "manifest.json": json.dumps(manifest(run, "eval.words", seconds), indent=2) + "\n",
+    }
+    for name, content in files.items():
+        write_text(config.out / name, content)
+    announce(text, [config.out / name for name in files])
+
+
+def arms_of(config: WordsConfig) -> dict[str, PolicyConfig]:
+    """The policies under comparison by their names in the table; changed contexts are written to the folder `out`."""
+    base = PolicyConfig(config.policy) if isinstance(config.policy, str) else config.policy
+    counted = ContextPrior.from_pretrained(config.counted)
+    arms = {"none": base, "counted": _with(base, config, config.counted if config.weights is None else counted)}
+    for path in config.tables:
+        name = clean(path.stem)
+        check(name not in arms, "tables", "files of different names", name)
+        prior = ContextPrior.from_pretrained(path)
+        arms[name] = _with(base, config, str(path) if config.weights is None else prior)
+        arms[f"{name}, permuted"] = _with(base, config, prior.permuted(config.permuted))
+    return arms
+
+
+def _with(base: PolicyConfig, config: WordsConfig, context: str | ContextPrior) -> PolicyConfig:
+    """Add a context to the policy; a context without a file is first written to the folder `out`."""
+    if isinstance(context, ContextPrior):
+        if config.weights is not None:
+            context.weights = dict.fromkeys(context.weights, config.weights)
+        # The name depends on the content, so that results with another context are never reused.
+        path = inside(config.out, f"context-{context.digest()[:16]}.safetensors")
+        if rank() == 0 and not path.exists():
+            context.save(path)
+        context = str(path)
+    return replace(base, context=config.context, context_model=context)
+
+
+def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) -> list[str]:
+    """Tables of all searches, and of the searches whose first look misses the target, as lines of Markdown."""
+    missed = [record for record in records if record["first_score"] < config.missed]
+    lines = []
+    for title, group in (("All searches", records), ("Searches whose first look misses the target", missed)):
+        if not group:
+            lines += [f"{title}: none.", ""]
+            continue
+        shifts = [n for n in SHIFTS if n <= config.protocol.shifts]
+        rows = [["context", *(f"CP@{n}" for n in shifts), *(f"gain @{n}" for n in shifts)]]
+        images = 0
+        for arm in arms:
+            plain_curve = curve_of((r for r in group if r["arm"] == arm), lambda r: found(r, config.protocol.shifts))
+            images = plain_curve.images
+            row = [arm, *(f"{100 * plain_curve.mean[n]:.1f}" for n in shifts)]
+            if arm == "none":
+                row += [""] * len(shifts)
+            else:
+                paired = differences(group, arm, config.protocol.shifts)
+                row += [signed(paired.mean[n], paired.over_images[n]) for n in shifts]
+            rows.append(row)
+        searches = len(group) // len(arms)
+        lines += [
+            f"{title} ({images} images, {searches} searches per arm; percentage of targets found after n gaze shifts, "
+            "mean over images; paired differences of the same searches, ± standard error over images)",
+            "",
+            *table(rows),
+            "",
+        ]
+    return lines
+
+
+def differences(records: Sequence[Record], arm: str, shifts: int) -> Curve:
+    """Share found with an arm minus share found without context, paired by search (`curve_of`)."""
+    without = {_search(record): record for record in records if record["arm"] == "none"}
+    chosen = [record for record in records if record["arm"] == arm]
+    return curve_of(chosen, lambda record: found(record, shifts) - found(without[_search(record)], shifts))
+
+
+def _search(record: Record) -> tuple[object, ...]:
+    return record["scene"], record["target"], record["repetition"]
+
+
+def found(record: Record, shifts: int) -> Array:
+    """Whether a search has found its target after 0, 1, … gaze shifts."""
+    return cumulative_performance(np.array([record["found_at"]]), shifts)
+
+
+def signed(value: float, error: float) -> str:
+    """A difference of shares and its standard error in percentage points, such as `+1.2 ± 0.4`."""
+    return f"{100 * value:+.1f}" + (f" ± {100 * error:.1f}" if np.isfinite(error) else "")

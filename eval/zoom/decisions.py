@@ -1,0 +1,127 @@
+"""Searches of large pictures for present and for absent classes, each until it reaches a decision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import torch
+
+from eval.decide.report import SHARES, telling
+from eval.decide.run import overlap
+from semfov.agents.windows import search
+from semfov.data.scene import Annotation
+from semfov.decision import MOST, OUTCOMES
+from semfov.metrics.calibration import BinarySums
+from semfov.runs.results import Record
+from semfov.runs.tables import mean, share, table
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.glances import Glances, Window
+
+OURS, UNVERIFIED = "ours", "ours, without closer looks"
+"""Names of searches with closer looks at places that seem to hold the target, and of searches without them."""
+
+
+def decide_all(
+    glances: Glances,
+    evidence: GlimpseEvidence,
+    classes: tuple[str, ...],
+    targets: Sequence[int],
+    annotation: Annotation,
+    slices: Sequence[Window],
+    *,
+    passes: int,
+) -> list[Record]:
+    """Search a picture until a decision, for each target, with closer looks and without them.
+
+    Args:
+        glances: the looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
+        targets: classes to search for, 1..K.
+        annotation: the annotated objects.
+        slices: the slices of the picture.
+        passes: largest number of passes of a search.
+
+    Returns:
+        Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
+        the overview and all slices. Evidence without fitted verification makes no closer looks.
+    """
+    shown = torch.stack([glance.show for glance in glances.see(slices)])
+    records: list[Record] = []
+    ways = {OURS: MOST} if evidence.verification is None else {OURS: MOST, UNVERIFIED: 0}
+    for target, (way, closer) in product(targets, ways.items()):
+        path = search(glances, evidence, classes, target, passes=passes, closer=closer)
+        decision = path.decision
+        assert decision is not None
+        there = annotation.boxes[annotation.labels == target]
+        first = float(path.glances[0].show[target - 1])
+        records.append(
+            {
+                "measure": "decision",
+                "way": way,
+                "target": classes[target],
+                "present": len(there) > 0,
+                "outcome": decision.outcome,
+                "probability": decision.probability,
+                "passes": path.passes,
+                "overlap": overlap(decision.box, there),
+                "overview": first,
+                "slices": max(first, float(shown[:, target - 1].max())),
+                "count": len(slices) + 1,
+            }
+        )
+    return records
+
+
+def by_way(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """The records of each way of searching; all ways have the same searches in the same order."""
+    ways: dict[str, list[Record]] = {}
+    for record in records:
+        ways.setdefault(record["way"], []).append(record)
+    return ways
+
+
+def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
+    ways = by_way(records)
+    told = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
+    searches = next(iter(ways.values()))
+    for name, key in (("the overview, highest score", "overview"), ("all slices, highest score", "slices")):
+        told[name] = torch.tensor([record[key] for record in searches])
+    return told, torch.tensor([record["present"] for record in searches])
+
+
+def decision_tables(records: Sequence[Record]) -> list[str]:
+    """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
+    told, there = probabilities(records)
+    ways = by_way(records)
+    searches = next(iter(ways.values()))
+    passes = {way: mean([record["passes"] for record in of]) for way, of in ways.items()}
+    passes["the overview, highest score"] = "1"
+    passes["all slices, highest score"] = mean([record["count"] for record in searches])
+    rows = [["", "passes", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE", "Brier"]]
+    for (name, score), figures in zip(told.items(), telling(told, there), strict=True):
+        sums = BinarySums.of(score, there)
+        rows.append([name, passes[name], *figures, f"{sums.ece:.3f}", f"{sums.brier:.3f}"])
+    decided = [["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]]
+    for way, of in ways.items():
+        for kind in (True, False):
+            group = [r for r in of if r["present"] is kind]
+            counts = [share(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
+            found = [r for r in group if r["outcome"] == "found"]
+            right = share(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
+            looks, chance = mean([r["passes"] for r in group]), mean([r["probability"] for r in group], 2)
+            name = f"it is {'there' if kind else 'not'}{way.removeprefix(OURS)}"
+            decided.append([name, counts[0], right, *counts[1:], looks, chance])
+    return [
+        f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
+        "in % at the given false alarm rates. `ours` is the probability at the end of a search.",
+        "",
+        *table(rows),
+        "",
+        "Decisions in %, and the share of finds of present targets whose box is right (IoU 0.5).",
+        "",
+        *table(decided),
+        "",
+    ]

@@ -1,0 +1,100 @@
+"""Runs an experiment with large pictures to its end, and writes its tables and curves."""
+
+from collections import defaultdict
+from statistics import mean, median
+
+import torch
+
+from eval.comparison.summary import announce, write_summary
+from eval.zoom.decisions import decision_tables, probabilities
+from eval.zoom.run import ZoomConfig, ZoomRun
+from semfov.runs.results import Record
+from semfov.runs.scene_run import complete
+from semfov.runs.tables import table
+from semfov.viz.reliability import plot_reliability
+from semfov.viz.style import save_figure
+
+
+def zoom(config: ZoomConfig) -> None:
+    """Run all scenes that are not finished yet, and write tables, records and curves."""
+    run = ZoomRun(config)
+    records = complete(run, "zooming")
+    if records is None:
+        return
+    text = summary(records, run)
+    written = write_summary(config.out, "zoom", text, records)
+    if "recall" in config.measures:
+        written.append(_curves(records, run))
+    if decided := [record for record in records if record["measure"] == "decision"]:
+        told, there = probabilities(decided)
+        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in told.items()}
+        written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
+    announce(text, written)
+
+
+def curve(records: list[Record], passes: int) -> list[float]:
+    """Share of all objects found after each pass; if a way of looking ends early, its last share stays."""
+    total = sum(record["objects"] for record in records)
+    counts = [sum(r["found"][min(n, len(r["found"])) - 1] for r in records) for n in range(1, passes + 1)]
+    return [count / max(total, 1) for count in counts]
+
+
+def summary(records: list[Record], run: ZoomRun) -> str:
+    """Tables as Markdown."""
+    groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    for record in records:
+        groups[record["measure"], record["way"]].append(record)
+    finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
+    lines = recalls(finding, run) if finding else []
+    hits = {way: group for (measure, way), group in groups.items() if measure == "first hit"}
+    if hits:
+        rows = [["", "mean", "median", "failures at the cap"]]
+        for way, group in hits.items():
+            counts = [record["passes"] for record in group]
+            failed = sum(not record["hit"] for record in group) / len(group)
+            rows.append([way, f"{mean(counts):.2f}", f"{median(counts):g}", f"{100 * failed:.1f} %"])
+        count = len(next(iter(hits.values())))
+        lines += [
+            f"Passes to the first confirmed hit, including the overview, in {count} searches for a class that one of "
+            "the slices shows with a score of 0.3 or more.",
+            "",
+            *table(rows),
+            "",
+        ]
+    if decided := [record for record in records if record["measure"] == "decision"]:
+        lines += decision_tables(decided)
+    return "\n".join(lines)
+
+
+def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
+    """Table of recall for every way of looking."""
+    passes = run.config.passes
+    at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
+    pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
+    rows = [["", *map(str, at), "area under the curve", "boxes for each object"]]
+    for way, group in finding.items():
+        line = curve(group, passes)
+        boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
+        rows.append([way, *(f"{line[n - 1]:.3f}" for n in at), f"{mean(line):.3f}", f"{boxes:.2f}"])
+    what = "objects" if run.config.target is None else run.config.target
+    objects = sum(record["objects"] for record in next(iter(finding.values())))
+    return [
+        f"Recall of {objects} {what} in {len(run.scenes)} pictures after n passes of the detector, including the "
+        f"overview (score 0.1, IoU 0.5); a pass takes {pixels:.3f} million pixels.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for way in dict.fromkeys(record["way"] for record in records if record["measure"] == "recall"):
+        group = [record for record in records if record["way"] == way and record["measure"] == "recall"]
+        axes.plot(range(1, run.config.passes + 1), curve(group, run.config.passes), label=way)
+    axes.set(xlabel="passes of the detector", ylabel="recall", ylim=(0, None))
+    axes.legend(fontsize="small")
+    return save_figure(figure, run.config.out / "recall.png")

@@ -1,0 +1,229 @@
+"""Experiments with pictures larger than the detector's input: recall and first hits against detector passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from torch import Tensor
+
+from eval.zoom.decisions import decide_all
+from semfov.data.classes import class_index
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
+from semfov.detection.detections import Detections
+from semfov.episode import Stopwatch
+from semfov.io.storage import checksum
+from semfov.runs.results import Record
+from semfov.runs.scene_run import SceneRun, digest_of
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.settings import Count, Range, Workers
+from semfov.runs.setup import make_zoom_observation
+from semfov.runs.window_looking import SHOWN, Tile, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
+from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.gist import FOUND
+from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge
+from semfov.zoom.observed import ObservedRates
+from semfov.zoom.search import find_everything, look_for
+
+Measure = Literal["recall", "hit", "decision"]
+
+
+@dataclass(frozen=True)
+class ZoomConfig(WindowLookingConfig):
+    """Large pictures: recall against detector passes, passes to the first confirmed hit, and decisions.
+
+    Args:
+        data: the photographs (without a root: the embedded scenes).
+        detector: the detector.
+        mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
+        columns: number of photographs in a row of a mosaic.
+        rows: number of photographs in a column of a mosaic.
+        tile: width in pixels of a photograph's slot in a mosaic; the height is three quarters of it.
+        target: class whose objects are to be found (None: objects of any class).
+        slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
+        overlap: overlap of neighbouring slices, as a share of their side.
+        passes: largest number of detector passes.
+        measures: what to measure: `recall` after each pass; passes to the first `hit`, in mosaics, for classes that a
+            slice shows; the `decision` at the end of a search.
+        sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
+            until a decision (with `target`, only that class is searched for).
+        cut: what to do with boxes at a window's border.
+        model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
+        observation: observation model by magnification to compare with, by name or file (None: the one shipped for
+            the detector, if there is one).
+        seed: random seed of mosaics and random orders.
+        out: folder for tables, records and figures.
+        cache: folder for the stored looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    target: str | None = None
+    slice: Tile = 640
+    overlap: Annotated[float, Range(0, 0.9)] = 0.2
+    passes: Annotated[int, Range(2, 100_000)] = 24
+    measures: tuple[Measure, ...] = ("recall", "hit", "decision")
+    sought: Count = 4
+    observation: str | None = None
+    out: Path = Path("runs/zoom")
+    workers: Workers | None = None
+
+
+class ZoomRun(WindowLooking, SceneRun):
+    """Ways of looking at large pictures; every process builds its own run from the settings."""
+
+    config: ZoomConfig
+
+    def __init__(self, config: ZoomConfig) -> None:
+        super().__init__(config)
+        self.observation = make_zoom_observation(config.observation, self.eye)
+        names = self.eye.detector.classes
+        self.target = None if config.target is None else class_index(config.target, names, "target")
+
+    def _key(self) -> str:
+        settings = asdict(self.config)
+        besides = ("out", "cache", "store", "workers", "data", "detector", "model", "observation")
+        protocol = {name: value for name, value in settings.items() if name not in besides}
+        evidence = self.evidence
+        thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
+        verified = None if evidence.verification is None else repr(evidence.verification.thresholds)
+        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds, verified]
+        observed = None if self.observation is None else checksum(self.observation.state_dict())
+        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
+
+    def slices(self, index: int, lattice: Lattice) -> list[Window]:
+        """The slices of a scene: the photographs of a mosaic, or squares of a picture."""
+        if isinstance(self.scenes, Mosaics):
+            boxes = [tile.slot for tile in self.scenes.tiles(index)]
+            return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+        return slices(lattice, self.config.slice, self.config.overlap)
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Measure all ways of looking at a scene; returns records, and the seconds that each stage took."""
+        watch = Stopwatch()
+        glances = self.glances(index)
+        records: list[Record] = []
+        measures = self.config.measures
+        for name, turns in self._finding(index, glances) if "recall" in measures else ():
+            seen = [turn.glance for turn in islice(turns, self.config.passes)]
+            records.append(self._recall(name, index, seen))
+            if name in ("slices, raster", "ours"):
+                records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
+        watch.lap("recall")
+        if self.config.mosaics and "hit" in measures:
+            records += self._first_hits(index, glances)
+        watch.lap("first hit")
+        if "decision" in measures:
+            records += self._decisions(index, glances)
+        watch.lap("decision")
+        glances.save()
+        return records, watch.seconds
+
+    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Turn[Any]]]]:
+        """Every way of looking for all objects, with its name in tables."""
+        cut, lattice = self.slices(index, glances.lattice), glances.lattice
+        annotation, target = self.annotation(index), self.target
+        orders = {
+            "slices, raster": raster(cut),
+            "slices, random": shuffled(cut, [self.config.seed, index]),
+            "slices, ranked by the overview": ranked(cut, target, most=False),
+            "quad-tree, best first": quad_tree(lattice, target, most=False),
+        }
+        for name, order in orders.items():
+            yield name, look_by_look(glances, order, None)
+        yield "ours", find_everything(glances, self.evidence, target)
+        yield "ours, four at a time", find_everything(glances, self.evidence, target, batch=4)
+        if self.observation is not None:
+            observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
+            yield "by the observation model", find_everything(glances, observed, target)
+        found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
+        every = [*half_steps(lattice)][1:]
+        yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], found, self.config.passes), None)
+
+    def _decisions(self, index: int, glances: Glances) -> list[Record]:
+        """Search for classes that are present and for classes that are absent."""
+        config, annotation = self.config, self.scenes.annotation(index)
+        targets = (
+            choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
+            if self.target is None
+            else [self.target]
+        )
+        names = "background", *self.scenes.classes
+        cut = self.slices(index, glances.lattice)
+        records = decide_all(glances, self.evidence, names, targets, annotation, cut, passes=config.passes)
+        return [record | {"scene": self.scenes.ids[index]} for record in records]
+
+    def annotation(self, index: int) -> Annotation:
+        """The objects to be found: of the target class, or all."""
+        annotation = self.scenes.annotation(index)
+        if self.target is None:
+            return annotation
+        kept = annotation.labels == self.target
+        return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
+
+    def _recall(self, name: str, index: int, seen: list[Glance]) -> Record:
+        annotation = self.annotation(index)
+        counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
+        boxes = len(merge(seen, self.target, score=FOUND))
+        return {
+            "measure": "recall",
+            "way": name,
+            "scene": self.scenes.ids[index],
+            "objects": len(annotation.boxes),
+            "found": counts,
+            "boxes": boxes,
+            "windows": [list(glance.window.fixation) for glance in seen],
+        }
+
+    def _first_hits(self, index: int, glances: Glances) -> list[Record]:
+        """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
+        cut = self.slices(index, glances.lattice)
+        shown = torch.stack([glance.show for glance in glances.see(cut)]) >= SHOWN
+        closest = min(window.level for window in cut)
+        limit = len(cut) + 1
+        records: list[Record] = []
+        for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
+            orders = {
+                "slices, raster": raster(cut),
+                "slices, random": shuffled(cut, [self.config.seed, index, target]),
+                "slices, ranked by the overview": ranked(cut, target, most=True),
+                "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
+            }
+            ways: dict[str, Iterator[Turn[Any]]] = {
+                **{name: look_by_look(glances, order, None) for name, order in orders.items()},
+                "ours": look_for(glances, self.evidence, target, slices=cut),
+                "ours, free windows": look_for(glances, self.evidence, target, closest=True),
+            }
+            for name, turns in ways.items():
+                passes, hit = 0, False
+                for glance in (turn.glance for turn in islice(turns, limit)):
+                    passes += 1
+                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= SHOWN
+                    if hit:
+                        break
+                records.append(
+                    {
+                        "measure": "first hit",
+                        "way": name,
+                        "scene": self.scenes.ids[index],
+                        "target": self.scenes.classes[target - 1],
+                        "passes": passes if hit else limit,
+                        "hit": hit,
+                    }
+                )
+        return records
+
+
+def without_cut(glance: Glance) -> Glance:
+    """A look without the boxes that are cut by the border of its window."""
+    seen, whole = glance.detections, ~glance.cut
+    detections = Detections(seen.boxes[:, whole], seen.scores[:, whole], seen.mask[:, whole])
+    return replace(glance, detections=detections, cut=glance.cut[whole])

@@ -1,1 +1,0 @@
-"""Experiments over many scenes: settings, stores, protocols, runs and tables."""

@@ -1,0 +1,1 @@
+"""Fits, for a detector, everything that the agent needs."""

@@ -1,0 +1,197 @@
+"""Searches of photographs that can be repeated: looks and closer looks are made once, and remembered or stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Observer
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight, Step, rollout
+from semfov.eye import Eye
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Greedy, drawn_by
+from semfov.runs.looks import Box, photograph_looks
+from semfov.runs.remembered import RememberedLooks
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.seeds import generator_for
+from semfov.runs.store import DetectionStore
+
+
+@dataclass(frozen=True)
+class Sought:
+    """A class to search for in a photograph.
+
+    Attributes:
+        target: the class, 1..K.
+        goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
+        start: `(1,)`, the first fixated cell.
+        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
+    """
+
+    target: int
+    goal: Tensor
+    start: Tensor
+    spare: bool = False
+
+    @property
+    def present(self) -> bool:
+        """Whether the photograph holds the class."""
+        return bool(self.goal.any())
+
+
+class Photograph:
+    """A photograph with the classes to search for, and all looks at it so far.
+
+    Args:
+        eye: sensor and detector.
+        scenes: the photographs.
+        index: index of the photograph.
+        number: number of the photograph among those that are searched.
+        grid: the cells.
+        sought: the classes to search for.
+        store: store of all looks; None keeps them in memory.
+        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
+    """
+
+    def __init__(
+        self,
+        eye: Eye,
+        scenes: Scenes,
+        index: int,
+        number: int,
+        grid: Grid,
+        sought: tuple[Sought, ...],
+        store: DetectionStore | None = None,
+        everywhere: Callable[[int], Detections] | None = None,
+    ) -> None:
+        self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
+        self.grid, self.sought, self.store, self.everywhere = grid, sought, store, everywhere
+        self.looks: RememberedLooks[int | Box, Detections] = RememberedLooks(
+            lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
+        )
+        self._image: Tensor | None = None
+        self._from_cells: Detections | None = None
+
+    @property
+    def image(self) -> Tensor:
+        """The photograph, `(1, 3, H, W)`."""
+        if self._image is None:
+            self._image = self.scenes[self.index].image[None]
+        return self._image
+
+    def close(self) -> None:
+        """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
+        self._image = self._from_cells = None
+        self.looks.close()
+
+    def look(self, cell: int) -> Detections:
+        """Look from the centre of a cell; returns the detections, a batch of one."""
+        if self.everywhere is None:
+            return self.looks(cell)
+        self._from_cells = self.everywhere(self.index) if self._from_cells is None else self._from_cells
+        return self._from_cells[cell : cell + 1]
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+        return self.looks(tuple(box.tolist()))
+
+
+class PhotographLooks(Looks):
+    """Looks at a photograph that are made only once, whatever is searched for.
+
+    Args:
+        photograph: the photograph.
+        target: class 1..K that is searched for.
+    """
+
+    def __init__(self, photograph: Photograph, target: int) -> None:
+        self.photograph, self.grid, self.target = photograph, photograph.grid, target
+        self.like = photograph.grid.centres
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Look, or remember."""
+        seen = self.photograph.look(int(cell))
+        return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
+
+
+def photographs(
+    eye: Eye,
+    scenes: Scenes,
+    chosen: Sequence[int],
+    cells: tuple[int, int],
+    *,
+    classes: int,
+    absent: int | None,
+    max_area: float,
+    seed: int,
+    store: DetectionStore | None = None,
+    spare: int = 0,
+    everywhere: Callable[[int], Detections] | None = None,
+) -> list[Photograph]:
+    """Draw classes to search for in photographs.
+
+    Args:
+        eye: sensor and detector.
+        scenes: the photographs.
+        chosen: indices of those to search.
+        cells: `(columns, rows)` of the grid.
+        classes: maximum number of present classes in a photograph.
+        absent: maximum number of absent classes (None: as many as present ones).
+        max_area: classes that cover a larger share of the image are left out.
+        seed: seed of the classes and of the first fixations.
+        store: store of all looks; None keeps them in memory.
+        spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
+        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
+
+    Returns:
+        The photographs with classes to search for.
+    """
+    found: list[Photograph] = []
+    for index in chosen:
+        annotation = scenes.annotation(index)
+        grid = Grid(*cells, annotation.size)
+        covered = grid.footprint(annotation.boxes)
+        targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        held = set(annotation.labels.tolist())
+        more = sum(target not in held for target in targets) + spare
+        # The same draw with a larger number begins with the same classes.
+        wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
+        sought = tuple(
+            Sought(
+                target,
+                covered[annotation.labels == target].any(0),
+                torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
+                spare=number >= len(targets),
+            )
+            for number, target in enumerate(wide)
+        )
+        if targets:
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, everywhere))
+    return found
+
+
+def search(
+    photograph: Photograph, sought: Sought, observer: Observer, looks: int, ends: Callable[[Step], Tensor] | None = None
+) -> Iterator[Step]:
+    """Search a photograph for a class, where it is most probable.
+
+    Args:
+        photograph: the photograph.
+        sought: the class.
+        observer: turns looks into a belief.
+        looks: maximum number of looks.
+        ends: maps a step to a number `(1,)` above 0 that ends the search; None makes all looks.
+
+    Returns:
+        The steps.
+    """
+    source = PhotographLooks(photograph, sought.target)
+    choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
+    rule = None if ends is None else lambda step: ends(step) > 0
+    return rollout(source, observer, TargetPosterior(sought.target), sought.start, choice, most=looks, ends=rule)

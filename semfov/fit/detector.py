@@ -1,0 +1,197 @@
+"""Fit all models that the agent needs to a detector of the user."""
+
+import logging
+import time
+from dataclasses import asdict, fields, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from semfov.agent import ActivePerception
+from semfov.errors import InputError
+from semfov.fit.detector_parts.workshop import Workshop
+from semfov.fit.detector_report import class_counts, next_commands, report
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.io.files import write_text
+from semfov.io.manifest import PARTS, Manifest, place_of
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.looking import Looking, looking_of
+from semfov.runs.progress import Whole
+from semfov.runs.scene_run import finish
+from semfov.runs.setup import detector_options, plain
+from semfov.runs.workers import available_cores, rank
+from semfov.sensor import SENSORS
+
+_log = logging.getLogger(__name__)
+
+SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
+"""Settings that the manifest of a model folder records."""
+
+
+def fit_detector(
+    model: str | PathLike[str],
+    root: str | PathLike[str],
+    annotations: str | PathLike[str],
+    *,
+    out: str | PathLike[str] = "mymodels",
+    limit: int | None = None,
+    workers: int = 1,
+    **settings: Any,
+) -> ActivePerception:
+    """Fit all models that the recommended agent needs to a detector, and return the agent.
+
+    This is `python -m train.fit_detector` as a function. The detector looks at every photograph from every cell. Then
+    an observation model, the exponent of its likelihoods, target evidence, the verification of targets by closer looks
+    and a map of all classes are fitted. Each of them is compared with raw scores on held-out photographs, and the
+    verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
+    again.
+
+    Args:
+        model: the detector: a name or a file, as for `semfov.load_detector`.
+        root: folder of the photographs.
+        annotations: annotation file with their boxes, in COCO's format. Its categories are matched to the detector's
+            classes by name.
+        out: folder to write the models to. After an interruption, the same call continues where it stopped.
+        limit: maximum number of photographs (None: all).
+        workers: number of processes that look. More than one requires a script that calls this function under
+            `if __name__ == "__main__"`.
+        settings: other settings of `FitDetectorConfig` (`holdout`, `steps`, `seed`, …) and of the detector (`classes`,
+            `head`, `weights`, `threshold`, …: `DetectorConfig`).
+
+    Returns:
+        The agent with the fitted models. It uses only models that were better on the held-out photographs.
+
+    Raises:
+        InputError: a setting is unknown or out of range, or there is no such detector.
+        DataError: a file is missing or damaged, or none of the annotated categories is a class of the detector.
+
+    Example::
+
+        agent = semfov.fit_detector("mine.onnx", "photographs", "instances.json", classes=["cat", "dog", "cup"])
+        scanpath = agent.search(semfov.read_image("kitchen.jpg"), "cup")
+    """
+    of_detector = {each.name for each in fields(DetectorConfig)} - {"name"}
+    of_fit = {each.name for each in fields(FitDetectorConfig)} - {"model", "data", "detector", "out", "workers"}
+    unknown = sorted(settings.keys() - of_detector - of_fit)
+    if unknown:
+        raise InputError(
+            f"settings: expected names among {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}"
+        )
+    given = {name: value for name, value in settings.items() if name in of_detector}
+    if given.get("classes") is not None:
+        given["classes"] = tuple(given["classes"])
+    if given.get("weights") is not None:
+        given["weights"] = Path(given["weights"])
+    config = FitDetectorConfig(
+        model=Path(model),
+        data=DataConfig(Path(root), Path(annotations), limit, min_instances=0, max_target_area=None),
+        detector=DetectorConfig(**{"background": None, **given}),
+        out=Path(out),
+        workers=workers,
+        **{name: value for name, value in settings.items() if name in of_fit},
+    )
+    fit_folder(config)
+    return ActivePerception.from_pretrained(out)
+
+
+def fit_folder(config: FitDetectorConfig) -> None:
+    """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
+    config = config.named()
+    started = time.monotonic()
+    run = looking_of(replace(config, out=config.out / "progress"))
+    shop = Workshop(config, run)
+    config = shop.config
+    missing = class_counts(run, range(len(run.scenes)))
+    _tell(missing)
+    with Whole("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
+        with whole.stage("looking"):
+            finish(run, "looking")
+        if rank() > 0:
+            return
+        for part in PARTS:
+            with whole.stage(part):
+                shop.fit(part)
+    path = manifest_of(config, run, shop).write(config.out)
+    text = report(config, run, shop.parts, time.monotonic() - started)
+    print(text)
+    write_text(config.out / "report.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    figures = [figure for fitted in shop.parts.values() for figure in fitted.figures]
+    models = [fitted.part.file for fitted in shop.parts.values() if fitted.part.file]
+    print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
+    print(f"\nnext:\n{next_commands(config, run)}")
+
+
+def seconds_of_looks(run: Looking) -> float:
+    """Estimate the seconds that the remaining looks will take, from the time of one look."""
+    left = [index for index in range(len(run.scenes)) if run.store.load(run.digest(index)) is None]
+    if not left:
+        return 1.0
+    image = run.scenes[left[0]].image[None]
+    grid = run.grid(left[0])
+    with torch.inference_mode():
+        run.eye(image, grid.centres[:1])
+        before = time.monotonic()
+        run.eye(image, grid.centres[1:2] if len(grid) > 1 else grid.centres)
+    workers = min(run.config.workers or available_cores(), len(left))
+    return (time.monotonic() - before) * len(grid) * len(left) / workers
+
+
+def _tell(counts: dict[str, int]) -> None:
+    """Warn about classes without any object in the photographs."""
+    missing = [name for name, count in counts.items() if not count]
+    if missing:
+        some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
+        _log.warning(
+            "%d of the detector's %d classes have no box in the photographs (%s): the fitted models can only apply to "
+            "them what they learn from the other classes",
+            len(missing),
+            len(counts),
+            some,
+        )
+
+
+def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Manifest:
+    """Build the manifest of the model folder.
+
+    Args:
+        config: the settings.
+        run: the finished looks.
+        shop: the fitted parts.
+
+    Returns:
+        The manifest.
+    """
+    detector, sensor = run.eye.detector, config.sensor
+    options = plain(detector_options(config.detector))
+    weights = options.pop("weights", None)
+    is_file = Path(config.detector.name).is_file()
+    return Manifest(
+        classes=detector.classes,
+        detector={
+            "name": detector.name,
+            "sha256": detector.digest,
+            "model": None if is_file else config.detector.name,
+            "model_file": place_of(config.detector.name, config.out) if is_file else None,
+            "weights_file": None if weights is None else place_of(weights, config.out),
+            "options": options,
+        },
+        sensor={**asdict(sensor), **SENSORS[sensor.name], **given_of(sensor)},
+        grid=(config.columns, config.rows),
+        parts={name: fitted.part for name, fitted in shop.parts.items()},
+        training={
+            "data": run.scenes.fingerprint,
+            "photographs": len(run.scenes),
+            "held_out": len(shop.bench.held_out),
+            "settings": {name: getattr(config, name) for name in SETTINGS},
+        },
+    )
+
+
+def given_of(sensor: SensorConfig) -> dict[str, float]:
+    """Return the sensor settings that were given explicitly instead of by the sensor's name."""
+    given = {"sigma": sensor.sigma, "growth": sensor.growth}
+    return {name: value for name, value in given.items() if value is not None}

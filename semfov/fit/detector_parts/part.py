@@ -1,0 +1,144 @@
+"""What all parts of a model folder share: how a part is fitted, and the data and the earlier parts that it may use."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+
+from semfov.belief.observers import Observer, Semantic
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.gaze.policies import Policy
+from semfov.io.files import sha256
+from semfov.io.manifest import Part
+from semfov.model_folder import KINDS, Model
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.looking import Looking
+from semfov.runs.samples import Samples
+from semfov.runs.seeds import generator_for
+from semfov.strategy import Strategy
+
+SHIFTS = 5
+"""Gaze shifts after which searches and explorations are compared."""
+LONGEST = 15
+"""Maximum number of gaze shifts in them."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted part with its report.
+
+    Attributes:
+        part: the part's entry in the manifest of the folder.
+        report: report in Markdown.
+        figures: names of its figures in the folder.
+    """
+
+    part: Part
+    report: str
+    figures: list[str] = field(default_factory=list)
+
+
+class Bench:
+    """The looks that all parts are fitted to, and the parts that are finished.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell of all photographs.
+    """
+
+    def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
+        self.config, self.run = config.sized(len(run.scenes)), run
+        self.components = len(run.scenes.classes) + 1
+        self.holdout = self.config.observation.holdout
+        self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
+        self.parts: dict[str, Fitted] = {}
+
+    @property
+    def judged(self) -> Sequence[int]:
+        """Indices of the held-out photographs on which searches and explorations are compared."""
+        return self.held_out[: self.config.judged]
+
+    @property
+    def protocol(self) -> ProtocolConfig:
+        """The protocol of these searches and explorations."""
+        shifts = min(LONGEST, self.config.columns * self.config.rows - 1)
+        return ProtocolConfig(shifts=shifts, seed=self.config.seed)
+
+    def model(self, name: str) -> Model | None:
+        """Return the model of a part, or None if the part has no model or the agent should not use it."""
+        part = self.parts[name].part
+        return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
+
+    @property
+    def semantic(self) -> Semantic:
+        """The belief that fuses scores with the best exponent."""
+        part = self.parts["tempering"].part
+        if not part.used:
+            return Semantic(self.components)
+        return self.fusing(part.settings["scores"], part.settings["exponent"])
+
+    def fusing(self, scores: str, exponent: float) -> Semantic:
+        """Return the belief that fuses `raw` or `calibrated` scores with an exponent."""
+        model = self.model("observation") if scores == "calibrated" else None
+        assert model is None or isinstance(model, FovealObservationModel)
+        footprint = self.config.tempering.footprint
+        return Semantic(self.components, model, footprint=footprint, tempering=exponent)
+
+    @cached_property
+    def samples(self) -> Samples:
+        """Labelled detections from a few random cells of each photograph."""
+        parts, run = [], self.run
+        for index in range(len(run.scenes)):
+            grid = run.grid(index)
+            generator = generator_for("cells", self.config.seed, run.scenes.ids[index])
+            cells = torch.randperm(len(grid), generator=generator)[: self.config.fixations]
+            seen, annotation = run.detections(index)[cells], run.scenes.annotation(index)
+            parts.append(Samples.of(seen, grid.centres[cells], annotation, index, self.config.observation.iou))
+        return Samples.join(parts)
+
+
+class PartFit(ABC):
+    """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it.
+
+    Args:
+        bench: the looks and the finished parts.
+
+    Attributes:
+        name: name of the part, one of `semfov.io.manifest.PARTS`.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench, self.config, self.run = bench, bench.config, bench.run
+
+    @property
+    @abstractmethod
+    def settings(self) -> Any:
+        """The settings of the part, a dataclass. The part is fitted again if they change."""
+
+    @property
+    @abstractmethod
+    def tasks(self) -> dict[str, float]:
+        """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
+
+    @abstractmethod
+    def fit(self) -> Fitted:
+        """Fit the part."""
+
+    def write(self, model: Model, used: bool, why: str) -> Part:
+        """Write the model of the part and return its entry in the manifest."""
+        file = f"{self.name}.safetensors"
+        model.save(self.config.out / file)
+        return Part(file, sha256(self.config.out / file), used, why)
+
+
+def strategy(observer: Observer, policy: Policy) -> Strategy:
+    """Return a strategy without gradients."""
+    return Strategy(observer, policy).eval().requires_grad_(False)

@@ -1,0 +1,110 @@
+"""The verification of targets by closer looks, compared with decisions by the target evidence alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.errors import DataError
+from semfov.fit.closer_looks import photographs
+from semfov.fit.detector_parts.evidence import SUREST_OF_FEW
+from semfov.fit.detector_parts.part import Fitted, PartFit
+from semfov.fit.detector_words import in_words
+from semfov.fit.held_out import Array, Difference
+from semfov.fit.outputs import training_of
+from semfov.fit.verification_decisions import Ended, Verified
+from semfov.fit.verification_fit import fit_and_verify, shipped_mean
+from semfov.fit.verification_report import report
+from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.io.manifest import Part
+
+ABSENT = 200
+"""The threshold is chosen on about this many searches for absent classes, at most 20 in a photograph."""
+
+
+class VerificationFit(PartFit):
+    """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
+
+    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`shipped_mean`).
+    """
+
+    name: ClassVar[str] = "verification"
+
+    @property
+    def settings(self) -> FitVerificationConfig:
+        """The settings of the fit."""
+        return self.config.verification(self.bench.components - 1)
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        judged = len(self.bench.judged)
+        return {"looking": judged, "verifying": 0.5 * judged}
+
+    def fit(self) -> Fitted:
+        """Fit in folds, and compare decisions with those of the same agent without closer looks."""
+        config, run, judged = self.settings, self.run, self.bench.judged
+        evidence = self.bench.model("evidence")
+        if not isinstance(evidence, TargetEvidence):
+            why = "not fitted, since the agent does not use the target evidence"
+            return Fitted(Part(None, None, False, why), f"{why.capitalize()}.")
+        seen = photographs(
+            run.eye,
+            run.scenes,
+            judged,
+            (config.columns, config.rows),
+            classes=config.classes,
+            absent=config.absent,
+            max_area=config.max_target_area,
+            seed=config.seed,
+            spare=min(20, ABSENT // len(judged)),
+            everywhere=run.detections,
+        )
+        if len(seen) < 2:
+            raise DataError(
+                f"data: expected at least 2 held-out photographs with a class to search for, got {len(seen)}; give "
+                "more photographs"
+            )
+        assert evidence.thresholds is not None
+        # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
+        give_up = min(config.give_up, evidence.thresholds.give_up)
+        config = replace(config, folds=min(config.folds, len(seen)), give_up=give_up)
+        fitted = fit_and_verify(seen, evidence, config, shipped_mean(), SUREST_OF_FEW)
+        assert fitted.model.thresholds is not None
+        confirm = fitted.model.thresholds.confirm
+        after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
+        before = scores(fitted.searches, [each.unverified for each in fitted.searches])
+        gain = Difference.of(after, before)
+        why = (
+            f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
+            f"{in_words(gain, 'points gained', 100)}"
+        )
+        fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes, "target_model", "fitted")}
+        text = (
+            "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
+            "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
+            "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
+            "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
+        )
+        return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, f"{len(seen)} photographs")[0])
+
+
+def scores(searches: Sequence[Verified], ends: Sequence[Ended]) -> Array:
+    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
+
+    Args:
+        searches: the searches.
+        ends: their ends. A right place scores 1, a wrong place -1, and a search that finds nothing 0.
+
+    Returns:
+        `(P,)`, the mean score of each photograph.
+    """
+    known: dict[int, dict[bool, list[int]]] = {}
+    for each, (right, _) in zip(searches, ends, strict=True):
+        score = 0 if right is None else 1 if right else -1
+        known.setdefault(each.photograph, {}).setdefault(each.present, []).append(score)
+    return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in known.values()])

@@ -1,0 +1,91 @@
+"""Fit all parts of a model folder in order. Parts that an earlier run finished are read from the folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from semfov.errors import DataError, InputError
+from semfov.fit.detector_parts.evidence import EvidenceFit
+from semfov.fit.detector_parts.map import MapFit
+from semfov.fit.detector_parts.observation import ObservationFit
+from semfov.fit.detector_parts.part import Bench, Fitted, PartFit
+from semfov.fit.detector_parts.tempering import TemperingFit
+from semfov.fit.detector_parts.verification import VerificationFit
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.io.files import sha256, write_text
+from semfov.io.manifest import Part
+from semfov.runs.looking import Looking
+from semfov.runs.scene_run import digest_of
+
+FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit)
+"""The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
+
+
+class Workshop:
+    """Fit the parts to a detector.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell of all photographs.
+    """
+
+    def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
+        self.bench = Bench(config, run)
+        self.fits = {each.name: each(self.bench) for each in FITS}
+
+    @property
+    def config(self) -> FitDetectorConfig:
+        """The settings, with defaults that suit the number of photographs."""
+        return self.bench.config
+
+    @property
+    def parts(self) -> dict[str, Fitted]:
+        """The finished parts by their names."""
+        return self.bench.parts
+
+    @property
+    def stages(self) -> dict[str, dict[str, float]]:
+        """The tasks of each part, with an estimate of their seconds on one core."""
+        return {name: each.tasks for name, each in self.fits.items()}
+
+    def fit(self, name: str) -> Fitted:
+        """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""
+        key = digest_of([self.bench.run.key, self._settings(name)])
+        kept = self._kept(name, key)
+        if kept is None:
+            try:
+                kept = self.fits[name].fit()
+            except (DataError, InputError) as error:
+                kept = Fitted(Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}")
+            write_text(self._record(name), json.dumps({"key": key, **asdict(kept)}))
+        self.parts[name] = kept
+        return kept
+
+    def _settings(self, name: str) -> list[Any]:
+        """List everything except the looks that a part and its evaluation depend on."""
+        before = [fitted.part.sha256 for fitted in self.parts.values()]
+        before += [_plain(asdict(each.part)) for each in self.parts.values() if each.part.settings]
+        return [name, _plain(asdict(self.fits[name].settings)), self.config.judged, before]
+
+    def _record(self, name: str) -> Path:
+        return self.config.out / "progress" / f"{name}.json"
+
+    def _kept(self, name: str, key: str) -> Fitted | None:
+        try:
+            record = json.loads(self._record(name).read_text(encoding="utf-8"))
+            part = Part(**record["part"])
+            whole = record["key"] == key
+            whole = whole and (part.file is None or sha256(self.config.out / part.file) == part.sha256)
+            whole = whole and all((self.config.out / figure).is_file() for figure in record["figures"])
+        except Exception:  # a damaged record is no problem, as the part can be fitted again
+            return None
+        return Fitted(part, record["report"], record["figures"]) if whole else None
+
+
+def _plain(settings: dict[str, Any]) -> Any:
+    """Return the settings that a part depends on, as JSON values."""
+    left_out = ("out", "cache", "workers")
+    return json.loads(json.dumps({name: each for name, each in settings.items() if name not in left_out}, default=str))

@@ -1,0 +1,151 @@
+"""Settings for fitting all models to a detector."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from semfov.errors import InputError
+from semfov.fit.evidence import FitSearchConfig
+from semfov.fit.map_evidence import FitMapConfig
+from semfov.fit.observation_settings import FitConfig
+from semfov.fit.tempering import FitTemperingConfig
+from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole, Workers
+
+FEW = 8
+"""Detectors with fewer classes also learn from photographs that contain none of them."""
+MANY = 100
+"""With at least this many photographs, one in five is held out and training takes all its steps."""
+
+
+@dataclass(frozen=True)
+class FitDetectorConfig(Settings):
+    """Fit all models that the agent needs to your own detector.
+
+    Args:
+        model: the detector: a name or a file, as for `semfov.load_detector`.
+        data: photographs with boxes to learn from. All of them are used unless `data.limit` or `data.ids` selects some.
+        detector: options of the detector; `model` gives its name.
+        sensor: the foveal sensor.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        holdout: one in every n photographs is held out for the evaluation and for choosing thresholds (None: one in 5,
+            or one in 3 if there are fewer than 100 photographs).
+        judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores,
+            and to which the verification is fitted.
+        fixations: looks at each photograph to fit the observation model to.
+        steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
+        map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
+        thin: the report lists classes with fewer objects than this in the training photographs.
+        seed: seed of all random choices.
+        out: folder to write the models to.
+        cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
+        workers: number of processes that look (None: one for each CPU core).
+    """
+
+    model: Path | None = None
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(background=None))
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    columns: Side = 10
+    rows: Side = 10
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] | None = None
+    judged: Count = 100
+    fixations: Count = 8
+    steps: Count | None = None
+    map_steps: Count | None = None
+    thin: Whole = 20
+    seed: Seed = 0
+    out: Path = Path("mymodels")
+    cache: Path | None = None
+    workers: Workers | None = None
+
+    def named(self) -> "FitDetectorConfig":
+        """Return these settings with `model` as the detector's name, and with targets of all sizes in the photographs.
+
+        Returns:
+            The settings.
+
+        Raises:
+            InputError: no model is given, or `detector.name` names another one.
+        """
+        default = DetectorConfig().name
+        if self.model is None:
+            raise InputError("model: expected the name or the file of a detector, got none")
+        if self.detector.name not in (default, str(self.model)):
+            raise InputError(
+                f"detector.name: expected nothing, as model already names the detector ({str(self.model)!r}), got "
+                f"{self.detector.name!r}"
+            )
+        # Photographs without the target are needed as negative examples.
+        data = replace(self.data, max_target_area=None)
+        return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
+
+    def sized(self, photographs: int) -> "FitDetectorConfig":
+        """Return these settings, with each None replaced by a default that suits the number of photographs."""
+        few = photographs < MANY
+        share = min(photographs / MANY, 1)
+        return replace(
+            self,
+            holdout=self.holdout or (3 if few else 5),
+            steps=self.steps or max(250, round(500 * share)),
+            map_steps=self.map_steps or max(300, round(1000 * share)),
+        )
+
+    @property
+    def _common(self) -> dict[str, object]:
+        shared = {name: getattr(self, name) for name in ("data", "detector", "sensor", "seed", "out")}
+        return {**shared, "holdout": self.holdout or 5}
+
+    @property
+    def observation(self) -> FitConfig:
+        """Settings of the observation model."""
+        return FitConfig(**self._common, fixations=self.fixations)  # type: ignore[arg-type]
+
+    @property
+    def tempering(self) -> FitTemperingConfig:
+        """Settings for choosing the exponent of the likelihoods."""
+        return FitTemperingConfig(
+            **self._common,  # type: ignore[arg-type]
+            fixations=self.fixations,
+            columns=self.columns,
+            rows=self.rows,
+            min_objects=1,
+            max_target_area=self.max_target_area,
+        )
+
+    def evidence(self, classes: int) -> FitSearchConfig:
+        """Return the settings of the target evidence for a detector with so many classes."""
+        return FitSearchConfig(
+            **self._common,  # type: ignore[arg-type]
+            absent=2 if classes < FEW else None,
+            columns=self.columns,
+            rows=self.rows,
+            max_target_area=self.max_target_area,
+            steps=self.steps or 500,
+        )
+
+    def verification(self, classes: int) -> FitVerificationConfig:
+        """Return the settings of the verification for a detector with so many classes."""
+        shared = {name: each for name, each in self._common.items() if name != "holdout"}
+        return FitVerificationConfig(
+            **shared,  # type: ignore[arg-type]
+            absent=2 if classes < FEW else None,
+            columns=self.columns,
+            rows=self.rows,
+            max_target_area=self.max_target_area,
+        )
+
+    @property
+    def map(self) -> FitMapConfig:
+        """Settings of the learned map."""
+        return FitMapConfig(
+            **self._common,  # type: ignore[arg-type]
+            columns=self.columns,
+            rows=self.rows,
+            steps=self.map_steps or 1000,
+            gain_steps=max(1, (self.map_steps or 1000) // 5),
+        )

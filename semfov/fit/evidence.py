@@ -1,0 +1,334 @@
+"""Train the target evidence on the looks of whole searches."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief import TargetEvidence
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Target, TargetBelief
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import place_known
+from semfov.episode import Step, rollout
+from semfov.fit.descent import descend
+from semfov.fit.evidence_examples import ExampleLooks, Examples, make_examples
+from semfov.fit.frame import Fit, FitOnLooksConfig, fit_and_write, split
+from semfov.fit.outputs import training_of
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Exploratory
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.presence import area_under_roc
+from semfov.runs.looking import Looking
+from semfov.runs.settings import Count, Positive, Share, Weight
+from semfov.runs.tables import table
+
+JUDGED = (1, 5, 15)
+"""Numbers of looks after which a belief is evaluated."""
+
+
+@dataclass(frozen=True)
+class FitSearchConfig(FitOnLooksConfig):
+    """Train the evidence for a target.
+
+    Args:
+        classes: maximum number of present classes to learn from in each photograph.
+        absent: maximum number of absent classes to learn from in each photograph (None: as many as present ones).
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        landing: weight of the loss term for landing on the target with the next fixation.
+        presence: weight of the loss term for predicting whether the target is in the photograph.
+        gaze: weight of the loss term for two selected cells: the next one to fixate, and the most probable fixated one.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
+        surest: upper limit of that threshold, even if more false alarms result.
+        lost: maximum share of the targets that may be missed because their cell is not certain enough, and maximum
+            further share that may be missed because the search gives up.
+    """
+
+    classes: Count = 2
+    absent: Count | None = None
+    max_target_area: Positive = 0.2
+    landing: Weight = 1.0
+    presence: Weight = 0.5
+    gaze: Weight = 1.0
+    false_alarms: Share = 0.015
+    surest: Share = 1.0
+    lost: Share = 0.02
+    out: Path = Path("runs/fit_search")
+
+
+def fit_search(config: FitSearchConfig) -> None:
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
+    fit_and_write(config, fit_evidence)
+
+
+def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
+    """Fit the model and its thresholds.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell.
+
+    Returns:
+        The model with its evaluation.
+    """
+    examples = make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
+    held_out = split(examples.scene, config.holdout)
+    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
+    model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
+    judged, model.thresholds = judge(config, model, examples[held_out], grid)
+    counts = int((~held_out).sum()), int(held_out.sum())
+    return Fit(model, judged, *counts, report(judged, model.thresholds, *counts))
+
+
+def train(
+    config: FitSearchConfig, examples: Examples, grid: Grid, metadata: dict[str, object], components: int
+) -> TargetEvidence:
+    """Train the model on searches that it makes itself. Some of their fixations are random.
+
+    Args:
+        config: the settings.
+        examples: the training examples.
+        grid: the grid of cells.
+        metadata: metadata of the model.
+        components: number of classes with background, K+1.
+
+    Returns:
+        The trained model.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = TargetEvidence(components=components, metadata=metadata)
+
+    def loss_of(number: int) -> Tensor:
+        chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
+        # At first the model has learned nothing, so its own choice of fixations would be no better than random ones.
+        astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
+        counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
+        loss = chosen.score.new_zeros(())
+        for step in searches(model, chosen, grid, config.looks, astray, generator):
+            if step.shift + 1 in (1, *counted):
+                loss = loss + objective(config, step, chosen.goal)
+        return loss
+
+    descend(model.parameters(), loss_of, config.steps, config.rate)
+    return model.eval()
+
+
+def searches(
+    model: TargetEvidence, examples: Examples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+) -> Iterator[Step]:
+    """Search every example from a random start. The searches continue after they reach their target.
+
+    Args:
+        model: the target evidence.
+        examples: the examples, one search each.
+        grid: the grid of cells.
+        looks: number of looks in a search.
+        astray: share of the fixations that are drawn at random.
+        generator: source of random numbers.
+
+    Returns:
+        The steps of all searches together.
+    """
+    count = len(examples)
+    start = torch.randint(len(grid), (count,), generator=generator)
+    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
+    observer = Target(model, together=True)
+    return rollout(ExampleLooks(examples, grid), observer, TargetPosterior(1), start, choice, most=looks)
+
+
+def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
+    r"""Compute the training loss after a look.
+
+    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
+              + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
+              \qquad o = p / (1 - p)
+
+    The terms are the cross-entropy of all cells (four times their mean, which the formula writes for 100 cells), the
+    cross-entropy of two selected cells, the cross-entropy of presence in the photograph, and minus the log probability
+    that a fixation drawn in proportion to the odds o of the unvisited cells lands on the target.
+
+    The cell a is the next one to fixate, and b is the most probable fixated cell. Both are selected because of their
+    high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
+    they have a term of their own.
+
+    Args:
+        config: the weights of the terms.
+        step: the step after the look.
+        goal: `(E, X·Y)` boolean, cells with the target.
+
+    Returns:
+        The loss, a scalar.
+    """
+    belief = step.belief
+    assert isinstance(belief, TargetBelief)
+    cells, present = belief.present.logit(eps=1e-7), goal.any(-1).to(belief.anywhere)
+    loss = 4 * F.binary_cross_entropy_with_logits(cells, goal.to(cells))
+    loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
+    named = cells.detach().masked_fill(~step.visited, -torch.inf).argmax(-1)
+    for chosen in (step.next_cell, named):
+        there = goal.gather(-1, chosen[:, None]).to(cells)
+        loss = loss + config.gaze * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
+    # A real search ends when it fixates the target, so there is no next fixation to learn.
+    some = goal.any(-1) & ~(goal & step.visited).any(-1)
+    if some.any():
+        odds = belief.following.logit(eps=1e-7)[some].masked_fill(step.visited[some], -torch.inf)
+        landing = odds.masked_fill(~goal[some], -torch.inf).logsumexp(-1) - odds.logsumexp(-1)
+        loss = loss - config.landing * landing.mean()
+    return loss
+
+
+@torch.no_grad()
+def judge(
+    config: FitSearchConfig, model: TargetEvidence, examples: Examples, grid: Grid
+) -> tuple[list[dict[str, float]], Thresholds]:
+    """Evaluate the model on held-out searches and choose its thresholds.
+
+    Args:
+        config: the settings.
+        model: the target evidence.
+        examples: the held-out examples.
+        grid: the grid of cells.
+
+    Returns:
+        The measures after each number of looks in `JUDGED`, and the thresholds.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    looks = max(*JUDGED, config.looks)
+    goal, visited, present, anywhere, following = examples.goal, [], [], [], []
+    for step in searches(model, examples, grid, looks, 0.0, generator):
+        assert isinstance(step.belief, TargetBelief)
+        present.append(step.belief.present)
+        anywhere.append(step.belief.anywhere)
+        following.append(step.belief.following.masked_fill(step.visited, 0).amax(-1))
+        visited.append(step.visited)
+    there = goal.any(-1)
+    judged = []
+    for number in (each for each in JUDGED if each <= len(present)):
+        cells, image, seen = present[number - 1], anywhere[number - 1], visited[number - 1]
+        judged.append(
+            {
+                "looks": number,
+                "found": float((seen & goal).any(-1)[there].double().mean()),
+                "cells_nll": float(F.binary_cross_entropy(cells.double(), goal.double())),
+                "cells_ece": float(calibration_error(cells.flatten(), goal.flatten())),
+                "visited_ece": float(calibration_error(cells[seen], goal[seen])),
+                "presence_area": area_under_roc(image, there),
+                "presence_ece": float(calibration_error(image, there)),
+            }
+        )
+    cells, seen = torch.stack(present), torch.stack(visited)
+    place = cells.masked_fill(~seen, 0).amax(-1) * place_known(cells, seen)
+    return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
+
+
+class Bounds(Protocol):
+    """Limits on wrong decisions, by which thresholds are chosen (see `FitSearchConfig`)."""
+
+    @property
+    def false_alarms(self) -> float:
+        """Maximum share of absent targets that may be reported as found."""
+        ...
+
+    @property
+    def surest(self) -> float:
+        """Upper limit of the probability from which on a target counts as found."""
+        ...
+
+    @property
+    def lost(self) -> float:
+        """Maximum share of the targets that may be missed because the search gives up."""
+        ...
+
+
+def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
+    """Choose thresholds with few false alarms and few missed targets.
+
+    For each candidate of the `place` threshold, the lowest `confirm` threshold is computed that respects the limit on
+    false alarms. Of these pairs, the one with the highest `place` is taken that misses few enough of the targets found
+    without a `place` threshold. Then the highest `give_up` is taken that misses few enough of the targets still found.
+
+    Args:
+        config: the limits on wrong decisions.
+        anywhere: `(n, E)`, probability of presence after each look of each search.
+        place: `(n, E)`, highest probability of a fixated cell; 0 if another cell is much more probable.
+        left: `(n, E)`, highest probability of a cell that was not fixated.
+        there: `(E,)` boolean, whether the target is present.
+
+    Returns:
+        The thresholds.
+    """
+    number = torch.arange(len(anywhere))[:, None]
+
+    def found(chosen: Thresholds) -> Tensor:
+        """Return which searches report the target as found, `(E,)` boolean."""
+        sure = (anywhere >= chosen.confirm) & (place > 0) & (place >= chosen.place)
+        first = torch.where(sure, number, len(sure)).amin(0)
+        return sure.any(0) & ~((left < chosen.give_up) & (number < first)).any(0)
+
+    def hits(chosen: Thresholds) -> int:
+        return int(found(chosen)[there].sum())
+
+    def confirming(least: float) -> Thresholds:
+        """Return the thresholds with the lowest `confirm` for a `place` threshold."""
+        confirm = 1.0
+        for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
+            if float(found(Thresholds(candidate, 0.0, least))[~there].double().mean()) > config.false_alarms:
+                break
+            confirm = candidate
+        return Thresholds(min(confirm, config.surest), 0.0, least)
+
+    lost = config.lost * int(there.sum())
+    anyhow = confirming(0.0)
+    pairs = (confirming(least) for least in torch.arange(0.95, 0.04, -0.05).tolist())
+    chosen = next((pair for pair in pairs if hits(anyhow) - hits(pair) <= lost), anyhow)
+    for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001):
+        if hits(chosen) - hits(chosen.changed(give_up=give_up)) <= lost:
+            return chosen.changed(give_up=give_up)
+    return chosen
+
+
+def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
+    """Report the evaluation and the thresholds as Markdown."""
+    head = [
+        "looks",
+        "gaze on target, %",
+        "NLL of cells",
+        "ECE of cells",
+        "ECE, fixated",
+        "area under ROC",
+        "ECE, presence",
+    ]
+    rows = [
+        [
+            str(int(row["looks"])),
+            f"{100 * row['found']:.1f}",
+            *(
+                f"{row[name]:.4f}"
+                for name in ("cells_nll", "cells_ece", "visited_ece", "presence_area", "presence_ece")
+            ),
+        ]
+        for row in judged
+    ]
+    return "\n".join(
+        [
+            f"Trained on {trained} pairs of photograph and class, and evaluated on {held_out} pairs from held-out "
+            "photographs. In about half of the pairs the class is absent. The searches follow the model. The table "
+            "shows how often the gaze has reached the target; negative log likelihood (NLL) and expected calibration "
+            "error (ECE) of the probability of the target in each cell; the ECE for fixated cells alone; and how well "
+            "the probability of presence separates present from absent classes.",
+            "",
+            *table([head, *rows]),
+            "",
+            f"Thresholds: the target counts as found if the probability of its presence is at least "
+            f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "
+            f"if no other cell has a probability of at least {thresholds.give_up:.2f}.",
+            "",
+        ]
+    )

@@ -1,0 +1,243 @@
+"""Compare fitted strategies for search and exploration with raw scores on held-out photographs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import legal_targets
+from semfov.decision import OUTCOMES, confirms
+from semfov.episode import Step, StoredLooks
+from semfov.metrics.averages import standard_error
+from semfov.metrics.exploration import answers_of, success_rate
+from semfov.metrics.search import cumulative_performance
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
+from semfov.runs.looking import Looking
+from semfov.runs.progress import track
+from semfov.runs.search_protocol import choose_classes, episodes_of, run_episodes, search_steps, tie_noise
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.strategy import Strategy
+
+Array = NDArray[np.float64]
+Ways = Mapping[str, Strategy]
+"""Strategies for a task, by their names in reports."""
+
+
+class Rule(Protocol):
+    """A rule that decides after each step which searches end."""
+
+    def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
+        """Return the number of each search's outcome (`semfov.decision.OUTCOMES`), 0 for searches that continue."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The difference between a measure with fitted models and with raw scores, paired over photographs.
+
+    Attributes:
+        mean: mean difference over photographs, fitted minus raw.
+        error: standard error of the mean; NaN for fewer than two photographs.
+        photographs: number of photographs.
+    """
+
+    mean: float
+    error: float
+    photographs: int
+
+    @classmethod
+    def of(cls, fitted: Array, raw: Array) -> Difference:
+        """Compute the paired difference of two measures `(P,)`, with one value for each photograph."""
+        paired = np.asarray(fitted, dtype=np.float64) - np.asarray(raw, dtype=np.float64)
+        return cls(float(paired.mean()), float(standard_error(paired)), len(paired))
+
+    @property
+    def better(self) -> bool:
+        """Whether the mean is positive and greater than its standard error."""
+        return math.isfinite(self.error) and self.mean > 0 and self.mean > self.error
+
+
+def search_curves(
+    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
+) -> dict[str, Array]:
+    """Measure the cumulative performance of search strategies on every photograph with a target.
+
+    Args:
+        run: the finished looks from every cell.
+        scenes: indices of the photographs.
+        ways: the strategies.
+        protocol: starting points, gaze shifts and seed.
+        max_area: classes that cover a larger share of the image are not searched for.
+
+    Returns:
+        For each strategy the curve of each photograph, `(P, shifts+1)`.
+    """
+    columns, rows = run.config.belief.columns, run.config.belief.rows
+    curves: dict[str, list[Array]] = {name: [] for name in ways}
+    for index in track(scenes, "searching", "scene"):
+        targets = legal_targets(run.scenes.annotation(index), max_area)
+        episodes = episodes_of(run.scenes, index, columns, rows, protocol, targets)
+        if not episodes:
+            continue
+        grid, detections = run.grid(index), run.detections(index)
+        noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        for name, strategy in ways.items():
+            with torch.inference_mode():
+                outcomes = run_episodes(
+                    episodes,
+                    Candidate(strategy),
+                    detections,
+                    grid,
+                    noise,
+                    shifts=protocol.shifts,
+                    batch=protocol.batch,
+                )
+            found = np.array([outcome.found_at for outcome in outcomes])
+            curves[name].append(cumulative_performance(found, protocol.shifts))
+    return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
+
+
+def explore_curves(
+    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
+) -> dict[str, dict[str, Array]]:
+    """Measure the share of cells that exploration strategies classify correctly.
+
+    The answer for a cell may be background, which is correct if the cell contains no object.
+
+    Args:
+        run: the finished looks from every cell.
+        scenes: indices of the photographs.
+        ways: the strategies.
+        protocol: starting points, gaze shifts and seed.
+
+    Returns:
+        Curves `(P, shifts+1)` of each strategy: under `objects` over the cells with objects (the published success
+        rate), and under `all` over all cells.
+    """
+    curves: dict[str, dict[str, list[Array]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
+    for index in track(scenes, "exploring", "scene"):
+        grid = run.grid(index)
+        answers = answers_of(run.scenes.annotation(index), grid, len(run.scenes.classes) + 1)
+        if not answers.any():
+            continue
+        detections = run.detections(index)
+        episodes = explorations_of(run.scenes, index, len(grid), protocol)
+        noise = torch.stack([explore_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        cells = int(answers.any(-1).sum())
+        for name, strategy in ways.items():
+            with torch.inference_mode():
+                progress = run_explorations(
+                    episodes,
+                    Candidate(strategy),
+                    detections,
+                    grid,
+                    answers,
+                    noise,
+                    shifts=protocol.shifts,
+                    batch=protocol.batch,
+                )
+            rates = [success_rate(each.right, cells) for each in progress]
+            curves["objects"][name].append(np.mean(rates, axis=0))
+            rates = [success_rate(each.right_everywhere, len(grid)) for each in progress]
+            curves["all"][name].append(np.mean(rates, axis=0))
+    return {
+        what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}
+        for what, ways_of in curves.items()
+    }
+
+
+@dataclass(frozen=True)
+class Decided:
+    """The decisions of searches for present and for absent classes.
+
+    Attributes:
+        found: share of the present classes that were reported as found.
+        false_alarms: share of the absent classes that were reported as found.
+        undecided: share of all searches without a decision.
+        looks: mean number of looks.
+        searches: number of searches.
+    """
+
+    found: float
+    false_alarms: float
+    undecided: float
+    looks: float
+    searches: int
+
+
+def decisions(
+    run: Looking,
+    scenes: Sequence[int],
+    ways: Mapping[str, tuple[Strategy, Rule]],
+    protocol: ProtocolConfig,
+    classes: int,
+    max_area: float,
+) -> dict[str, Decided]:
+    """Evaluate the decisions of search strategies.
+
+    Args:
+        run: the finished looks from every cell.
+        scenes: indices of the photographs.
+        ways: the strategies, with their decision rules.
+        protocol: gaze shifts and seed.
+        classes: maximum number of present classes, and of absent classes, to search for in each photograph.
+        max_area: classes that cover a larger share of the image are left out.
+
+    Returns:
+        The decisions of each strategy.
+    """
+    results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
+    for index in track(scenes, "deciding", "scene"):
+        annotation, grid = run.scenes.annotation(index), run.grid(index)
+        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, protocol.seed, classes)
+        detections = run.detections(index) if chosen else None
+        for target in chosen:
+            assert detections is not None
+            generator = generator_for("start", protocol.seed, run.scenes.ids[index], target)
+            start = torch.randint(len(grid), (1,), generator=generator)
+            noise = noise_for(protocol, len(grid), run.scenes.ids[index], target, 0)[None]
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            there = bool((annotation.labels == target).any())
+            for name, (strategy, rule) in ways.items():
+                ends = partial(rule, target=target, grid=grid)
+                outcome, count = _search(looks, strategy, target, start, noise, ends)
+                results[name].append((there, outcome, count))
+    return {name: _decided(each) for name, each in results.items()}
+
+
+@torch.inference_mode()
+def _search(
+    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+) -> tuple[str, int]:
+    """Run one search and return its outcome and its number of looks."""
+    steps = search_steps(looks, strategy, target, start, noise, rule)
+    return OUTCOMES[int(rule(steps[-1]))], len(steps)
+
+
+def by_detection(step: Step, target: int, grid: Grid) -> Tensor:
+    """Apply the rule of agents without fitted models: a detection with a score of 0.5 in the fixated cell is a find."""
+    return confirms(step.detections, grid, step.cell, target, 0.5).long()
+
+
+def _decided(searches: Sequence[tuple[bool, str, int]]) -> Decided:
+    def share(outcome: str, which: Sequence[bool]) -> float:
+        chosen = [each[1] == outcome for each in searches if each[0] in which]
+        return sum(chosen) / len(chosen) if chosen else math.nan
+
+    return Decided(
+        share("found", [True]),
+        share("found", [False]),
+        share("undecided", [True, False]),
+        sum(each[2] for each in searches) / max(len(searches), 1),
+        len(searches),
+    )

@@ -1,0 +1,282 @@
+"""Train the map of all classes on the looks of whole explorations."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief import MapEvidence
+from semfov.belief.grid import Grid
+from semfov.belief.observers import LearnedMap, MapBelief
+from semfov.episode import Step, rollout
+from semfov.errors import check
+from semfov.fit.descent import descend
+from semfov.fit.frame import Fit, FitOnLooksConfig, fit_and_write, split
+from semfov.fit.map_examples import MapExampleLooks, MapExamples, make_map_examples
+from semfov.fit.outputs import training_of
+from semfov.gaze.acquisition import CloserLook
+from semfov.gaze.choice import Exploratory
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.exploration import answers_of
+from semfov.runs.looking import Looking
+from semfov.runs.settings import Count, Range, Share
+from semfov.runs.tables import table
+
+JUDGED = (1, 2, 3, 5, 10, 15)
+"""Numbers of looks after which a map is evaluated."""
+
+
+@dataclass(frozen=True)
+class FitMapConfig(FitOnLooksConfig):
+    """Train the map of all classes.
+
+    Args:
+        classes: number of classes to learn from in each photograph. The present classes and those with the highest
+            scores come first.
+        others: how many of these classes are drawn at random from the remaining ones.
+        gain_steps: number of training steps for predicting the gain of a look.
+    """
+
+    classes: Annotated[int, Range(2, 10_000)] = 12
+    others: Count = 3
+    looks: Annotated[int, Range(2, 10_000)] = 12
+    astray: Share = 0.5
+    steps: Count = 1000
+    gain_steps: Count = 200
+    batch: Count = 12
+    out: Path = Path("runs/fit_map")
+
+
+def fit_map(config: FitMapConfig) -> None:
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
+    check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
+    fit_and_write(config, fit_map_evidence)
+
+
+def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
+    """Fit the model.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell.
+
+    Returns:
+        The model with its evaluation.
+    """
+    examples = make_map_examples(run, config.classes, config.others, config.seed)
+    held_out = split(examples.scene, config.holdout)
+    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = MapEvidence(components=len(run.scenes.classes) + 1, metadata=metadata)
+    with torch.no_grad():
+        model.prior.copy_(frequencies(run, config.holdout))
+    train(config, model, examples[~held_out], grid)
+    train_gain(config, model, examples[~held_out], grid)
+    judged = judge(config, model.eval(), examples[held_out], grid)
+    counts = int((~held_out).sum()), int(held_out.sum())
+    return Fit(model, judged, *counts, report(judged, *counts))
+
+
+def frequencies(run: Looking, holdout: int) -> Tensor:
+    """Count how often a cell contains each class in the training photographs.
+
+    Args:
+        run: the run over the photographs.
+        holdout: one in every n photographs is left out, as it is held out.
+
+    Returns:
+        `ℓ / 4 + 1` with the log-odds ℓ of each class, `(K+1,)`; the values are of the order of 1.
+    """
+    components, cells = len(run.scenes.classes) + 1, 0
+    count = torch.zeros(components)
+    for index in range(len(run.scenes)):
+        if index % holdout:
+            grid = run.grid(index)
+            count += answers_of(run.scenes.annotation(index), grid, components).sum(0)
+            cells += len(grid)
+    return ((count + 1) / (cells + 2)).logit() / 4 + 1
+
+
+def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+    """Train on explorations that follow the model. Some of their fixations are random."""
+    generator = torch.Generator().manual_seed(config.seed)
+
+    def loss_of(_: int) -> Tensor:
+        chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
+        counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
+        loss = chosen.score.new_zeros(())
+        for step in explorations(model, chosen, grid, max(counted), config.astray, generator):
+            if step.shift + 1 in (1, *counted):
+                loss = loss + objective(step, chosen)
+        return loss
+
+    descend(model.parameters(), loss_of, config.steps, config.rate)
+
+
+def explorations(
+    model: MapEvidence, examples: MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+) -> Iterator[Step]:
+    """Explore every example from a random start.
+
+    Args:
+        model: the map evidence.
+        examples: the examples, one exploration each.
+        grid: the grid of cells.
+        looks: number of looks in an exploration.
+        astray: share of the fixations that are drawn at random.
+        generator: source of random numbers.
+
+    Returns:
+        The steps of all explorations together.
+    """
+    count = len(examples)
+    start = torch.randint(len(grid), (count,), generator=generator)
+    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
+    observer = LearnedMap(model, together=True)
+    return rollout(MapExampleLooks(examples, grid), observer, CloserLook(grid), start, choice, most=looks)
+
+
+def objective(step: Step, examples: MapExamples) -> Tensor:
+    """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
+
+    A class that was drawn at random counts as often as the number of classes that it represents.
+
+    Args:
+        step: the step after a look.
+        examples: the examples, with the true classes of the cells.
+
+    Returns:
+        The loss, a scalar.
+    """
+    belief = step.belief
+    assert isinstance(belief, MapBelief)
+    weight = torch.cat([torch.ones_like(examples.stands_for[:, :1]), examples.stands_for], 1)
+    answers = examples.answers.to(belief.probabilities)
+    each = F.binary_cross_entropy_with_logits(belief.probabilities.logit(eps=1e-7), answers, reduction="none")
+    return (each.mean(1) * weight).sum(-1).mean()
+
+
+def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+    """Train the prediction of a look's gain by least squares.
+
+    The gain of a look in a cell is the change of the cell's answer from wrong to right (1) or from right to wrong (-1).
+    """
+    generator = torch.Generator().manual_seed(config.seed + 1)
+
+    def loss_of(_: int) -> Tensor:
+        chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
+        before: Step | None = None
+        loss = chosen.score.new_zeros(())
+        with torch.no_grad():
+            steps = list(explorations(model, chosen, grid, config.looks, config.astray, generator))
+        for step in steps:
+            if before is not None:
+                known = before.belief
+                assert isinstance(known, MapBelief)
+                brought = right(step, chosen.answers) - right(before, chosen.answers)
+                distance = chosen.distance[torch.arange(len(chosen)), step.cell][:, None]
+                expected = model.gain(known.probabilities, known.closest, known.looks, distance)[:, 0]
+                loss = loss + (expected - brought).square().mean() * 100
+            before = step
+        return loss
+
+    title = "learning the gain of looks"
+    descend(model.worth.parameters(), loss_of, config.gain_steps, config.rate, clip=None, title=title)
+
+
+def right(step: Step, answers: Tensor) -> Tensor:
+    """Return 1 for cells whose most probable answer is right and 0 for the others, `(B, X·Y)`."""
+    belief = step.belief
+    assert isinstance(belief, MapBelief)
+    best = belief.probabilities.argmax(-1, keepdim=True)
+    return answers.gather(-1, best)[..., 0].to(belief.closest)
+
+
+@torch.no_grad()
+def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
+    """Evaluate the model on held-out explorations.
+
+    Args:
+        config: the settings.
+        model: the map evidence.
+        examples: the held-out examples.
+        grid: the grid of cells.
+
+    Returns:
+        The measures after each number of looks in `JUDGED`.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    judged = []
+    answers = examples.answers
+    some = ~answers[..., 0]
+    before: tuple[Tensor, Tensor] | None = None
+    for step in explorations(model, examples, grid, max(JUDGED), 0.0, generator):
+        belief = step.belief
+        assert isinstance(belief, MapBelief)
+        p, now = belief.probabilities, right(step, answers)
+        named = answers[..., 1:].gather(-1, p[..., 1:].argmax(-1, keepdim=True))[..., 0]
+        gained = (0.0, 0.0)
+        if before is not None:
+            distance = examples.distance[torch.arange(len(examples)), step.cell][:, None]
+            known, was = before
+            gained = float(known.sum(-1).mean()), float((now - was).sum(-1).mean())
+        if step.shift + 1 in JUDGED:
+            judged.append(
+                {
+                    "looks": step.shift + 1,
+                    "all": float(now.double().mean()),
+                    "objects": float(now[some].double().mean()),
+                    "objects_without_background": float(named[some].double().mean()),
+                    "nll": float(F.binary_cross_entropy(p.double(), answers.double())),
+                    "ece": float(calibration_error(p.flatten(), answers.flatten())),
+                    "ece_background": float(calibration_error(p[..., 0].flatten(), answers[..., 0].flatten())),
+                    "expected": gained[0],
+                    "brought": gained[1],
+                }
+            )
+        distance = examples.distance[torch.arange(len(examples)), step.next_cell][:, None]
+        before = model.gain(p, belief.closest, belief.looks, distance)[:, 0], now
+    return judged
+
+
+def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
+    """Report the evaluation as Markdown."""
+    head = [
+        "looks",
+        "cells right, %",
+        "with objects, %",
+        "without background, %",
+        "NLL",
+        "ECE",
+        "ECE, background",
+        "expected gain, cells",
+        "gain, cells",
+    ]
+    rows = [
+        [
+            str(int(row["looks"])),
+            *(f"{100 * row[name]:.1f}" for name in ("all", "objects", "objects_without_background")),
+            *(f"{row[name]:.4f}" for name in ("nll", "ece", "ece_background")),
+            *(f"{row[name]:.2f}" for name in ("expected", "brought")),
+        ]
+        for row in judged
+    ]
+    return "\n".join(
+        [
+            f"Trained on {trained} photographs and evaluated on {held_out} held-out photographs, in explorations with "
+            "the policy of the closer look. The first three measures are the share of cells whose most probable answer "
+            "is right: over all cells; over cells with objects; and over cells with objects when background is not "
+            "allowed as an answer. Then follow the negative log likelihood (NLL) and the expected calibration error "
+            "(ECE) of the probabilities of the example's classes and of background. The last two columns show how many "
+            "more cells were expected to be right after the last look, and how many more were right.",
+            "",
+            *table([head, *rows]),
+            "",
+        ]
+    )

@@ -1,0 +1,216 @@
+"""Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Footprint, Grid
+from semfov.belief.observers import Semantic
+from semfov.data.scene import Scenes, legal_targets
+from semfov.detection.detections import Detections
+from semfov.errors import DataError, check
+from semfov.fit.outputs import write_outputs
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.progress import track
+from semfov.runs.samples import Sampler, Samples, SampleSettings, collect
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Side, Whole, Workers
+from semfov.runs.setup import make_observation
+from semfov.runs.tables import table
+from semfov.runs.workers import rank
+
+
+@dataclass(frozen=True)
+class FitTemperingConfig(Settings):
+    """Find the exponent of the likelihoods.
+
+    Args:
+        data: photographs to learn from (by default all of them, however many objects they have).
+        detector: the detector that processes the foveated views.
+        sensor: the foveal sensor.
+        calibrated: compute likelihoods from the scores with the observation model shipped for the detector. If false,
+            the raw scores are the likelihoods.
+        footprint: which cells a detection updates.
+        exponents: values of the exponent τ to compare.
+        photographs: use only the first so many photographs (None: all).
+        fixations: random fixations in each photograph.
+        iou: must be the same as in `train.fit_fom` to share looks with it.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        min_objects: photographs with fewer objects are left out.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        holdout: one in every n photographs is held out for the evaluation.
+        out: folder for the report.
+        cache: folder for the labelled detections (None: `out`).
+        workers: number of processes that look (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    calibrated: bool = False
+    footprint: Footprint = "box_centre"
+    exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+    photographs: Count | None = None
+    fixations: Count = 8
+    iou: Share = 0.5
+    seed: Seed = 0
+    shard: Count = 32
+    columns: Side = 10
+    rows: Side = 10
+    min_objects: Whole = 4
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] = 4
+    out: Path = Path("runs/fit_tempering")
+    cache: Path | None = None
+    workers: Workers | None = None
+
+
+def fit_tempering(config: FitTemperingConfig) -> None:
+    """Collect looks, try every exponent, and write the report."""
+    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
+    check(len(config.exponents) > 0, "exponents", "at least one value", "none")
+    settings = SampleSettings.of(config)
+    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    if rank() > 0:
+        return
+    model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
+    hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
+    text = report(hits)
+    write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
+
+
+def measure(
+    config: FitTemperingConfig,
+    sampler: Sampler,
+    samples: Samples,
+    model: FovealObservationModel | None,
+    tempering: float,
+) -> dict[str, float]:
+    """Measure one exponent: the share of next fixations that hit the target, as means over photographs.
+
+    Args:
+        config: the settings.
+        sampler: the sampler that looked.
+        samples: the labelled detections of the looks.
+        model: observation model, or None for raw scores.
+        tempering: the exponent.
+
+    Returns:
+        The means over the photographs to choose by (`fitted`) and over the `held_out` ones.
+    """
+    observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
+    return means_of(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
+
+
+def means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
+    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones.
+
+    Args:
+        config: the settings.
+        rates: hit rates by the index of the photograph (`hit_rates`).
+
+    Returns:
+        The two means.
+
+    Raises:
+        DataError: one of the two groups has no photograph.
+    """
+    means: dict[str, list[float]] = {"fitted": [], "held_out": []}
+    for index, share in rates.items():
+        means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
+    if not all(means.values()):
+        raise DataError(
+            f"data: expected searches in photographs of both groups, got {len(means['fitted'])} photographs to choose "
+            f"by and {len(means['held_out'])} held-out ones; give more photographs"
+        )
+    return {name: sum(values) / len(values) for name, values in means.items()}
+
+
+def hit_rates(
+    config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
+) -> dict[int, float]:
+    """Compute the share of next fixations that hit the target in each photograph.
+
+    Args:
+        config: the settings, which select photographs and targets.
+        scenes: the photographs.
+        samples: labelled detections of the looks, `config.fixations` for each photograph, in order.
+        observer: the observer that fuses the looks.
+        title: label of the progress bar.
+
+    Returns:
+        The hit rates by the index of the photograph.
+    """
+    rates = {}
+    number = min(config.photographs or len(scenes), len(scenes))
+    for index in track(range(number), title, "scene"):
+        annotation = scenes.annotation(index)
+        targets = legal_targets(annotation, config.max_target_area)
+        if len(annotation.labels) < config.min_objects or not targets:
+            continue
+        looks = slice(index * config.fixations, (index + 1) * config.fixations)
+        grid = Grid(config.columns, config.rows, annotation.size)
+        covered = grid.footprint(annotation.boxes)
+        goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
+        share = hit_rate(observer, samples.seen(looks), samples.fixations[looks], grid, torch.tensor(targets), goal)
+        if share is not None:
+            rates[index] = share
+    return rates
+
+
+def hit_rate(
+    observer: Semantic, seen: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
+) -> float | None:
+    """Compute the share of next fixations that hit the target in one photograph.
+
+    The mean is over targets and over the beliefs after the first look, the second look and so on. Looks that fixate the
+    target are left out, as they would have ended the search. If several cells are equally probable, the share of them
+    that contain the target counts.
+
+    Args:
+        observer: the observer that fuses the looks.
+        seen: detections of R looks at the photograph.
+        fixations: `(R, 2)`, fixations of the looks, `(x, y)` in pixels.
+        grid: the grid of cells.
+        targets: `(T,)`, classes to search for.
+        goal: `(T, X·Y)` boolean, cells that contain them.
+
+    Returns:
+        The share, or None if every look fixates every target.
+    """
+    evidence = observer.weigh(seen, fixations, grid)
+    belief = observer.start(len(targets), grid, seen.scores)
+    visited = torch.zeros_like(goal)
+    hits = []
+    for look, cell in enumerate(grid.cell_of(fixations).tolist()):
+        going = (~goal[:, cell]).nonzero()[:, 0]
+        updated = observer.update(belief[going], evidence[torch.full_like(going, look)])
+        belief.beta[going], belief.closest[going] = updated.beta, updated.closest
+        visited[going, cell] = True
+        posterior = updated.probability(targets[going]).masked_fill(visited[going], -1)
+        best = posterior == posterior.amax(-1, keepdim=True)
+        hits.append((best & goal[going]).sum(-1) / best.sum(-1))
+    share = torch.cat(hits)
+    return float(share.mean()) if len(share) else None
+
+
+def report(hits: dict[float, dict[str, float]]) -> str:
+    """Report the hit rates of every exponent and the best exponent as Markdown."""
+    best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
+    rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
+    return "\n".join(
+        [
+            f"Best exponent on the photographs to choose by: {best:g}. The table shows the percentage of next "
+            "fixations that hit the target, as a mean over all numbers of looks and over photographs.",
+            "",
+            *table([["tempering", "photographs to choose by", "held-out photographs"], *rows]),
+            "",
+        ]
+    )

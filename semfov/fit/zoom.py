@@ -1,0 +1,276 @@
+"""Fit evidence by magnification on mosaics of photographs."""
+
+import json
+import logging
+import random
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from semfov.data.crowded import Crowded
+from semfov.data.mosaics import Mosaics
+from semfov.errors import check
+from semfov.fit.outputs import training_of, write_outputs
+from semfov.fit.zoom_choice import choose_foresight, choose_patience, open_all
+from semfov.fit.zoom_decision import fit_judge, judge_searches, search_mosaics
+from semfov.fit.zoom_examples import ZoomExample, example_of, windows_of
+from semfov.fit.zoom_presence import fit_presence, pair_windows, presence_loss, presence_of
+from semfov.fit.zoom_rates import fit_rates, rate_loss
+from semfov.fit.zoom_settings import FitZoomConfig, Part
+from semfov.fit.zoom_survey import SurveyExample, fit_survey, judge_survey
+from semfov.fit.zoom_verification import fit_closer
+from semfov.io.files import inside
+from semfov.runs.scene_run import cache_folder
+from semfov.runs.setup import make_detector, prepare_worker, split_photographs
+from semfov.runs.tables import table
+from semfov.runs.workers import available_cores, run_tasks
+from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import ZoomEye
+from semfov.zoom.survey import Survey
+
+DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
+"""Settings that the thresholds and the probability of presence depend on."""
+
+VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
+"""Settings that the verification depends on."""
+
+SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
+"""Settings that the survey depends on."""
+
+JUDGED = ("judged", "judged far", "judged crowded")
+"""Mosaics of held-out photographs on which foresight is chosen."""
+
+_log = logging.getLogger(__name__)
+
+
+def make_eye(config: FitZoomConfig) -> ZoomEye:
+    """Make the eye that looks at the mosaics."""
+    return ZoomEye(make_detector(config.detector)).eval().requires_grad_(False)
+
+
+def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
+    """Compose the mosaics to fit on, and those of held-out photographs.
+
+    Args:
+        config: the settings.
+        classes: names of the detector's classes.
+
+    Returns:
+        The mosaics: `near`, `far` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of held-out
+        photographs, and `searched` to fit decisions on.
+    """
+    kept, held = split_photographs(config.data, classes, 5)
+    tile = config.tile, config.tile * 3 // 4
+    return {
+        "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
+        "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
+        "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
+        "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
+        "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
+        "crowded": Mosaics(Crowded(kept, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
+        "judged crowded": Mosaics(Crowded(held, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
+    }
+
+
+def make_store(config: FitZoomConfig, eye: ZoomEye) -> GlanceStore:
+    """Open the store of looks at mosaics."""
+    return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+
+
+_process: dict[str, Any] = {}
+
+
+def prepare_process(config: FitZoomConfig) -> None:
+    """Build the eye, the mosaics and the store once in this process."""
+    prepare_worker()
+    eye = make_eye(config)
+    _process.update(eye=eye, mosaics=make_mosaics(config, eye.detector.classes), store=make_store(config, eye))
+
+
+def look(task: tuple[str, int]) -> tuple[str, int]:
+    """Look at all windows of a mosaic that are not in the store yet."""
+    kind, index = task
+    mosaics = _process["mosaics"][kind]
+    glances = StoredGlances(_process["eye"], mosaics, index, _process["store"])
+    glances.see(windows_of(mosaics, index, glances.lattice))
+    glances.save()
+    return task
+
+
+def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
+    """Read the results of the looks at all mosaics."""
+    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store)) for n in range(len(mosaics))]
+
+
+def fit_zoom(config: FitZoomConfig) -> None:
+    """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
+    eye = make_eye(config)
+    mosaics = make_mosaics(config, eye.detector.classes)
+    store = make_store(config, eye)
+    parts: list[str] = []
+    figures = "{}"
+    check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
+    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey", "verification"}
+    examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
+    if config.evidence is None:
+        model = fit_looks(config, eye, mosaics, examples)
+        text, figures = judge(model, examples["judged"])
+        tried = choose_patience(model, eye, mosaics["judged"], store)
+        parts += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
+    else:
+        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
+        model.check_compatible(eye.settings())
+    if "survey" in refit:
+        measured = survey_again(config, model, examples)
+        figures = json.dumps({**json.loads(figures), **measured}, indent=1)
+        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in JUDGED}, store)
+        chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
+        parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
+    if "decision" in refit:
+        parts += fit_decision(config, model, eye, mosaics, store)
+        # A verification belongs to the probability that it was fitted with.
+        model.verification = None
+        model.metadata.pop("verification", None)
+    if "verification" in refit:
+        check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
+        prepare_worker()
+        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+        parts += ["Closer looks:", "", fit_closer(model, mosaics, opened, config)]
+        if model.verification is not None:
+            model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+    path = inside(config.out, f"{eye.detector.name}.safetensors")
+    model.save(path)
+    write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
+
+
+def look_at_all(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> dict[str, list[ZoomExample]]:
+    """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
+    looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
+    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
+    workers = config.workers or available_cores()
+    for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
+                       unit="mosaic"):  # fmt: skip
+        pass
+    prepare_worker()
+    return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
+
+
+def fit_looks(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
+) -> GlimpseEvidence:
+    """Fit the prediction of closer looks, class by class."""
+    torch.manual_seed(config.seed)
+    random.seed(config.seed)
+    metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
+    model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
+    known = examples["near"] + examples["far"]
+    fit_presence(model, pair_windows(known), config.steps)
+    fit_rates(model, known, config.steps)
+    return model.eval().requires_grad_(False)
+
+
+def survey_again(
+    config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
+) -> dict[str, float]:
+    """Fit a new survey; returns its measures on held-out mosaics."""
+    torch.manual_seed(config.seed)
+    random.seed(config.seed)
+    survey = Survey(model.classes, foresight=model.survey.foresight)
+    kinds = {kind: [SurveyExample.of(example) for example in some] for kind, some in examples.items()}
+    fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
+    model.survey = survey.eval().requires_grad_(False)
+    model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
+    crowded = judge_survey(survey, kinds["judged crowded"])
+    return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
+
+
+def fit_decision(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit the decisions of searches: the probability of presence, and the thresholds.
+
+    Args:
+        config: the settings.
+        model: the model to complete.
+        eye: the eye that looks.
+        mosaics: the mosaics (`make_mosaics`).
+        store: store of the looks.
+
+    Returns:
+        Lines of the report in Markdown.
+    """
+    prepare_worker()
+    torch.manual_seed(config.seed)
+    searches = {
+        kind: search_mosaics(
+            model,
+            mosaics[kind],
+            open_all(eye, mosaics[kind], store),
+            classes=config.sought,
+            passes=config.passes,
+            seed=config.seed,
+            title=title,
+        )
+        for kind, title in (("searched", "searching"), ("judged", "searching held-out mosaics"))
+    }
+    fit_judge(model, searches["searched"], config.judging)
+    rows = judge_searches(model, searches["judged"], config)
+    assert model.thresholds is not None
+    model.metadata["decision"] = {name: getattr(config, name) for name in DECIDING}
+    fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
+    return [
+        f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them for "
+        f"absent classes, and evaluated on {held_out} searches in mosaics of held-out photographs.",
+        "",
+        *rows,
+        "",
+        f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
+        f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
+        "",
+    ]
+
+
+@torch.no_grad()
+def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
+    """Evaluate the model on held-out mosaics.
+
+    Args:
+        model: the model.
+        examples: the held-out examples.
+
+    Returns:
+        The measures as Markdown and as JSON.
+    """
+    windows = pair_windows(examples)
+    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
+    if len(later):
+        figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
+        figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
+    slots = first[windows.slot[first]]
+    odds, shown = presence_of(model, windows, slots), windows.shown[slots]
+    passes: dict[str, list[int]] = defaultdict(list)
+    for mosaic in windows.mosaic[slots].unique():
+        here = windows.mosaic[slots] == mosaic
+        for target in shown[here].any(0).nonzero()[:, 0].tolist():
+            hits = shown[here, target]
+            for name, value in (("evidence", odds), ("raw score", windows.scores[slots])):
+                order = value[here, target].argsort(descending=True, stable=True)
+                passes[name].append(2 + int(hits[order].int().argmax()))
+    for name, counts in passes.items():
+        figures[f"passes to the first hit, {name}"] = sum(counts) / len(counts)
+    losses = torch.stack([rate_loss(model, example) for example in examples])
+    figures["rates, mean negative log likelihood"] = float(losses.mean())
+    lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
+    lines += [*figures_of(figures), ""]
+    return "\n".join(lines), json.dumps(figures, indent=1)
+
+
+def figures_of(figures: Mapping[str, float]) -> list[str]:
+    """Write measures as a table in Markdown."""
+    return ["| measure | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items())]

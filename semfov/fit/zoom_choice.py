@@ -1,0 +1,137 @@
+"""Choose `foresight` and `patience`, the settings of a search by magnification, on mosaics of held-out photographs."""
+
+from collections.abc import Mapping, Sequence
+from itertools import chain, islice
+
+import torch
+from tqdm import tqdm
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
+from semfov.runs.window_looking import SHOWN, found_in
+from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import ZoomEye
+from semfov.zoom.glances import Glance, Glances, Window, around
+from semfov.zoom.search import find_everything, look_for
+
+FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
+PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
+
+
+@torch.inference_mode()
+def choose_foresight(
+    model: GlimpseEvidence, eye: ZoomEye, kinds: Mapping[str, Mosaics], store: GlanceStore
+) -> list[list[str]]:
+    """Set the `foresight` of the survey to the one with which most objects are found.
+
+    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of
+    mosaics differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
+
+    Args:
+        model: the model; the foresight of its survey is chosen.
+        eye: the eye that looks.
+        kinds: mosaics of each kind, by its name.
+        store: store of the looks.
+
+    Returns:
+        A table of the values that were tried.
+    """
+    opened = [open_all(eye, mosaics, store) for mosaics in kinds.values()]
+    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds.values()]
+    rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
+    recalls: dict[float, list[float]] = {}
+    for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
+        model.survey.foresight = value
+        recalls[value] = [
+            mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
+            for looks, annotations, mosaics in zip(opened, objects, kinds.values(), strict=True)
+        ]
+        rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
+        for glances in chain.from_iterable(opened):
+            glances.save()
+    most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
+    share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
+    model.survey.foresight = max(share, key=share.__getitem__)
+    return rows
+
+
+@torch.inference_mode()
+def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
+    """Set `patience` to the value with which a class is found soonest.
+
+    The measure is the mean number of passes until a look at a photograph that shows the class.
+
+    Args:
+        model: the model; its patience is chosen.
+        eye: the eye that looks.
+        near: mosaics of few photographs.
+        store: store of the looks.
+
+    Returns:
+        A table of the values that were tried.
+    """
+    opened = open_all(eye, near, store)
+    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
+    passes: dict[float, float] = {}
+    for value in tqdm(PATIENCES, desc="choosing patience", unit="value", dynamic_ncols=True):
+        model.patience = value
+        passes[value] = mean_passes(model, opened, slots)
+        for glances in opened:
+            glances.save()
+    model.patience = min(passes, key=passes.__getitem__)
+    return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
+
+
+def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
+    """Open the stored looks of each mosaic."""
+    return [StoredGlances(eye, mosaics, index, store) for index in range(len(mosaics))]
+
+
+def mean_recall(
+    model: GlimpseEvidence, glances: Sequence[Glances], objects: Sequence[Annotation], passes: int
+) -> float:
+    """Compute the mean recall over passes of an exploration that looks for all objects.
+
+    Args:
+        model: the evidence that guides the exploration.
+        glances: looks at each mosaic.
+        objects: the objects of each mosaic.
+        passes: number of passes.
+
+    Returns:
+        The share of the objects of all mosaics that were found, as a mean over the passes.
+    """
+    found = 0
+    for looks, annotation in zip(glances, objects, strict=True):
+        seen: list[Glance] = []
+        path = find_everything(looks, model)
+        count = 0
+        for _ in range(passes):
+            turn = next(path, None)
+            if turn is not None:
+                seen.append(turn.glance)
+                count = int(found_in(seen, annotation).sum())
+            # When no window is left, the number of found objects stays the same for the remaining passes.
+            found += count
+    return found / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
+
+
+def mean_passes(model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]]) -> float:
+    """Compute the mean number of passes until a look at a photograph that shows the target.
+
+    Args:
+        model: the evidence that guides the search.
+        glances: looks at each mosaic.
+        slots: windows of the photographs of each mosaic.
+
+    Returns:
+        The mean over mosaics and over the classes that any of their photographs shows.
+    """
+    counts = []
+    for looks, photographs in zip(glances, slots, strict=True):
+        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= SHOWN
+        for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
+            path = look_for(looks, model, target, slices=photographs)
+            counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
+    return sum(counts) / max(len(counts), 1)

@@ -1,0 +1,165 @@
+"""Fit the decisions of searches in large pictures, whether the target is found or absent, on searches of mosaics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
+from semfov.fit.descent import descend
+from semfov.fit.evidence import Bounds, choose_thresholds
+from semfov.metrics.calibration import BinarySums
+from semfov.metrics.presence import area_under_roc
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.tables import table
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.episode import Turn
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.search import look_for
+from semfov.zoom.tally import Tally
+
+JUDGED = (1, 4, 8, 16)
+"""Numbers of looks after which the probability of presence is evaluated."""
+
+
+@dataclass(frozen=True)
+class Searches:
+    """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
+
+    Attributes:
+        best: `(E, n)`, highest score of the target so far, after each look.
+        case: `(E, n, 10)`, features of the search so far (`Tally.case`).
+        looked: `(E, n)`, whether a detection has shown the target (`Tally.looked`).
+        left: `(E, n)`, value of the best remaining look.
+        there: `(E,)`, whether the target is in the picture.
+    """
+
+    best: Tensor
+    case: Tensor
+    looked: Tensor
+    left: Tensor
+    there: Tensor
+
+    @classmethod
+    def join(cls, parts: Sequence[Searches]) -> Searches:
+        """Join several sets of searches."""
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+@torch.inference_mode()
+def searches_of(
+    model: GlimpseEvidence,
+    mosaics: Mosaics,
+    opened: Sequence[StoredGlances],
+    *,
+    classes: int,
+    passes: int,
+    seed: int,
+    title: str,
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], Tally]]]]:
+    """Search every mosaic for some present classes and for as many absent ones, without decisions.
+
+    Args:
+        model: the evidence that guides the search.
+        mosaics: the mosaics.
+        opened: the stored looks at each mosaic.
+        classes: maximum number of present classes to search for in a mosaic.
+        passes: maximum number of passes of the detector in a search.
+        seed: seed of the choice of classes.
+        title: label of the progress bar.
+
+    Yields:
+        For each search the number and the objects of the mosaic, the class, and the turns with the facts after each.
+        Looks that are made before the next search are stored.
+    """
+    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
+        annotation = mosaics.annotation(index)
+        for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
+            turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)
+            yield index, annotation, target, _tallied(turns)
+        looks.save()
+
+
+def _tallied(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBelief], Tally]]:
+    """The turns of a search, each with the facts about the search after it."""
+    tally: Tally | None = None
+    for turn in turns:
+        tally = tally or Tally(turn.belief)
+        tally.add(turn.glance)
+        yield turn, tally
+
+
+@torch.inference_mode()
+def search_mosaics(
+    model: GlimpseEvidence,
+    mosaics: Mosaics,
+    opened: Sequence[StoredGlances],
+    *,
+    classes: int,
+    passes: int,
+    seed: int,
+    title: str,
+) -> Searches:
+    """Take down all searches of `searches_of`, whose arguments these are.
+
+    Returns:
+        The searches.
+    """
+    rows: list[list[Tensor]] = []
+    searches = searches_of(model, mosaics, opened, classes=classes, passes=passes, seed=seed, title=title)
+    for _, annotation, target, turns in searches:
+        steps = [(tally.best, tally.case(turn.ahead), tally.looked, turn.ahead) for turn, tally in turns]
+        steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))
+        best, case, looked, left = zip(*steps, strict=True)
+        there = torch.tensor(bool((annotation.labels == target).any()))
+        rows.append([torch.tensor(best), torch.stack(case), torch.tensor(looked), torch.tensor(left), there])
+    return Searches(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int = 4096) -> None:
+    """Fit the probability that a picture contains the target, by the cross-entropy after all looks of all searches."""
+    best, case = searches.best.flatten(), searches.case.flatten(0, 1)
+    there = searches.there[:, None].expand_as(searches.best).flatten().float()
+
+    def loss_of(_: int) -> Tensor:
+        rows = torch.randint(len(best), (min(batch, len(best)),))
+        return F.binary_cross_entropy_with_logits(model.anywhere(best[rows], case[rows]), there[rows])
+
+    model.judge.requires_grad_(True)
+    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="fitting decisions")
+    model.judge.requires_grad_(False)
+
+
+@torch.no_grad()
+def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -> list[str]:
+    """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them.
+
+    Args:
+        model: the model, whose thresholds are set.
+        searches: the held-out searches.
+        bounds: limits on wrong decisions.
+
+    Returns:
+        Lines of a table in Markdown.
+    """
+    anywhere = model.anywhere(searches.best, searches.case).sigmoid()
+    there = searches.there
+    chosen = choose_thresholds(bounds, anywhere.mT, searches.looked.mT.to(anywhere), searches.left.mT, there)
+    # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
+    model.thresholds = chosen.changed(place=0.0)
+    rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
+    for number in (each for each in (*JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
+        presence = BinarySums.of(anywhere[:, number - 1], there)
+        raw = BinarySums.of(searches.best[:, number - 1], there)
+        area = area_under_roc(anywhere[:, number - 1], there) if bool(there.any() and not there.all()) else float("nan")
+        measures = (presence.nll, presence.brier, presence.ece, raw.ece)
+        rows.append([str(number), f"{area:.3f}", *(f"{measure:.3f}" for measure in measures)])
+    return table(rows)

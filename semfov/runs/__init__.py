@@ -1,0 +1,1 @@
+"""What environments, fits and studies share: settings, workers, progress, stores, and episodes of a protocol."""

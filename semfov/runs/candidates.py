@@ -1,0 +1,178 @@
+"""From the settings of a policy to its observer and its acquisition function."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from torch import Tensor
+
+from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
+from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.errors import InputError, check
+from semfov.eye import Eye
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Task, named_policy
+from semfov.gaze.policies.tables import salient_from
+from semfov.gaze.templates import ClassTemplates
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
+from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
+from semfov.runs.setup import make_context, make_map_evidence, make_observation, make_target_evidence, make_templates
+from semfov.strategy import Strategy
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A policy under comparison, in one scene.
+
+    Attributes:
+        strategy: observer and policy.
+        table: the table of the scene that the policy needs (`Policy.table`); None if it needs none.
+        saliency: saliency of all cells as a prior over them (`SaliencyPrior`), seen from each cell, `(X·Y, X·Y)`, or
+            the same for all fixations, `(1, X·Y)`; None for no prior.
+        weight: weight of this prior.
+    """
+
+    strategy: Strategy
+    table: Tensor | None = None
+    saliency: Tensor | None = None
+    weight: float = 1.0
+
+    @property
+    def observer(self) -> Observer:
+        """The observer, which updates the belief with looks."""
+        return self.strategy.observer
+
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
+        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        acquisition = self.strategy.policy.in_scene(target, grid, self.table, cell)
+        if self.saliency is None:
+            return acquisition
+        return SaliencyPrior(acquisition, salient_from(self.saliency, cell), weight=self.weight)
+
+
+@dataclass(frozen=True)
+class Models:
+    """Fitted models that the policies of a run need, contexts by name; None for a model that no policy needs."""
+
+    observation: FovealObservationModel | None = None
+    evidence: TargetEvidence | None = None
+    context: Mapping[str, ContextPrior] = field(default_factory=dict)
+    map: MapEvidence | None = None
+    templates: ClassTemplates | None = None
+
+
+def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
+    """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
+    check(len(config.policies) > 0, "policies", "at least one policy", "none")
+    policies = [resolve(choice, task) for choice in config.policies]
+    belief = config.belief
+    return Models(
+        make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
+        make_target_evidence(belief.target_model, eye)
+        if any(by_evidence(policy, task) for policy in policies)
+        else None,
+        {
+            name: make_context(name, eye)
+            for name in dict.fromkeys(
+                _of(policy.context_model, belief.context_model)
+                for policy in policies
+                if _of(policy.context, belief.context) != "none"
+            )
+        },
+        make_map_evidence(belief.map_model, eye)
+        if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
+        else None,
+        make_templates(config.class_templates, eye)
+        if any(table_of(policy) == "attention" for policy in policies)
+        else None,
+    )
+
+
+def by_evidence(policy: PolicyConfig, task: Task) -> bool:
+    """Whether a policy uses the learned target evidence."""
+    return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
+
+
+def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
+    """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
+    return any(
+        policy.scores == "calibrated"
+        or _of(policy.misses, belief.misses)
+        or (policy.policy in POLICIES and POLICIES[policy.policy].needs_model)
+        for policy in policies
+    )
+
+
+def make_strategy(
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
+) -> Strategy:
+    """Build the observer and the policy that settings describe.
+
+    Args:
+        policy: the settings of the policy.
+        task: what the policy is for.
+        belief: the belief settings of the run, used where the policy has none of its own.
+        components: number of classes, background included.
+        models: fitted models.
+        fovea: width of the fovea as a fraction of the image's longer side.
+
+    Returns:
+        The observer and the policy.
+
+    Raises:
+        InputError: a context is asked for with a policy that cannot use one, or a model is missing.
+    """
+    context = _of(policy.context, belief.context)
+    if context == "none":
+        return _strategy(policy, task, belief, components, models, fovea)
+    if task != "search" or policy.policy not in (TARGET_EVIDENCE, NonPredictive.name):
+        raise InputError(
+            "context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive', got policy "
+            f"{policy.policy!r}"
+        )
+    inner = _strategy(policy, task, belief, components, models, fovea)
+    prior = _given(models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context")
+    place, cooccurrence = prior.weights_for("evidence" if inner.observer.by_target else "map")
+    weights = place * (context != "cooccurrence"), cooccurrence * (context != "place")
+    return Strategy(Context(inner.observer, prior, weights), inner.policy)
+
+
+def _strategy(
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
+) -> Strategy:
+    if policy.policy == TARGET_EVIDENCE:
+        return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
+    means = Means(models.observation, models.map, fovea, belief.prior)
+    chosen = named_policy(policy.policy, task, means)
+    if by_evidence(policy, task):
+        return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
+    if policy.scores == "learned":
+        return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
+    misses = _of(policy.misses, belief.misses)
+    calibrated = policy.scores == "calibrated"
+    observer = Semantic(
+        components,
+        _given(models.observation, "scores", "an observation model") if calibrated else None,
+        prior=belief.prior,
+        fusion=belief.fusion,
+        footprint=_of(policy.footprint, belief.footprint),
+        tempering=_of(policy.tempering, belief.tempering),
+        memory=_of(policy.memory, belief.memory),
+        misses=_given(models.observation, "misses", "an observation model") if misses else None,
+    )
+    return Strategy(observer, chosen)
+
+
+def _of(own: T | None, common: T) -> T:
+    return common if own is None else own
+
+
+def _given(model: T | None, argument: str, expected: str) -> T:
+    if model is None:
+        raise InputError(f"{argument}: expected {expected}, got none")
+    return model

@@ -1,0 +1,284 @@
+"""Settings of the evaluation: dataclasses that are filled in from the command line and from YAML files."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from semfov.belief.grid import Footprint
+from semfov.belief.observers import Memory
+from semfov.detection.onnx_twin import Runtime
+from semfov.detection.scores import BackgroundPolicy
+from semfov.gaze.policies import Task
+from semfov.gaze.saliency.cells import Reduction
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers
+from semfov.sensor import SENSORS, Foveation, named_sensor
+from semfov.sensor.named import SensorName
+
+SaliencyModel = Literal["vocus2", "itti-koch"]
+Context = Literal["none", "place", "cooccurrence", "both"]
+Scores = Literal["raw", "calibrated", "learned"]
+
+
+@dataclass(frozen=True)
+class DataConfig(Settings):
+    """The scenes of the experiment.
+
+    Args:
+        root: folder of the photographs (None: the embedded scenes, which need no data set).
+        annotations: annotation file of the photographs, in the COCO instances format.
+        limit: use only this many scenes, the first ones (None: all photographs, or 8 embedded scenes).
+        min_instances: leave out photographs with fewer annotated objects than this (published: 8).
+        ids: text file with the ids of the photographs to use, one per line; the other settings select among these
+            (None: all photographs).
+        max_target_area: a class is searched for only if its boxes cover at most this share of the image (published: 0.2
+            for a target object; null: no limit).
+        scene_seed: random seed from which the embedded scenes are composed.
+    """
+
+    root: Path | None = None
+    annotations: Path | None = None
+    limit: Count | None = None
+    ids: Path | None = None
+    min_instances: Whole = 8
+    max_target_area: Positive | None = 0.2
+    scene_seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class DetectorConfig(Settings):
+    """The detector, which is applied to each foveated view.
+
+    Args:
+        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, a Darknet cfg file, an
+            ONNX model, or `torchvision:<model>`.
+        weights: file with the weights (None: the weights registered for the name).
+        background: how the background score is computed (`semfov.detection.scores`; None: the policy that suits the
+            network).
+        threshold: drop boxes whose confidence is lower than this.
+        iou: class-agnostic non-maximum suppression drops a box whose intersection over union with a more confident box
+            is larger than this.
+        limit: keep at most this many boxes per view, the most confident ones.
+        stride: pad the view to a multiple of this number of pixels (None: to the detector's square input, as Darknet
+            pads it; `auto`: whatever is fastest, 32 for Darknet's networks).
+        input_size: longer side in pixels to which a Darknet network's input is resized (None: the network's own, 416).
+        runtime: what runs a Darknet network: `torch`, `onnxruntime`, or the faster of the two (`auto`).
+        classes: names of the classes in the order of the scores (None: the network's own names, or those of COCO).
+        head: output format of an ONNX model whose format is not recognised (docs/detectors.md).
+    """
+
+    name: str = "yolov3-tiny"
+    weights: Path | None = None
+    background: BackgroundPolicy | None = "residual"
+    threshold: Share = 0.02
+    iou: Share = 0.5
+    limit: Count = 100
+    stride: Annotated[int, Range(1, 4096)] | Literal["auto"] | None = "auto"
+    input_size: Annotated[int, Range(1, 65_536)] | None = None
+    runtime: Runtime = "auto"
+    classes: tuple[str, ...] | None = None
+    head: str | None = None
+
+
+@dataclass(frozen=True)
+class SensorConfig(Settings):
+    """The foveal sensor.
+
+    Args:
+        name: `published` (the paper's wide fovea), `published-narrow` (the paper's narrow fovea), or `gradual` (the
+            agent's fovea); see `semfov.sensor.SENSORS`.
+        sigma: width of the fovea in pixels of an image whose longer side is `reference` (None: that of the named
+            sensor).
+        growth: factor by which the window of each coarser band is wider than that of the next finer band (None: that of
+            the named sensor).
+        levels: number of bands of the Laplacian pyramid.
+        convention: whether the pyramid is computed as `kornia` or as `opencv` does it.
+        reference: longer side, in pixels, of the images for which sigma is given.
+    """
+
+    name: SensorName = "gradual"
+    sigma: Positive | None = None
+    growth: Positive | None = None
+    levels: Annotated[int, Range(1, 30)] = 5
+    convention: Literal["kornia", "opencv"] = "kornia"
+    reference: Positive = 640.0
+
+    def make(self) -> Foveation:
+        """Build the sensor."""
+        given = {"sigma": self.sigma, "growth": self.growth}
+        changes = {name: value for name, value in given.items() if value is not None}
+        return named_sensor(self.name, levels=self.levels, convention=self.convention, **changes)
+
+    @property
+    def fovea(self) -> float:
+        """Width of the fovea as a fraction of the image's longer side."""
+        return (SENSORS[self.name]["sigma"] if self.sigma is None else self.sigma) / self.reference
+
+
+@dataclass(frozen=True)
+class BeliefConfig(Settings):
+    """The belief: a grid of cells over the image, with a distribution over the classes in each cell.
+
+    Args:
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
+        prior: Dirichlet parameter of every class before the first look.
+        fusion: rule that updates the belief with a detection: `kaplan` (published), `product` or `sum`.
+        footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
+        tempering: exponent of the likelihoods (published: 1).
+        memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
+        misses: also update cells in which nothing was detected, with the miss rates of the observation model.
+        model: fitted observation model, by name or file (None: semfov's own model for the detector and growth; for the
+            published one, give the detector's name followed by `-published` or `-published-narrow`).
+        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
+        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        context: context that is added to the log odds of the target: `none`, the `place` where the class usually is,
+            its `cooccurrence` with the classes seen so far, or `both`. Only `target-evidence` and `non-predictive` can
+            use context.
+        context_model: fitted context, by name or file.
+    """
+
+    columns: Side = 10
+    rows: Side = 10
+    prior: Positive = 0.5
+    fusion: Literal["kaplan", "product", "sum"] = "kaplan"
+    footprint: Footprint = "overlap"
+    tempering: Positive = 1.0
+    memory: Memory = "all"
+    misses: bool = False
+    model: str | None = None
+    target_model: str | None = None
+    map_model: str | None = None
+    context: Context = "none"
+    context_model: str = "coco"
+
+
+@dataclass(frozen=True)
+class SaliencyConfig(Settings):
+    """The saliency baselines, `vocus2` and `itti-koch`.
+
+    Args:
+        view: `foveated` computes the saliency of the foveated view from each fixation (published); `picture` computes
+            the saliency of the whole sharp photograph, once. Neither depends on the detector.
+        reduction: the saliency of a cell is the `max` or the `mean` of that of its pixels.
+        weight: weight of the saliency map as a prior over the cells, for policies that have one.
+    """
+
+    view: Literal["foveated", "picture"] = "foveated"
+    reduction: Reduction = "max"
+    weight: Weight = 1.0
+
+
+@dataclass(frozen=True)
+class PolicyConfig(Settings):
+    """A policy under comparison: how it chooses fixations, and which belief it uses.
+
+    A setting that is null is taken from the `belief` settings of the run.
+
+    Args:
+        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient cell)
+            and `ivsn` (uses class templates), or `target-evidence` (uses the learned evidence for the target).
+        scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
+            first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
+            evidence in searches.
+        tempering: exponent of the likelihoods.
+        footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
+        memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
+        misses: also update cells in which nothing was detected.
+        saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2` or
+            `itti-koch`.
+        context: context that is added to the log odds of the target: `none`, `place`, `cooccurrence` or `both`.
+        context_model: fitted context, by name or file.
+    """
+
+    policy: str
+    scores: Scores = "raw"
+    tempering: Positive | None = None
+    footprint: Footprint | None = None
+    memory: Memory | None = None
+    misses: bool | None = None
+    saliency: SaliencyModel | None = None
+    context: Context | None = None
+    context_model: str | None = None
+
+
+@dataclass(frozen=True)
+class ProtocolConfig(Settings):
+    """The protocol of the experiment.
+
+    Args:
+        starts: number of episodes per image (and per target, in searches), each from a different cell; no search starts
+            on its target.
+        shifts: number of gaze shifts per episode.
+        ties: among equally good cells choose one at `random`, or the `first` by number.
+        control: `none`; `wrong-class`: the searcher is given a randomly drawn wrong class, while the true class decides
+            what counts as found; `permuted`: the cells that count as the target are drawn at random, as many as truly
+            hold it.
+        seed: random seed of starts and tie-breaking (docs/guides/evaluation.md says what it reproduces).
+        batch: number of episodes computed together (does not change the result).
+    """
+
+    starts: Annotated[int, Range(1, 10_000)] = 10
+    shifts: Shifts = 30
+    ties: Literal["random", "first"] = "random"
+    control: Literal["none", "wrong-class", "permuted"] = "none"
+    seed: Seed = 0
+    batch: Count = 1024
+
+
+@dataclass(frozen=True)
+class LookingConfig(Settings):
+    """Looks at scenes from every cell of a grid.
+
+    Args:
+        data: the scenes.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief; its columns and rows are the cells.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    out: Path = Path("runs/looks")
+    cache: Path | None = None
+    store: bool = True
+    workers: Workers | None = None
+
+
+@dataclass(frozen=True)
+class RunConfig(LookingConfig):
+    """Policies that look at scenes, in the episodes of a protocol.
+
+    Args:
+        data: the scenes.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief, a grid of class distributions.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        saliency: the saliency baselines.
+        protocol: the protocol of the episodes.
+        policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
+        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
+
+    Attributes:
+        task: the task of the policies.
+    """
+
+    task: ClassVar[Task] = "search"
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
+    models: Path | None = None
+
+    @property
+    def class_templates(self) -> str | None:
+        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
+        return None

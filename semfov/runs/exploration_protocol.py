@@ -1,0 +1,121 @@
+"""The protocol of explorations: the episodes of a scene, and their results."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.episode import StoredLooks, rollout
+from semfov.gaze.choice import Greedy, drawn_from
+from semfov.metrics.exploration import count_right
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.seeds import generator_for, noise_for
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """One exploration of a scene.
+
+    Attributes:
+        scene: index of the scene in its data set.
+        repetition: number of the start, from 0.
+        start: cell of the first fixation.
+    """
+
+    scene: int
+    repetition: int
+    start: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Result of an exploration.
+
+    Attributes:
+        cells: the fixated cells in order.
+        right: after 0, 1, … gaze shifts, the number of cells with objects whose answer is the class of one of them. The
+            answer is the most probable class, background included (the published measure).
+        right_without_background: the same, but the answer is the most probable class other than background.
+        right_everywhere: the number of cells, among all, whose answer is the class of an object there, or background
+            where there is no object.
+    """
+
+    cells: tuple[int, ...]
+    right: tuple[int, ...]
+    right_without_background: tuple[int, ...]
+    right_everywhere: tuple[int, ...]
+
+
+def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
+    """All explorations of a scene; their starts differ as long as there are enough cells."""
+    generator = generator_for("start", protocol.seed, scenes.ids[index])
+    rounds = -(-protocol.starts // cells)
+    order = torch.cat([torch.randperm(cells, generator=generator) for _ in range(rounds)])
+    return [Exploration(index, number, start) for number, start in enumerate(order[: protocol.starts].tolist())]
+
+
+def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: ProtocolConfig) -> Tensor:
+    """Random numbers that break an exploration's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], "exploration", episode.repetition)
+
+
+def run_explorations(
+    episodes: Sequence[Exploration],
+    candidate: Candidate,
+    detections: Detections,
+    grid: Grid,
+    answers: Tensor,
+    noise: Tensor,
+    *,
+    shifts: int,
+    batch: int,
+) -> list[Progress]:
+    """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
+
+    Args:
+        episodes: the explorations, all of the same scene.
+        candidate: the policy under comparison.
+        detections: detections from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
+        answers: right classes of each cell (`answers_of`).
+        noise: `(episodes, shifts+1, X·Y)`, from `explore_noise`.
+        shifts: number of gaze shifts.
+        batch: number of episodes computed together.
+
+    Returns:
+        The result of each exploration.
+    """
+    starts = torch.tensor([episode.start for episode in episodes])
+    looks = StoredLooks(detections, grid)
+    progress: list[Progress] = []
+    for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
+        choice = Greedy(drawn_from(random))
+        visits, counts = [], []
+        for step in rollout(
+            looks,
+            candidate.observer,
+            lambda _, cell: candidate.acquisition(None, grid, cell),
+            start,
+            choice,
+            most=shifts + 1,
+        ):
+            known = step.belief.class_probabilities()
+            visits.append(step.cell)
+            counts.append(counts_of(known, answers))
+        # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
+        counts += [counts[-1]] * (shifts + 1 - len(counts))
+        tables = torch.stack(visits, 1).tolist(), *(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True))
+        progress += [Progress(*map(tuple, row)) for row in zip(*tables, strict=True)]
+    return progress
+
+
+def counts_of(probabilities: Tensor, answers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three counts of `Progress` for maps `(B, X·Y, K+1)`, each `(B,)`."""
+    everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
+    without = count_right(probabilities[..., 1:], answers[:, 1:])
+    return count_right(probabilities, answers), without, count_right(probabilities, everywhere)

@@ -1,0 +1,98 @@
+"""Looks at scenes from every cell of a grid, kept on disk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.errors import DataError
+from semfov.runs.config import BeliefConfig, LookingConfig
+from semfov.runs.remembered import look_everywhere
+from semfov.runs.results import Record
+from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
+from semfov.runs.setup import check_sources, make_eye, make_scenes
+from semfov.runs.store import cell_store
+
+
+class Looking(SceneRun):
+    """Scenes, and an eye that looks at each of them from every cell; what it detects is stored.
+
+    Its outcomes are the looks themselves. A subclass that compares policies adds the records of their episodes.
+
+    Args:
+        config: the settings.
+
+    Attributes:
+        eye: sensor and detector.
+        store: the stored detections.
+    """
+
+    config: LookingConfig
+
+    def __init__(self, config: LookingConfig) -> None:
+        self.config = config
+        self.check_sources()
+        self.eye = make_eye(config.detector, config.sensor)
+        self.scenes: Scenes = self.open_scenes()
+        if not len(self.scenes):
+            raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
+        size, components = (config.belief.columns, config.belief.rows), len(self.scenes.classes) + 1
+        self.store = cell_store(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self._digests: dict[int, str] = {}
+
+    def check_sources(self) -> None:
+        """Check that the files of the scenes and of the detector exist, before any of them is loaded."""
+        check_sources(self.config.data, self.config.detector)
+
+    def open_scenes(self) -> Scenes:
+        """Open the scenes; a subclass may open others."""
+        return make_scenes(self.config.data, self.eye.detector.classes)
+
+    def _key(self) -> str:
+        cells = [self.config.belief.columns, self.config.belief.rows]
+        return digest_of([self.eye.settings(), self.scenes.fingerprint, cells])
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a scene depend on."""
+        if index not in self._digests:
+            self._digests[index] = self.scenes.digest(index)
+        return self._digests[index]
+
+    def grid(self, index: int) -> Grid:
+        """The grid over a scene."""
+        return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index).size)
+
+    def detections(self, index: int) -> Detections:
+        """Detections from every cell of a scene, read from the store, or computed and stored."""
+        store = self.store if self.config.store else None
+        image, digest = (lambda: self.scenes[index].image[None]), (lambda: self.digest(index))
+        return look_everywhere(self.eye, image, self.grid(index), store, digest)
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Look at a scene; there are no episodes, so there are no records."""
+        self.detections(index)
+        return [], {}
+
+
+def looking_of(config: Any) -> Looking:
+    """Prepare the looks from every cell that a fit needs.
+
+    Args:
+        config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
+
+    Returns:
+        The looks, none of which has been taken yet (`finish` takes them).
+    """
+    return Looking(
+        LookingConfig(
+            data=config.data,
+            detector=config.detector,
+            sensor=config.sensor,
+            belief=BeliefConfig(columns=config.columns, rows=config.rows),
+            out=config.out,
+            cache=config.cache,
+            workers=config.workers,
+        )
+    )

@@ -1,0 +1,94 @@
+"""Looks at scenes from every cell of a grid, and policies that choose among the cells."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check, lookup
+from semfov.gaze.policies import Task
+from semfov.gaze.templates import at_points
+from semfov.runs.candidates import Candidate, load_models, make_strategy
+from semfov.runs.config import RunConfig, SaliencyModel
+from semfov.runs.looking import Looking
+from semfov.runs.looks import one_thread
+from semfov.runs.presets import label, resolve
+from semfov.runs.saliency_store import SaliencyStore, saliency_table
+from semfov.runs.scene_run import cache_folder
+from semfov.runs.setup import fovea_of
+
+
+class PolicyLooking(Looking):
+    """Looks at scenes, and policies with the tables that they need for each scene.
+
+    Args:
+        config: the settings.
+
+    Attributes:
+        task: the task of the policies.
+        policies: settings of the policies, by their names in tables.
+        models: fitted models that the policies need.
+        strategies: observer and policy, by name.
+        saliency_stores: stored saliency, by name of its model.
+    """
+
+    task: Task
+    config: RunConfig
+
+    def __init__(self, config: RunConfig) -> None:
+        labels = [label(choice, self.task) for choice in config.policies]
+        for name in labels:
+            check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
+        self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
+        super().__init__(config)
+        self.models = load_models(config, self.task, self.eye)
+        components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
+        self.strategies = {
+            name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
+            for name, policy in self.policies.items()
+        }
+        folder, sensor = cache_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
+        size = config.belief.columns, config.belief.rows
+        self.saliency_stores = {
+            name: SaliencyStore(folder, name, config.saliency, sensor, size)
+            for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
+            if name is not None
+        }
+
+    def candidate(self, name: str, index: int) -> Candidate:
+        """The policy of this name in tables, for a scene."""
+        policy = self.policies[lookup(name, self.policies, "policy of this run")]
+        strategy = self.strategies[name]
+        if strategy.policy.table == "attention":
+            return Candidate(strategy, self.attention(index))
+        if policy.saliency is None:
+            return Candidate(strategy)
+        saliency = self.saliency(policy.saliency, index)
+        if strategy.policy.table == "saliency":
+            return Candidate(strategy, saliency)
+        return Candidate(strategy, saliency=saliency, weight=self.config.saliency.weight)
+
+    def attention(self, index: int) -> Tensor:
+        """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""
+        templates, found = self.models.templates, []
+        assert templates is not None
+        with one_thread(), torch.inference_mode():
+            image, grid = self.scenes[index].image, self.grid(index)
+            view, points = self.eye.open(image[None]), grid.centres.to(image)
+            for point in points:
+                canvas = self.eye.foveated(view, point[None])
+                maps = templates(self.eye.detector.features(canvas))
+                found.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
+            return torch.cat(found)
+
+    def saliency(self, name: SaliencyModel, index: int) -> Tensor:
+        """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
+        digest, store = self.digest(index), self.saliency_stores[name]
+        saliency = store.load(digest) if self.config.store else None
+        if saliency is None:
+            image = self.scenes[index].image
+            sensor, reference = fovea_of(self.eye), self.config.sensor.reference
+            saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
+            if self.config.store:
+                store.save(digest, saliency)
+        return saliency

@@ -1,0 +1,162 @@
+"""Presets: policies by name, and labels for policies without a name."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from types import MappingProxyType
+from typing import get_args
+
+from semfov.belief.grid import Footprint
+from semfov.belief.observers import Memory
+from semfov.errors import InputError, check, lookup
+from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
+from semfov.runs.config import Context, PolicyConfig, SaliencyModel, Scores
+
+TARGET_EVIDENCE = "target-evidence"
+SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
+
+WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
+"""Settings with a fixed set of values."""
+
+ALIASES = ("recommended", "published")
+"""Presets that have another name in tables, like those of `MAXIMUM_A_POSTERIORI`."""
+
+MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
+"""Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
+
+OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
+"""Settings of the map of all classes."""
+
+Choice = str | PolicyConfig
+"""A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
+
+
+def known_policies(task: Task) -> list[str]:
+    """The values that `PolicyConfig.policy` may have."""
+    return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
+
+
+def table_of(policy: PolicyConfig) -> Table | None:
+    """The table that a policy needs of every scene."""
+    return POLICIES[policy.policy].table if policy.policy in POLICIES else None
+
+
+def presets(task: Task) -> Mapping[str, PolicyConfig]:
+    """The presets for a task."""
+    return _presets(task, tuple(policy_names(task)))
+
+
+@cache
+def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
+    plain = {name: PolicyConfig(name) for name in policies if POLICIES[name].table != "saliency"}
+    salient = {
+        model: PolicyConfig(name, saliency=model)
+        for name in policies
+        if POLICIES[name].table == "saliency"
+        for model in SALIENCY_MODELS
+    }
+    if task == "search":
+        # The scores do not matter to these: no belief guides them, or one of their own.
+        alone = {name: PolicyConfig(name) for name in (Random.name, TARGET_EVIDENCE)}
+        alone |= {name: policy for name, policy in plain.items() if table_of(policy) is not None} | salient
+        best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
+        scored = {name: policy for name, policy in plain.items() if name not in alone}
+        alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
+    else:
+        best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
+        scored = {name: policy for name, policy in plain.items() if not POLICIES[name].needs_map} | salient
+        alone = {
+            f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
+            for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
+            if not POLICIES[policy.policy].needs_model
+        }
+    both = {
+        f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
+        for name, policy in scored.items()
+        for scores in ("raw", "calibrated")
+    }
+    same = {"recommended": best, "published": published}
+    if task == "search":
+        same |= {
+            f"{MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
+        }
+        same[f"{MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
+    return MappingProxyType({**alone, **both, **same})
+
+
+def resolve(choice: Choice, task: Task) -> PolicyConfig:
+    """The settings of a policy.
+
+    Args:
+        choice: the name of a preset, or settings.
+        task: what the policy is for.
+
+    Returns:
+        The settings.
+
+    Raises:
+        InputError: there is no such preset, no such policy, or its settings contradict each other.
+    """
+    known = presets(task)
+    if isinstance(choice, str):
+        if choice[:1] in ("[", "{"):
+            settings = ", ".join(field.name for field in fields(PolicyConfig))
+            raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
+        return known[lookup(choice, known, "policy")]
+    lookup(choice.policy, known_policies(task), "policy")
+    if table_of(choice) == "saliency" and choice.saliency is None:
+        models = ", ".join(SALIENCY_MODELS)
+        raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
+    for setting, words in WORDS.items():
+        if getattr(choice, setting) is not None:
+            lookup(getattr(choice, setting), get_args(words), setting)
+    if choice.tempering is not None:
+        check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
+    scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
+    if choice.scores not in scores:
+        expected = " or ".join(map(repr, scores))
+        raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
+    if choice.scores == "learned" or choice.policy == TARGET_EVIDENCE:
+        given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
+        if given is not None:
+            raise InputError(
+                f"{given}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
+                f"belief, got {getattr(choice, given)!r}"
+            )
+    return choice
+
+
+def label(choice: Choice, task: Task) -> str:
+    """The name of a policy in tables: the preset that it is based on, and the settings that differ from it.
+
+    Args:
+        choice: the name of a preset, or settings.
+        task: what the policy is for.
+
+    Returns:
+        The name.
+
+    >>> label(PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre"), "search")
+    'non-predictive-raw, tempering 0.25, footprint box_centre'
+    """
+    settings = resolve(choice, task)
+    names = {
+        preset: name
+        for name, preset in presets(task).items()
+        if name not in ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
+    }
+    alone = settings.saliency if table_of(settings) == "saliency" else None
+    base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
+    differs = []
+    for field in fields(PolicyConfig)[2:]:
+        value = getattr(settings, field.name)
+        if value is not None and not (field.name == "saliency" and alone is not None):
+            shown = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
+            differs.append(field.name if value is True else f"{field.name} {shown}")
+    return ", ".join([base, *differs])
+
+
+def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
+    """Whether there is a preset of this policy with these scores."""
+    saliency = policy.saliency if table_of(policy) == "saliency" else None
+    return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

@@ -1,0 +1,103 @@
+"""Stores the saliency of every cell of a scene, from every fixation or once for the whole photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.placement import resize
+from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.io.schema import Field, Schema
+from semfov.runs.config import SaliencyConfig
+from semfov.runs.looks import one_thread
+from semfov.runs.store import SceneStore, looks_digest
+from semfov.sensor import Bands, Foveation
+
+Model = Callable[[Tensor], Tensor]
+
+SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
+"""Modules that saliency depends on, in addition to those of a look."""
+
+SALIENCY_MODELS: dict[str, Callable[[], Model]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
+
+
+class SaliencyStore(SceneStore):
+    """Saliency of a scene's cells on disk, `(F, X·Y)` for F = X·Y fixations, or F = 1 for the whole photograph.
+
+    Args:
+        folder: folder of the store.
+        name: name of the saliency model.
+        saliency: settings of the saliency baselines.
+        sensor: settings of the sensor; the saliency of the whole photograph does not depend on them.
+        grid: `(columns, rows)`.
+    """
+
+    def __init__(
+        self, folder: Path, name: str, saliency: SaliencyConfig, sensor: Mapping[str, Any], grid: tuple[int, int]
+    ) -> None:
+        what = {
+            "model": name,
+            "view": saliency.view,
+            "reduction": saliency.reduction,
+            "sensor": sensor if saliency.view == "foveated" else None,
+            "grid": list(grid),
+        }
+        cells = grid[0] * grid[1]
+        schema = Schema({"saliency": Field(("F", cells), low=0)})
+        super().__init__(folder, what, looks_digest(*SOURCES), schema)
+        self.fixations = cells if saliency.view == "foveated" else 1
+
+    def load(self, digest: str) -> Tensor | None:
+        """The saliency of a scene; None if it is missing or incomplete."""
+        tensors = self.read(digest)
+        return None if tensors is None or len(tensors["saliency"]) != self.fixations else tensors["saliency"]
+
+    def save(self, digest: str, saliency: Tensor) -> None:
+        """Store the saliency of a scene."""
+        self.write(digest, {"saliency": saliency})
+
+
+def saliency_table(
+    name: str, saliency: SaliencyConfig, sensor: Foveation, reference: float, image: Tensor, grid: Grid
+) -> Tensor:
+    """Saliency of every cell of a photograph.
+
+    It does not depend on a detector: the photograph is resized so that its longer side is `reference`, the size for
+    which the sensor's σ is given.
+
+    Args:
+        name: name of the saliency model.
+        saliency: settings of the saliency baselines.
+        sensor: the foveal sensor.
+        reference: longer side in pixels of the images for which the sensor's σ is given.
+        image: `(3, H, W)`.
+        grid: the grid over the image.
+
+    Returns:
+        `(X·Y, X·Y)`, a row for the view from the centre of each cell, or `(1, X·Y)` for the whole photograph.
+    """
+    model = SALIENCY_MODELS[name]()
+    with one_thread(), torch.inference_mode():
+        if saliency.view == "picture":
+            return cells_of(model, image[None], grid, saliency)
+        bands, fixations = seen_by(sensor, reference, image, grid.centres)
+        # One view at a time: rounding then does not depend on which views share a batch.
+        return torch.cat([cells_of(model, sensor(bands, fixation), grid, saliency) for fixation in fixations])
+
+
+def seen_by(sensor: Foveation, reference: float, image: Tensor, points: Tensor) -> tuple[Bands, Tensor]:
+    """Pyramid of a photograph `(3, H, W)` resized to a longer side of `reference`, and its `points` `(F, 2)` there."""
+    scale = reference / max(image.shape[-2:])
+    size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
+    ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
+    return sensor.pyramid(resize(image[None], size)), (points + 0.5) * ratio - 0.5
+
+
+def cells_of(model: Model, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
+    """Saliency of the cells of pictures `(B, 3, h, w)`, `(B, X·Y)`."""
+    return cell_saliency(model(pictures), grid.columns, grid.rows, saliency.reduction)

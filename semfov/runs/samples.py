@@ -1,0 +1,312 @@
+"""Labelled detections: the detector's scores, the distance from the fixation, and the true class."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Annotation, Scenes
+from semfov.detection.detections import Detections
+from semfov.errors import DataError
+from semfov.eye import Eye
+from semfov.io.schema import Field, Schema
+from semfov.observation.matching import match
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.looks import look_from
+from semfov.runs.seeds import generator_for
+from semfov.runs.setup import check_sources, make_eye, make_scenes, prepare_worker
+from semfov.runs.store import SceneStore, looks_digest
+from semfov.runs.workers import available_cores, mine, run_tasks, wait_for_others
+from semfov.zoom.eye import ZoomEye
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Detections with their true classes, and the looks that they come from.
+
+    Attributes:
+        boxes: `(M, 4)`, in pixels of the image.
+        scores: `(M, K+1)`, score vectors.
+        distance: `(M,)`, distance of the box's centre from the fixation, as a fraction of the image's longer side.
+        labels: `(M,)`, true classes, 0 where a detection matches no object.
+        look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
+        scenes: `(R,)`, index of the scene of each look; a look may have no detections.
+        fixations: `(R, 2)`, the fixation of each look; for glimpses of large pictures `(R, 3)`, with the magnification.
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    distance: Tensor
+    labels: Tensor
+    look: Tensor
+    scenes: Tensor
+    fixations: Tensor
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        """Select detections; all looks are kept."""
+        chosen = {name: getattr(self, name)[index] for name in _DETECTIONS}
+        return Samples(**chosen, scenes=self.scenes, fixations=self.fixations)
+
+    @property
+    def scene(self) -> Tensor:
+        """Index of the scene of each detection, `(M,)`."""
+        return self.scenes[self.look]
+
+    def seen(self, looks: slice) -> Detections:
+        """The detections of successive looks, as a batch."""
+        numbers = torch.arange(looks.start, looks.stop + 1)
+        bounds = torch.searchsorted(self.look, numbers).tolist()
+        return Detections.stack([self._view(slice(a, b)) for a, b in itertools.pairwise(bounds)])
+
+    def _view(self, rows: slice) -> Detections:
+        boxes, scores = self.boxes[rows], self.scores[rows]
+        return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
+
+    @classmethod
+    @torch.inference_mode()
+    def of(cls, seen: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
+        """Label the detections of the looks at one scene.
+
+        Args:
+            seen: the detections, a batch of R looks.
+            fixations: `(R, 2)`, the fixation of each look.
+            annotation: the scene's annotated objects.
+            index: index of the scene.
+            iou: smallest intersection over union at which a detection matches an object.
+
+        Returns:
+            The labelled detections.
+        """
+        labels = [
+            match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
+            for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
+        ]
+        return cls(
+            boxes=seen.boxes[seen.mask],
+            scores=seen.scores[seen.mask],
+            distance=Grid(1, 1, annotation.size).box_distance(seen.boxes, fixations)[seen.mask],
+            labels=torch.cat(labels),
+            look=seen.mask.nonzero()[:, 0],
+            scenes=torch.full((len(fixations),), index),
+            fixations=fixations,
+        )
+
+    @classmethod
+    def join(cls, parts: list[Samples]) -> Samples:
+        """Concatenate several sets of samples in order."""
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _NAMES}
+        counts = torch.tensor([len(part.scenes) for part in parts])
+        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(part) for part in parts]))
+        return cls(**{**joined, "look": joined["look"] + first})
+
+
+_DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
+_NAMES = (*_DETECTIONS, "scenes", "fixations")
+
+SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")
+"""Modules that samples depend on, in addition to those of a look."""
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """Settings that labelled detections depend on.
+
+    Attributes:
+        data: the photographs.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        fixations: number of random fixations in each photograph, uniform over its pixels.
+        iou: smallest intersection over union at which a detection matches an object.
+        seed: random seed of the fixations.
+        shard: number of photographs in a shard, the unit of work.
+    """
+
+    data: DataConfig
+    detector: DetectorConfig
+    sensor: SensorConfig
+    fixations: int
+    iou: float
+    seed: int
+    shard: int = 32
+
+    @classmethod
+    def of(cls, config: Any) -> SampleSettings:
+        """Take these settings from those of a command, by their names."""
+        return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
+
+    def sampler(self, folder: Path) -> Sampler:
+        """The sampler with these settings, whose shards are in a folder."""
+        return Sampler(self, folder)
+
+
+Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
+"""Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
+`(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
+
+
+def cells_of(columns: int, rows: int) -> Cells:
+    """A grid over whole photographs: every look shows all cells, at their distances from the fixation."""
+
+    def cells(size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+        grid = Grid(columns, rows, size)
+        return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
+
+    return cells
+
+
+class Sampler:
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
+
+    Args:
+        settings: settings of the samples.
+        folder: folder of the shards.
+
+    Attributes:
+        store: store of the shards.
+        sources: modules that samples depend on; all modules that they import count, too.
+        coordinates: number of coordinates of a fixation.
+    """
+
+    sources: ClassVar[tuple[str, ...]] = SOURCES
+    coordinates: ClassVar[int] = 2
+
+    def __init__(self, settings: SampleSettings, folder: Path) -> None:
+        self.settings = settings
+        check_sources(settings.data, settings.detector)
+        self.eye, self.scenes = self.make()
+        components = len(self.scenes.classes) + 1
+        schema = Schema(
+            {
+                "boxes": Field(("M", 4)),
+                "scores": Field(("M", components), low=0, high=1),
+                "distance": Field(("M",), low=0),
+                "labels": Field(("M",), torch.int64, low=0, high=components - 1),
+                "look": Field(("M",), torch.int64, low=0),
+                "scenes": Field(("R",), torch.int64, low=0, high=len(self.scenes) - 1),
+                "fixations": Field(("R", self.coordinates)),
+            }
+        )
+        what = {
+            "settings": self.eye.settings(),
+            "scenes": self.scenes.fingerprint,
+            **{name: getattr(settings, name) for name in ("fixations", "iou", "seed", "shard")},
+        }
+        self.store = SceneStore(folder, what, looks_digest(*self.sources), schema)
+
+    def make(self) -> tuple[Eye | ZoomEye, Scenes]:
+        """Make the eye and open the scenes."""
+        eye = make_eye(self.settings.detector, self.settings.sensor)
+        return eye, make_scenes(self.settings.data, eye.detector.classes)
+
+    def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+        """The cells in which misses are counted (`Cells`)."""
+        return cells_of(10, 10)(size, fixation)
+
+    @property
+    def foveal_eye(self) -> Eye:
+        """The eye, which must be a foveal one."""
+        assert isinstance(self.eye, Eye)
+        return self.eye
+
+    @property
+    def shards(self) -> range:
+        """The numbers of the shards."""
+        return range(-(-len(self.scenes) // self.settings.shard))
+
+    def load(self, shard: int) -> Samples | None:
+        """The samples of a shard; None if they are missing or damaged."""
+        tensors = self.store.read(self.digest(shard))
+        return None if tensors is None else Samples(**tensors)
+
+    def save(self, shard: int, samples: Samples) -> None:
+        """Store the samples of a shard."""
+        self.store.write(self.digest(shard), {name: getattr(samples, name) for name in _NAMES})
+
+    def scenes_of(self, shard: int) -> range:
+        """The photographs of a shard."""
+        first = shard * self.settings.shard
+        return range(first, min(first + self.settings.shard, len(self.scenes)))
+
+    def digest(self, shard: int) -> str:
+        """sha256 of what the pixels of a shard's photographs depend on, and of their numbers."""
+        digests = [[index, self.scenes.digest(index)] for index in self.scenes_of(shard)]
+        return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
+
+    def sample(self, shard: int) -> Samples:
+        """Look at the photographs of a shard; returns the labelled detections."""
+        return Samples.join([self._look(index) for index in self.scenes_of(shard)])
+
+    def _look(self, index: int) -> Samples:
+        settings, scene = self.settings, self.scenes[index]
+        grid = Grid(1, 1, scene.size)
+        generator = generator_for("fixations", settings.seed, scene.id)
+        points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
+        seen = look_from(self.foveal_eye, scene.image, points)
+        return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
+
+
+_process: dict[str, Sampler] = {}
+
+
+def _prepare(settings: SampleSettings, folder: Path) -> None:
+    prepare_worker()
+    _process["sampler"] = settings.sampler(folder)
+
+
+def _run_shard(shard: int) -> int:
+    sampler = _process["sampler"]
+    sampler.save(shard, sampler.sample(shard))
+    return shard
+
+
+def collect(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
+    """Collect the labelled detections of all photographs in order; finished shards are read, the others computed.
+
+    The result is the same to the last bit for any number of workers and ranks.
+
+    Args:
+        settings: the settings of the samples.
+        folder: folder of the shards.
+        workers: number of processes (None: one per CPU core).
+        title: label of the progress bar.
+
+    Returns:
+        The sampler and the samples.
+
+    Raises:
+        DataError: the file of a shard is missing or damaged.
+    """
+    sampler = settings.sampler(folder)
+    todo = [shard for shard in mine(sampler.shards) if sampler.load(shard) is None]
+    done = run_tasks(
+        _run_shard,
+        todo,
+        workers=workers or available_cores(),
+        setup=_prepare,
+        settings=(settings, folder),
+        title=title,
+        unit="shard",
+    )
+    for _ in done:
+        pass
+    wait_for_others(sampler.shards, lambda shard: sampler.load(shard) is not None)
+    parts = []
+    for shard in sampler.shards:
+        part = sampler.load(shard)
+        if part is None:
+            path = sampler.store.path(sampler.digest(shard))
+            raise DataError(f"{path} is missing or damaged; run the same command again")
+        parts.append(part)
+    return sampler, Samples.join(parts)

@@ -1,0 +1,158 @@
+"""Work over scenes that any process can build from its settings; a stopped run continues where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from semfov.data.scene import Scenes
+from semfov.errors import DataError
+from semfov.io.code import class_digest, package_digest
+from semfov.runs.results import Parts, Record
+from semfov.runs.setup import prepare_worker
+from semfov.runs.store import versions
+from semfov.runs.workers import available_cores, mine, rank, run_tasks, wait_for_others
+
+_log = logging.getLogger(__name__)
+
+
+class SceneRun(ABC):
+    """Base of runs that any process can build from the settings and that go through scenes one by one.
+
+    Attributes:
+        config: the settings.
+        scenes: the scenes in order.
+        settings_key: sha256 of all settings, models and scenes that the outcomes depend on.
+        code: sha256 of all code that the outcomes depend on.
+        key: short key of both; it keeps the outcomes of different runs apart.
+    """
+
+    config: Any
+    scenes: Scenes
+
+    @cached_property
+    def settings_key(self) -> str:
+        """sha256 of all settings, models and scenes that the outcomes depend on."""
+        return self._key()
+
+    @cached_property
+    def code(self) -> str:
+        """sha256 of all code that the outcomes depend on."""
+        return self._code()
+
+    @property
+    def key(self) -> str:
+        """Short key of settings and code; it keeps the outcomes of different runs apart."""
+        return f"{self.settings_key[:16]}-{self.code[:16]}"
+
+    @abstractmethod
+    def _key(self) -> str: ...
+
+    def _code(self) -> str:
+        """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
+        return digest_of([package_digest(), versions(), class_digest(type(self))])
+
+    @property
+    def parts(self) -> Parts:
+        """The outcomes of finished scenes."""
+        return Parts(self.config.out / "parts", self.key, self.digest)
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a scene depend on."""
+        return self.scenes.digest(index)
+
+    @abstractmethod
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
+
+
+def cache_folder(chosen: Path | None) -> Path:
+    """Folder of the stores: the chosen one, or the user's cache."""
+    if chosen is not None:
+        return chosen
+    from semfov.detection.weights import cache_folder as user_cache
+
+    return user_cache()
+
+
+def finish(run: SceneRun, title: str) -> None:
+    """Run this rank's share of the scenes that are not finished yet, and wait for the other ranks."""
+    parts = run.parts
+    todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
+    older = parts.by_other_code()
+    if todo and older:
+        _log.warning(
+            "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
+            "changed since); they are computed anew",
+            run.config.out,
+            older,
+        )
+    done = run_tasks(
+        finish_scene,
+        todo,
+        workers=run.config.workers or available_cores(),
+        setup=prepare_process,
+        settings=(type(run), run.config),
+        title=title,
+        unit="scene",
+    )
+    for _ in done:
+        pass
+    wait_for_others(range(len(run.scenes)), lambda index: parts.load(index) is not None)
+
+
+def complete(run: SceneRun, title: str) -> list[Record] | None:
+    """Run all scenes that are not finished yet.
+
+    Args:
+        run: the run.
+        title: label of the progress bar.
+
+    Returns:
+        The records of all scenes; None in a process of torchrun that does not write the report.
+    """
+    finish(run, title)
+    return gather(run)[0] if rank() == 0 else None
+
+
+def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
+    """Records of all scenes in their order, and the seconds that each stage took."""
+    records: list[Record] = []
+    seconds: dict[str, float] = defaultdict(float)
+    for index in range(len(run.scenes)):
+        part = run.parts.load(index)
+        if part is None:
+            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
+        records += part["records"]
+        for stage, value in part["seconds"].items():
+            seconds[stage] += value
+    return records, dict(seconds)
+
+
+def digest_of(what: object) -> str:
+    """The sha256 of a JSON value."""
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+_process: dict[str, SceneRun] = {}
+
+
+def prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
+    """Build the run in this process, once."""
+    prepare_worker()
+    _process["run"] = make(config)
+
+
+def finish_scene(index: int) -> int:
+    """Run all episodes of a scene and store their outcomes; returns the index of the scene."""
+    run = _process["run"]
+    records, seconds = run.outcomes(index)
+    run.parts.save(index, records, seconds)
+    return index

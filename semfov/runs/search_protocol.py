@@ -1,0 +1,221 @@
+"""The protocol of searches: the episodes of a scene, and their results."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Annotation, Scenes, legal_targets
+from semfov.detection.detections import Detections
+from semfov.episode import Step, StoredLooks, rollout
+from semfov.gaze.acquisition import AcquisitionFunction
+from semfov.gaze.choice import Greedy, drawn_from
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.seeds import generator_for, noise_for
+from semfov.strategy import Strategy
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One search for a target class in a scene.
+
+    Attributes:
+        scene: index of the scene in its data set.
+        target: class index, 1..K.
+        cue: class that the searcher is told to look for; it differs from the target only in a control experiment.
+        repetition: number of the start, from 0.
+        start: cell of the first fixation.
+        goal: cells that an object of the target class overlaps.
+        commonest: whether the target is the class with most instances in the scene (of several, the lowest index).
+    """
+
+    scene: int
+    target: int
+    cue: int
+    repetition: int
+    start: int
+    goal: tuple[int, ...]
+    commonest: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
+
+    cells: tuple[int, ...]
+    found_at: int
+
+
+def episodes_of(
+    scenes: Scenes,
+    index: int,
+    columns: int,
+    rows: int,
+    protocol: ProtocolConfig,
+    targets: Sequence[int] | None = None,
+) -> list[Episode]:
+    """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
+
+    Starts differ from each other as long as there are enough cells.
+
+    Args:
+        scenes: the data set.
+        index: index of the scene.
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
+        protocol: the protocol of the experiment.
+        targets: classes to search for (None: the classes that the data set allows).
+
+    Returns:
+        The episodes.
+    """
+    annotation = scenes.annotation(index)
+    labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
+    counts = torch.bincount(labels, minlength=1)
+    targets = scenes.targets(index) if targets is None else targets
+    commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
+    episodes = []
+    for target in targets:
+        goal, cue = covered[labels == target].any(0), target
+        if protocol.control == "permuted":
+            goal = goal[
+                torch.randperm(len(goal), generator=generator_for("goal", protocol.seed, scenes.ids[index], target))
+            ]
+        elif protocol.control == "wrong-class":
+            others = [other for other in range(1, len(scenes.classes) + 1) if other != target]
+            draw = generator_for("cue", protocol.seed, scenes.ids[index], target)
+            cue = others[int(torch.randint(len(others), (1,), generator=draw))]
+        free = (~goal).nonzero()[:, 0]
+        if not len(free) or not goal.any():
+            continue
+        generator = generator_for("start", protocol.seed, scenes.ids[index], target)
+        rounds = -(-protocol.starts // len(free))
+        order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
+        cells = tuple(goal.nonzero()[:, 0].tolist())
+        episodes += [
+            Episode(index, target, cue, repetition, start, cells, target == commonest)
+            for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
+        ]
+    return episodes
+
+
+def choose_classes(
+    scenes: Scenes,
+    index: int,
+    annotation: Annotation,
+    classes: int,
+    max_area: float,
+    seed: int,
+    absent: int | None = None,
+) -> list[int]:
+    """Draw target classes for a photograph: some that it holds, and some that it does not hold.
+
+    Args:
+        scenes: the data set.
+        index: index of the scene.
+        annotation: the scene's annotated objects.
+        classes: largest number of present classes.
+        max_area: classes that cover a larger share of the image are left out.
+        seed: random seed of the choice.
+        absent: largest number of absent classes (None: the number of present classes that were drawn).
+
+    Returns:
+        The present classes, then the absent ones.
+    """
+    generator = generator_for("classes", seed, scenes.ids[index])
+    held = set(annotation.labels.tolist())
+    legal = legal_targets(annotation, max_area)
+    present = [legal[place] for place in torch.randperm(len(legal), generator=generator)[:classes].tolist()]
+    others = [target for target in range(1, len(scenes.classes) + 1) if target not in held]
+    count = len(present) if absent is None else absent
+    return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
+
+
+def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
+    """Random numbers that break an episode's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
+
+
+def run_episodes(
+    episodes: Sequence[Episode],
+    candidate: Candidate,
+    detections: Detections,
+    grid: Grid,
+    noise: Tensor,
+    *,
+    shifts: int,
+    batch: int,
+) -> list[Outcome]:
+    """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
+
+    Args:
+        episodes: the episodes, all of the same scene.
+        candidate: the policy under comparison.
+        detections: detections from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
+        noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
+        shifts: largest number of gaze shifts.
+        batch: number of episodes computed together.
+
+    Returns:
+        The result of each episode.
+    """
+    outcomes: list[Outcome] = []
+    for first in range(0, len(episodes), batch):
+        part = slice(first, first + batch)
+        outcomes += _run_batch(episodes[part], candidate, detections, grid, noise[part], shifts)
+    return outcomes
+
+
+def _run_batch(
+    episodes: Sequence[Episode], candidate: Candidate, detections: Detections, grid: Grid, noise: Tensor, shifts: int
+) -> list[Outcome]:
+    goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
+    for row, episode in enumerate(episodes):
+        goals[row, list(episode.goal)] = True
+    cues = torch.tensor([episode.cue for episode in episodes])
+    starts = torch.tensor([episode.start for episode in episodes])
+    visits = torch.full((len(episodes), shifts + 1), -1)
+    visits[:, 0] = starts
+    found_at = torch.where(goals.gather(1, starts[:, None])[:, 0], 0, -1)
+    # A search that starts on its target has ended before its first look.
+    seeking = (found_at < 0).nonzero()[:, 0]
+
+    def acquisition(order: Tensor, cell: Tensor) -> AcquisitionFunction:
+        return candidate.acquisition(cues[seeking[order]], grid, cell)
+
+    def lands(step: Step) -> Tensor:
+        return goals[seeking[step.episodes], step.next_cell]
+
+    looks = StoredLooks(detections, grid, cues[seeking])
+    choice = Greedy(drawn_from(noise[seeking]))
+    for step in rollout(looks, candidate.observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
+        going = ~step.visited.all(-1)
+        number = seeking[step.episodes[going]]
+        visits[number, step.shift + 1] = step.next_cell[going]
+        found_at[number[lands(step)[going]]] = step.shift + 1
+    return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
+
+
+def search_steps(
+    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+) -> list[Step]:
+    """Run one search until it decides or all looks are spent.
+
+    Args:
+        looks: the looks at the scene.
+        strategy: observer and policy of the search.
+        target: the class to search for.
+        start: `(1,)`, the first cell.
+        noise: `(1, N, X·Y)`, random numbers that break ties in at most N looks.
+        rule: maps a step to a number `(1,)`; a number above 0 ends the search.
+
+    Returns:
+        The steps of the search.
+    """
+    policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
+    ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
+    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))

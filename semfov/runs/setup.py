@@ -1,0 +1,243 @@
+"""Makes scenes, detector, eye and models from settings."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from semfov.belief import ContextPrior, MapEvidence, TargetEvidence, Verification
+from semfov.data.scene import Scenes
+from semfov.detection.detector import Detector
+from semfov.detection.load import check_detector, load_detector
+from semfov.errors import DataError, InputError, check
+from semfov.eye import Eye
+from semfov.gaze.templates import ClassTemplates
+from semfov.io.compatibility import learned_for, recommended
+from semfov.io.files import check_regular
+from semfov.io.shipped import shipped_model
+from semfov.observation.foveal import FovealObservationModel
+from semfov.presets import PUBLISHED_SENSORS
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.looks import one_thread
+from semfov.sensor import Foveation
+from semfov.zoom.eye import ZoomEye
+
+
+def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
+    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
+    check_data(data)
+    check_detector(detector.name)
+
+
+def check_data(data: DataConfig) -> None:
+    """Raise an error unless photographs and annotations both exist, or the settings name neither of them."""
+    if (data.root is None) != (data.annotations is None):
+        given, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
+        raise InputError(
+            f"data: expected both data.root and data.annotations, or neither for the embedded scenes, got {given} "
+            f"alone; add {missing}"
+        )
+    if data.root is not None and not data.root.is_dir():
+        raise DataError(f"data.root: no such folder: {data.root}; check the path")
+    if data.annotations is not None and not data.annotations.exists():
+        raise DataError(f"data.annotations: no such file: {data.annotations}; check the path")
+
+
+def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
+    """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
+    check_data(data)
+    if data.root is None or data.annotations is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
+    from semfov.data.coco import CocoScenes
+
+    return CocoScenes(
+        data.root,
+        data.annotations,
+        classes,
+        min_instances=data.min_instances,
+        ids=None if data.ids is None else read_ids(data.ids),
+        max_target_area=data.max_target_area,
+        limit=data.limit,
+    )
+
+
+def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
+    """Split photographs into every n-th one and the others; of the embedded scenes make two sets.
+
+    Args:
+        data: the settings of the photographs.
+        classes: the detector's classes.
+        every: n.
+
+    Returns:
+        The larger part, and every n-th photograph.
+
+    Raises:
+        InputError: there are too few photographs to split.
+    """
+    check_data(data)
+    if data.root is None or data.annotations is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        count = data.limit or 16
+        return (
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed),
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed + 1),
+        )
+    from semfov.data.coco import CocoScenes
+
+    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
+    ids = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
+    check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
+    kept = [name for number, name in enumerate(ids) if number % every]
+    return (
+        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
+        CocoScenes(data.root, data.annotations, classes, ids=ids[::every], **selection),
+    )
+
+
+def read_ids(path: Path) -> list[str]:
+    """Read the ids of photographs from a text file with one per line."""
+    check_regular(path)
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: expected a text file with one id per line; it cannot be read ({error})") from None
+
+
+def make_detector(detector: DetectorConfig) -> Detector:
+    """Load the detector that the settings name."""
+    # A session of onnxruntime keeps the number of threads that it is opened with.
+    with one_thread():
+        return load_detector(detector.name, **detector_options(detector))
+
+
+def detector_options(detector: DetectorConfig) -> dict[str, Any]:
+    """The options of `semfov.load_detector` that correspond to the settings."""
+    onnx = detector.name.endswith(".onnx")
+    if detector.head is not None and not onnx:
+        raise InputError(
+            f"detector.head: expected null, since detector.name {detector.name!r} is not an ONNX file, got "
+            f"{detector.head!r}"
+        )
+    options: dict[str, Any] = {
+        "threshold": detector.threshold,
+        "iou": detector.iou,
+        "limit": detector.limit,
+    }
+    for name in ("background", "weights", "classes", "head"):
+        if getattr(detector, name) is not None:
+            options[name] = getattr(detector, name)
+    if detector.stride != "auto":
+        options["stride"] = detector.stride
+    if detector.input_size is not None:
+        options["input_size"] = detector.input_size
+    if detector.runtime != "auto":
+        options["runtime"] = detector.runtime
+    return options
+
+
+def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
+    """Make an eye: the foveal sensor, and the detector that sees through it."""
+    model = make_detector(detector)
+    return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
+
+
+def fovea_of(eye: Eye) -> Foveation:
+    """The foveal sensor of an eye; fitted models exist only for eyes with a foveal sensor."""
+    sensor = eye.sensor
+    if not isinstance(sensor, Foveation):
+        raise InputError(
+            f"sensor: expected a Foveation, since models are fitted for foveal sensors, got {type(sensor).__name__}"
+        )
+    return sensor
+
+
+def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
+    """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
+    own = recommended(eye.detector.name, float(fovea_of(eye).growth))
+    model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
+
+
+def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationModel | None:
+    """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
+    own = f"{eye.detector.name}-zoom"
+    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
+        return None
+    model = FovealObservationModel.from_pretrained(name or own)
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
+
+
+def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
+    """Name of the observation model fitted by maximum likelihood for detector and sensor; None if none is shipped."""
+    name = f"{detector.name}-{sensor.name}"
+    shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
+    return name if sensor.name in PUBLISHED_SENSORS and shipped else None
+
+
+def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
+    """Load learned target evidence by name, or the one shipped for the eye; check that it fits the eye."""
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = TargetEvidence.from_pretrained(name or shipped_model(TargetEvidence, own, "MODEL"))
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_verification(name: str | None, eye: Eye) -> Verification | None:
+    """Load a model of verification by name, or the one shipped for the eye, if there is one; check that it fits."""
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = Verification.if_shipped(own) if name is None else Verification.from_pretrained(name)
+    if model is None:
+        return None
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
+    """Load a learned map by name, or the one shipped for the eye; check that it fits the eye."""
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = MapEvidence.from_pretrained(name or shipped_model(MapEvidence, own, "MODEL"))
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
+    """Load class templates by name, or those shipped for the detector; check that they fit the eye."""
+    model = ClassTemplates.from_pretrained(name or eye.detector.name)
+    model.check_eye(eye.settings(), eye.detector.classes)
+    return model
+
+
+def make_context(name: str, eye: Eye) -> ContextPrior:
+    """Load a fitted context; check that it knows the detector's classes."""
+    prior = ContextPrior.from_pretrained(name)
+    prior.check_compatible(eye.detector.classes)
+    return prior.requires_grad_(False)
+
+
+def plain(settings: dict[str, Any]) -> Any:
+    """Convert settings to JSON values: paths become text, tuples become lists."""
+    return json.loads(json.dumps(settings, default=str))
+
+
+def prepare_worker() -> None:
+    """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
+
+    Only worker processes are silenced: the main process has logged the same messages already.
+    """
+    torch.set_num_threads(1)
+    # Freeing one large block raises the size from which glibc returns memory to the system; otherwise it would return
+    # and request memory at every look.
+    torch.empty(31 << 20, dtype=torch.uint8)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)

@@ -1,0 +1,228 @@
+"""Stores looks at scenes, so that each is computed only once.
+
+Scenes are static, so what a look shows is a function of scene and action: the cell, the pose and cell, the box or the
+window that the eye looks at. A store keeps looks under a key of everything that they depend on. It changes the duration
+of a run, and never its result.
+"""
+
+import hashlib
+import json
+import platform
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.detections import Detections
+from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.code import modules_digest
+from semfov.io.schema import Field, Schema
+from semfov.runs.looks import SOURCES, Box
+from semfov.version import __version__
+
+Action = TypeVar("Action", bound=Hashable)
+Look = TypeVar("Look")
+
+
+class SceneStore:
+    """A folder of tensors with one file for each scene.
+
+    Files are written atomically and carry a checksum. A file that is damaged, truncated, of another version or of
+    another schema counts as missing, and its tensors are computed again.
+
+    Args:
+        folder: folder of the store; several runs and processes may share it.
+        what: settings that the tensors depend on.
+        code: sha256 of the source code that the tensors depend on.
+        schema: schema of a file.
+    """
+
+    def __init__(self, folder: Path, what: Mapping[str, object], code: str, schema: Schema) -> None:
+        described = json.dumps({**what, "versions": {**versions(), "code": code}}, sort_keys=True)
+        self.key = hashlib.sha256(described.encode()).hexdigest()
+        self.folder = folder / self.key[:16]
+        self.schema = schema
+
+    def path(self, digest: str) -> Path:
+        """Path of the file of the scene whose image has this sha256."""
+        return self.folder / f"{digest[:32]}.safetensors"
+
+    def read(self, digest: str) -> dict[str, Tensor] | None:
+        """Read the tensors of a scene; None if they are missing or damaged."""
+        return read_tensors(self.path(digest), self.key, self.schema)
+
+    def write(self, digest: str, tensors: Mapping[str, Tensor]) -> None:
+        """Write the tensors of a scene."""
+        write_tensors(self.path(digest), self.key, tensors)
+
+
+class LookStore(SceneStore, ABC, Generic[Action, Look]):
+    """Looks at scenes by action, with the looks at a scene in one file.
+
+    A subclass says how an action is written as numbers, and how looks are written as tensors.
+
+    Args:
+        folder: folder of the store; several runs and processes may share it.
+        what: settings that the looks depend on.
+        sources: modules that turn a scene into looks; all modules that they import count, too.
+        components: length of the score vectors (None: any length).
+
+    Attributes:
+        width: number of numbers of an action.
+    """
+
+    width: ClassVar[int]
+
+    def __init__(
+        self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int | None = None
+    ) -> None:
+        fields = {
+            "actions": Field(("N", self.width), torch.float64),
+            "count": Field(("N",), torch.int64, low=0),
+            "boxes": Field(("M", 4)),
+            "scores": Field(("M", "C" if components is None else components), low=0, high=1),
+        }
+        code = modules_digest(*sources, __name__)
+        super().__init__(folder, what, code, Schema(fields | self.more()))
+
+    def load(self, digest: str) -> dict[Action, Look]:
+        """Read the looks at a scene.
+
+        Args:
+            digest: sha256 of what the pixels of the scene depend on.
+
+        Returns:
+            The looks by action; empty if they are missing or incomplete.
+        """
+        tensors = self.read(digest)
+        if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
+            return {}
+        actions = [self.decode(row) for row in tensors["actions"].tolist()]
+        return dict(zip(actions, self.unpack(tensors, actions), strict=True))
+
+    def save(self, digest: str, looks: Mapping[Action, Look]) -> None:
+        """Store the looks at a scene.
+
+        Args:
+            digest: sha256 of what the pixels of the scene depend on.
+            looks: the looks by action; at least one.
+        """
+        rows = {action: tuple(map(float, self.encode(action))) for action in looks}
+        actions = sorted(looks, key=rows.__getitem__)
+        numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
+        self.write(digest, {"actions": numbers, **self.pack([looks[action] for action in actions])})
+
+    def more(self) -> dict[str, Field]:
+        """Names, shapes and ranges of the tensors that a look has besides its detections."""
+        return {}
+
+    @abstractmethod
+    def encode(self, action: Action) -> Sequence[float]:
+        """Write an action as `width` numbers."""
+
+    @abstractmethod
+    def decode(self, row: Sequence[float]) -> Action:
+        """Read an action from its numbers."""
+
+    @abstractmethod
+    def pack(self, looks: Sequence[Look]) -> dict[str, Tensor]:
+        """Convert looks to tensors for a file."""
+
+    @abstractmethod
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Action]) -> list[Look]:
+        """Convert the tensors of a file back to the looks of these actions."""
+
+
+class DetectionStore(LookStore[Any, Detections]):
+    """Looks that consist of detections.
+
+    An action is a number, such as that of a cell, or the box of a closer look.
+    """
+
+    width = 5
+
+    def encode(self, action: int | Box) -> Sequence[float]:
+        """A number, or -1 and the corners of a box."""
+        return (-1, *action) if isinstance(action, tuple) else (action, 0, 0, 0, 0)
+
+    def decode(self, row: Sequence[float]) -> int | Box:
+        """A number or a box."""
+        return tuple(row[1:]) if row[0] < 0 else int(row[0])
+
+    def pack(self, looks: Sequence[Detections]) -> dict[str, Tensor]:
+        """Convert detections to tensors for a file."""
+        return pack(looks)
+
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[int | Box]) -> list[Detections]:
+        """Convert the tensors of a file back to the detections of each action."""
+        return unpack(tensors)
+
+
+def pack(looks: Sequence[Detections]) -> dict[str, Tensor]:
+    """Join the detections of looks without padding, which makes up most of a padded batch."""
+    return {
+        "count": torch.cat([look.mask.sum(-1) for look in looks]),
+        "boxes": torch.cat([look.boxes[look.mask] for look in looks]),
+        "scores": torch.cat([look.scores[look.mask] for look in looks]),
+    }
+
+
+def unpack(tensors: Mapping[str, Tensor]) -> list[Detections]:
+    """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
+    counts = tensors["count"].tolist()
+    looks = zip(tensors["boxes"].split(counts), tensors["scores"].split(counts), strict=True)
+    return [
+        Detections(boxes[None].clone(), scores[None].clone(), torch.ones(1, len(boxes), dtype=torch.bool))
+        for boxes, scores in looks
+    ]
+
+
+def cell_store(
+    folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
+) -> DetectionStore:
+    """Open a store of looks from the cells of a grid, and of closer looks.
+
+    Args:
+        folder: folder of the store.
+        settings: `Eye.settings()`.
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
+        components: length of the score vectors (None: any length).
+
+    Returns:
+        The store.
+    """
+    # The cell centres in a picture of odd size identify the way in which a grid is laid out.
+    centres = Grid(columns, rows, (641, 479)).centres.tolist()
+    what = {"settings": settings, "grid": [columns, rows], "centres": centres}
+    return DetectionStore(folder, what, SOURCES, components)
+
+
+def versions() -> dict[str, object]:
+    """Versions of semfov, of its libraries and of the machine, on which numerical results depend."""
+    import kornia
+    import torchvision
+
+    return {
+        "semfov": __version__,
+        "torch": torch.__version__,
+        "torchvision": torchvision.__version__,
+        "kornia": kornia.__version__,
+        "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
+    }
+
+
+def looks_digest(*more: str) -> str:
+    """Digest of the source code that turns an image into detections; a store is not reused after a change of it.
+
+    Args:
+        *more: dotted names of further modules.
+
+    Returns:
+        The sha256.
+    """
+    return modules_digest(*SOURCES, *more)

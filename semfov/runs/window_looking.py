@@ -1,0 +1,115 @@
+"""Looks at windows of large pictures, kept on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation, Scenes
+from semfov.errors import DataError
+from semfov.observation.matching import box_iou
+from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.scene_run import cache_folder
+from semfov.runs.settings import Range, Seed, Settings, Side, Whole
+from semfov.runs.setup import make_detector, make_scenes
+from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import Cut, ZoomEye
+from semfov.zoom.gist import FOUND
+from semfov.zoom.glances import Glance
+from semfov.zoom.objects import merge
+
+SHOWN = 0.3
+"""Smallest score with which a look confirms a class."""
+
+Tile = Annotated[int, Range(16, 16_384)]
+"""Side of a part of a picture in pixels."""
+
+
+@dataclass(frozen=True)
+class WindowLookingConfig(Settings):
+    """Large pictures, and an eye that looks at windows of them.
+
+    Args:
+        data: the photographs (without a root: the embedded scenes).
+        detector: the detector.
+        mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
+        columns: number of photographs in a row of a mosaic.
+        rows: number of photographs in a column of a mosaic.
+        tile: width in pixels of a photograph's slot in a mosaic; the height is three quarters of it.
+        cut: what to do with boxes at a window's border.
+        model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
+        seed: random seed of mosaics.
+        cache: folder for the stored looks (None: the user's cache).
+        store: keep looks on disk; false computes them anew (the result is the same).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
+    mosaics: Whole = 100
+    columns: Side = 4
+    rows: Side = 4
+    tile: Tile = 640
+    cut: Cut = "keep"
+    model: str | None = None
+    seed: Seed = 0
+    cache: Path | None = None
+    store: bool = True
+
+
+class WindowLooking:
+    """Large pictures, an eye that looks at windows of them, and evidence; what it detects is stored.
+
+    Args:
+        config: the settings.
+
+    Attributes:
+        scenes: the mosaics or photographs.
+        eye: the eye.
+        evidence: learned evidence by magnification.
+        store: the stored looks.
+    """
+
+    config: WindowLookingConfig
+    scenes: Scenes
+
+    def __init__(self, config: WindowLookingConfig) -> None:
+        self.config = config
+        detector = make_detector(config.detector)
+        self.eye = ZoomEye(detector, cut=config.cut).eval().requires_grad_(False)
+        self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
+        self.evidence.check_compatible(self.eye.settings())
+        photographs = self.open_scenes(detector.classes)
+        if not len(photographs):
+            raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
+        self.scenes = photographs
+        if config.mosaics:
+            size = config.tile, config.tile * 3 // 4
+            self.scenes = Mosaics(
+                photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
+            )
+        folder = cache_folder(config.cache) / "glances"
+        self.store = GlanceStore(folder, self.eye.settings(), len(detector.classes))
+
+    def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
+        """Open the photographs; a subclass may open others."""
+        return make_scenes(self.config.data, classes)
+
+    def glances(self, index: int) -> StoredGlances:
+        """The looks at a scene."""
+        return StoredGlances(self.eye, self.scenes, index, self.store if self.config.store else None)
+
+
+def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
+    """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
+    objects = merge(looks, target, score=FOUND)
+    if not len(objects):
+        return torch.zeros(len(annotation.boxes), dtype=torch.bool)
+    hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
+    return hits.any(0)

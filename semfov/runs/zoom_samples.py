@@ -1,0 +1,145 @@
+"""Labelled detections in windows of large pictures: the detector's scores, the magnification, and the true class."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation, Scene, Scenes
+from semfov.observation.matching import match
+from semfov.runs.looks import one_thread
+from semfov.runs.samples import Sampler, Samples, SampleSettings
+from semfov.runs.seeds import generator_for
+from semfov.runs.setup import make_detector, split_photographs
+from semfov.runs.zoom_store import SOURCES as GLANCES
+from semfov.zoom.eye import ZoomEye
+from semfov.zoom.lattice import Lattice
+
+COLUMNS, ROWS, TILE = 8, 6, (480, 360)
+"""Columns and rows of a mosaic, and the size of its slots in pixels.
+
+Such a mosaic is so large that the overview reduces it by more than three octaves.
+"""
+
+
+@dataclass(frozen=True)
+class MosaicSettings(SampleSettings):
+    """Settings that labelled detections in windows depend on.
+
+    Attributes:
+        mosaics: number of mosaics; `fixations` is the number of windows at each magnification.
+        holdout: n; every n-th mosaic is composed of every n-th photograph, and the other mosaics of the others.
+    """
+
+    mosaics: int = 0
+    holdout: int = 10
+
+    def sampler(self, folder: Path) -> Sampler:
+        """The sampler with these settings, whose shards are in a folder."""
+        return MosaicSampler(self, folder)
+
+
+class HeldOutMosaics:
+    """Mosaics of which every n-th is composed of photographs that no other mosaic shows.
+
+    Args:
+        kept: source of the other mosaics.
+        held: source of every n-th mosaic.
+        every: n.
+    """
+
+    def __init__(self, kept: Mosaics, held: Mosaics, every: int) -> None:
+        self._kept, self._held, self._every = kept, held, every
+        self.classes, self.ids = kept.classes, list(kept.ids)
+        self.fingerprint = f"{kept.fingerprint} {held.fingerprint} {every}"
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def _of(self, index: int) -> Mosaics:
+        return self._kept if index % self._every else self._held
+
+    def __getitem__(self, index: int) -> Scene:
+        """Compose a mosaic."""
+        return self._of(index)[index]
+
+    def annotation(self, index: int) -> Annotation:
+        """The objects of a mosaic."""
+        return self._of(index).annotation(index)
+
+    def targets(self, index: int) -> list[int]:
+        """The classes of a mosaic that may be searched for."""
+        return self._of(index).targets(index)
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a mosaic depend on."""
+        return self._of(index).digest(index)
+
+
+class MosaicSampler(Sampler):
+    """Looks at mosaics in windows of all magnifications at random places.
+
+    The distance of a sample is the number of octaves by which the look reduces the picture (`Lattice.octaves`).
+    Fixations are `(x, y, magnification)`.
+    """
+
+    settings: MosaicSettings
+    sources = (*GLANCES, "semfov.data.mosaics", __name__)
+    coordinates = 3
+
+    def make(self) -> tuple[ZoomEye, Scenes]:
+        """Make the eye and the mosaics."""
+        settings = self.settings
+        eye = ZoomEye(make_detector(settings.detector)).eval().requires_grad_(False)
+        kept, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
+        near, far = (
+            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed) for some in (kept, held)
+        )
+        return eye, HeldOutMosaics(near, far, settings.holdout)
+
+    def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+        """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
+        lattice = Lattice.over(size, self.eye.detector.input_size)
+        grid = Grid(lattice.columns, lattice.rows, size)
+        x, y, magnification = fixation.tolist()
+        reach = torch.tensor(lattice.canvas) / magnification / 2
+        seen = ((grid.centres - torch.tensor([x, y])).abs() <= reach).all(-1)
+        octaves = max(-math.log2(magnification), 0.0)
+        return grid, torch.full((len(grid),), octaves), seen
+
+    def _look(self, index: int) -> Samples:
+        scene = self.scenes[index]
+        eye = cast(ZoomEye, self.eye)
+        view = eye.open(scene.image)
+        windows = choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
+        fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]
+        annotation = self.scenes.annotation(index)
+        parts = []
+        with one_thread(), torch.inference_mode():
+            for number in range(len(windows)):
+                seen = eye.look(view, fixations[number : number + 1])
+                boxes = seen.boxes[0, seen.mask[0]]
+                labels = match(boxes, annotation.boxes, annotation.labels, iou=self.settings.iou)
+                look = torch.zeros(len(boxes), dtype=torch.long)
+                distance = octaves[number].expand(len(boxes)).clone()
+                at = torch.tensor([index]), fixations[number : number + 1]
+                parts.append(Samples(boxes, seen.scores[0, seen.mask[0]], distance, labels, look, *at))
+        return Samples.join(parts)
+
+
+def choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> Tensor:
+    """Draw windows `(R, 3)`: the overview, and `count` windows at random places of every other magnification."""
+    generator = generator_for("windows", seed, scene)
+    rows = [torch.zeros(1, 3, dtype=torch.long)]
+    for level in range(1, lattice.levels):
+        across, down = lattice.places(level)
+        place = torch.randint(across * down, (count,), generator=generator)
+        rows.append(torch.stack([torch.full_like(place, level), place % across, place // across], -1))
+    return torch.cat(rows)

@@ -1,1 +1,0 @@
-"""Fit semfov's models to photographs with annotated boxes."""

@@ -1,0 +1,553 @@
+"""`python -m train.fit_detector` for a detector of coloured squares, from photographs to a search."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import stats
+
+import semfov
+from eval.comparison.model_folder import with_models
+from eval.decide import main as decide
+from eval.decide.config import DecisionConfig
+from eval.demo import main as demo
+from eval.explore.config import ExploreConfig
+from eval.search import main as search
+from eval.search.config import SearchConfig
+from semfov import ActivePerception, DataError, InputError
+from semfov.belief import Verification
+from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.data.scenes import EmbeddedScenes
+from semfov.fit.detector_parts.part import Bench, Fitted
+from semfov.fit.detector_parts.verification import VerificationFit, scores
+from semfov.fit.detector_report import thin_classes
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.evidence import FitSearchConfig, choose_thresholds
+from semfov.fit.held_out import Difference
+from semfov.fit.verification_decisions import Verified
+from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
+from semfov.io.files import sha256
+from semfov.io.manifest import Manifest, Part
+from semfov.model_folder import ModelFolder
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
+from semfov.runs.progress import Whole, task_bar, track
+from semfov.runs.search_protocol import choose_classes
+from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_network, write_photographs
+from train.fit_detector import main
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The parent folder of a network, photographs and the models fitted to them."""
+    folder = tmp_path_factory.mktemp("fit_detector")
+    write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert main(arguments(folder)) == 0
+    torch.set_num_threads(threads)
+    return folder
+
+
+def data(folder):
+    root = folder / "photographs"
+    return ["--data.root", str(root), "--data.annotations", str(root / "instances.json")]
+
+
+def arguments(folder, *more):
+    paths = ["--out", str(folder / "models"), "--cache", str(folder / "cache")]
+    return [str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
+
+
+@pytest.mark.slow
+def test_the_folder_describes_its_models(home):
+    manifest = Manifest.read(home / "models")
+    assert manifest.classes == CLASSES
+    assert manifest.grid == (4, 4)
+    assert manifest.detector["sha256"] == sha256(home / "colours.onnx")
+    assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
+    assert manifest.sensor["sigma"] == 60
+    assert manifest.sensor["growth"] == 1
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map"]
+    assert manifest.training["photographs"] == 20
+    assert manifest.training["held_out"] == 5
+    for name, part in manifest.parts.items():
+        assert "held-out photographs" in part.why, (name, part.why)
+        assert (part.file is None) == (name == "tempering")
+    thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
+    assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
+    text = (home / "models/report.md").read_text()
+    assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
+    assert f"gives up when no cell has a probability of {thresholds.give_up:.2f} or more" in text
+    assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
+    verification = Verification.from_pretrained(home / "models/verification.safetensors")
+    assert 0.5 <= verification.thresholds.confirm <= 0.9
+    assert verification.thresholds.give_up <= thresholds.give_up
+    assert verification.metadata["detector"] == ModelFolder(home / "models").eye().settings()["detector"]
+    section = text.split("## Verification (closer looks)")[1].split("## ")[0]
+    assert f"| {verification.thresholds.confirm:.2f} (chosen) " in section
+    assert "| no closer looks " in section
+    for name in ("reliability.png", "search.png", "explore.png"):
+        assert f"({name})" in text
+        with Image.open(home / "models" / name) as picture:
+            picture.verify()
+
+
+def test_the_agent_of_the_folder_finds_the_target(home):
+    folder = ModelFolder(home / "models")
+    agent = ActivePerception.from_pretrained(home / "models")
+    assert agent.classes[1:] == CLASSES
+    assert (agent.columns, agent.rows) == (4, 4)
+    assert not any(parameter.requires_grad for parameter in agent.parameters())
+    assert isinstance(agent.searching.observer, Target if folder.used("evidence") else Semantic)
+    assert isinstance(agent.exploring.observer, LearnedMap if folder.used("map") else Semantic)
+    pixels = np.full((SIDE, SIDE, 3), 125, dtype=np.uint8)
+    pixels[56:64, 0:8] = COLOURS[2]
+    image = torch.from_numpy(pixels).permute(2, 0, 1) / 255
+    scanpath = agent.search(image, "blue", start=3, shifts=15)
+    assert 12 in scanpath.cells.tolist()
+    assert len(agent.explore(image, shifts=3).cells) >= 1
+
+
+@pytest.mark.parametrize("search", ["predictive", "non-predictive"])
+def test_the_published_agent_takes_the_folder(home, search):
+    folder = ModelFolder(home / "models")
+    agent = ActivePerception.published(home / "models", search=search)
+    assert (agent.columns, agent.rows) == folder.manifest.grid
+    assert agent.eye.settings() == folder.eye().settings()
+    fitted = FovealObservationModel.from_pretrained(folder.file("observation")).state_dict()
+    used = agent.searching.observer.observation.state_dict()
+    assert all(torch.equal(used[name], value) for name, value in fitted.items())
+    assert isinstance(agent.searching.policy, Predictive if search == "predictive" else NonPredictive)
+    assert isinstance(agent.exploring.policy, KL)
+    image = torch.rand(3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    assert len(agent.search(image, "blue", shifts=2, confirm=1.0).cells) == 3
+    with pytest.raises(InputError, match="sensor: expected None with a folder of models"):
+        ActivePerception.published(home / "models", sensor="published")
+
+
+def test_the_published_agent_needs_an_observation_model(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
+    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: python -m train\.fit_detector"):
+        ActivePerception.published(folder)
+
+
+def test_eval_search_with_the_folder_matches_the_report(home, capsys):
+    """`eval.search` on only the held-out photographs gives the same cumulative performance with other code."""
+    (home / "ids.txt").write_text("0 4 8 12 16")
+    out = home / "search"
+    options = [
+        "--models", str(home / "models"), "--policies", "[non-predictive-raw, target-evidence]", "--data.min_instances",
+        "0", "--data.ids", str(home / "ids.txt"), "--protocol.shifts", "15", "--workers", "1", "--scanpaths", "0",
+        "--out", str(out), "--cache", str(home / "cache"),
+    ]  # fmt: skip
+    assert search([*data(home), *options]) == 0
+    lines = (out / "summary.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines if line.startswith("all") or "all targets" in line]
+    performance = {(row[1], int(row[2])): float(row[3]) for row in rows}
+    report = (home / "models/report.md").read_text().split("## Target evidence")[1]
+    for name, policy in (("fitted", "target-evidence"), ("raw", "non-predictive-raw")):
+        row = next(line for line in report.splitlines() if line.startswith(f"| {name} "))
+        shares = [float(cell.split("±")[0]) for cell in row.split("|")[2:5]]
+        assert shares == pytest.approx([100 * performance[policy, n] for n in (1, 5, 15)], abs=0.051)
+    capsys.readouterr()
+
+
+FITS = {
+    "observation": "fit_model",
+    "tempering": "hit_rates",
+    "evidence": "fit_evidence",
+    "verification": "fit_and_verify",
+    "map": "fit_map_evidence",
+}
+
+
+def forbid(monkeypatch, *parts):
+    """Make the fit of parts fail."""
+    for part in parts:
+        monkeypatch.setattr(f"semfov.fit.detector_parts.{part}.{FITS[part]}", None)
+
+
+def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
+    before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
+    forbid(monkeypatch, *FITS)
+    assert main(arguments(home)) == 0
+    assert {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")} == before
+    printed = capsys.readouterr()
+    assert "python -m eval.demo PHOTO.jpg --target" in printed.out
+    assert f"--models {home / 'models'}" in printed.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["verification", "map"])
+@pytest.mark.parametrize("lost", ["model", "record"])
+def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, lost):
+    """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
+    shutil.copytree(home / "models", tmp_path / "models")
+    name = f"{part}.safetensors" if lost == "model" else f"progress/{part}.json"
+    (tmp_path / "models" / name).unlink()
+    (tmp_path / "models/manifest.json").unlink()
+    forbid(monkeypatch, *(FITS.keys() - {part}))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert main(arguments(home, "--out", str(tmp_path / "models"))) == 0
+    torch.set_num_threads(threads)
+    again, once = (folder / f"models/{part}.safetensors" for folder in (tmp_path, home))
+    assert again.read_bytes() == once.read_bytes()
+
+
+@pytest.mark.parametrize("agent", ["recommended", "published"])
+def test_the_demonstration_takes_the_folder(home, tmp_path, capsys, agent):
+    photo = str(home / "photographs/0.png")
+    given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--out", str(tmp_path)]
+    assert demo([*given, "--agent", agent]) == 0
+    assert "0.png: “red”" in capsys.readouterr().out
+
+
+def copy_models(home, tmp_path):
+    shutil.copytree(home / "models", tmp_path / "models")
+    shutil.copy(home / "colours.onnx", tmp_path)
+    return tmp_path / "models"
+
+
+def test_another_network_is_refused(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    write_network(tmp_path / "colours.onnx", bias=-3.0)
+    with pytest.raises(DataError, match=r"detector: .*expected the network .*python -m train\.fit_detector"):
+        ActivePerception.from_pretrained(folder)
+    with pytest.raises(DataError, match="expected the network"):
+        ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
+
+
+def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_path):
+    folder = copy_models(home, tmp_path / "here")
+    # The network is next to the folder as before, so the two may be moved together.
+    assert ModelFolder(folder).detector_source()[0] == str(tmp_path / "here/models/../colours.onnx")
+    place = tmp_path / "here/colours.onnx"
+    place.rename(tmp_path / "elsewhere.onnx")
+    assert ModelFolder(folder).detector_source()[0] == str((home / "colours.onnx").resolve())
+    record = json.loads((folder / "manifest.json").read_text())
+    assert record["detector"]["model_file"]["absolute"] == str((home / "colours.onnx").resolve())
+    agent = ActivePerception.from_pretrained(folder, detector=tmp_path / "elsewhere.onnx")
+    assert agent.eye.detector.classes == CLASSES
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors", "verification.safetensors"])
+def test_a_changed_file_is_refused(home, tmp_path, name):
+    folder = copy_models(home, tmp_path)
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
+    with pytest.raises(DataError, match=f"{name}: damaged or changed"):
+        ModelFolder(folder)
+    (folder / name).unlink()
+    with pytest.raises(DataError, match=r"no such file.*train\.fit_detector"):
+        ModelFolder(folder)
+
+
+def rewrite_manifest(folder, **parts):
+    """Rewrite the manifest of a folder so that all parts are used or unused, or with other parts."""
+    known = Manifest.read(folder)
+    changed = dict(known.parts) | {name: part for name, part in parts.items() if name != "used"}
+    if "used" in parts:
+        changed = {name: replace(part, used=parts["used"]) for name, part in changed.items()}
+    replace(known, parts=changed).write(folder)
+
+
+def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    agent = ActivePerception.from_pretrained(folder)
+    assert isinstance(agent.searching.observer, Target)
+    assert isinstance(agent.exploring.observer, LearnedMap)
+    assert isinstance(agent.exploring.policy, Closer)
+    given = SearchConfig(models=folder, policies=("recommended", "random"))
+    assert with_models(given).policies == ("target-evidence", "random")
+    rewrite_manifest(folder, used=False)
+    agent = ActivePerception.from_pretrained(folder)
+    for strategy, policy in ((agent.searching, None), (agent.exploring, Random)):
+        assert isinstance(strategy.observer, Semantic)
+        assert strategy.observer.observation is None
+        assert strategy.observer.tempering == 1
+        assert strategy.observer.footprint == "overlap"
+        assert policy is None or isinstance(strategy.policy, policy)
+    given = SearchConfig(models=folder, policies=("recommended", "target-evidence"))
+    assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
+    assert with_models(ExploreConfig(models=folder, policies=("recommended",))).policies == ("random-raw",)
+
+
+def photograph_with(colour, place):
+    """A grey photograph with a square of one colour, `place` in 8 × 8 squares."""
+    pixels = np.full((SIDE, SIDE, 3), 125, dtype=np.uint8)
+    pixels[8 * place[0] : 8 * place[0] + 8, 8 * place[1] : 8 * place[1] + 8] = COLOURS[colour]
+    return torch.from_numpy(pixels).permute(2, 0, 1) / 255
+
+
+def test_the_agent_of_the_folder_looks_closely_at_a_target(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    agent = ActivePerception.from_pretrained(folder)
+    fitted = Verification.from_pretrained(folder / "verification.safetensors")
+    assert torch.equal(agent.verification.linear.weight, fitted.linear.weight)
+    image = photograph_with(2, (7, 0))
+    scanpath = agent.search(image, "blue", start=3, shifts=15)
+    assert 1 <= len(scanpath.closer) <= 2
+    look = scanpath.closer[0]
+    assert look.cell == 12
+    # The probability follows from the score of the square in the enlarged window, by the fitted regression.
+    calls = []
+    agent.eye.close_up = lambda image, box: calls.append(box) or type(agent.eye).close_up(agent.eye, image, box)
+    again = agent.search(image, "blue", start=3, shifts=15)
+    assert len(calls) == len(again.closer)
+    assert scanpath.decision.outcome == "found"
+    assert scanpath.decision.place == pytest.approx(max(look.place for look in scanpath.closer))
+    assert agent.search(image, "blue", start=3, shifts=15, closer=0).closer == ()
+
+
+def test_without_verification_or_evidence_the_agent_decides_without_closer_looks(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    known = Manifest.read(folder).parts
+    for unused in ("verification", "evidence"):
+        rewrite_manifest(folder, used=True)
+        rewrite_manifest(folder, **{unused: replace(known[unused], used=False)})
+        agent = ActivePerception.from_pretrained(folder)
+        assert agent.verification is None
+        assert agent.search(photograph_with(2, (7, 0)), "blue", start=3, shifts=15).closer == ()
+
+
+def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    known = Manifest.read(folder)
+    earlier = {name: part for name, part in known.parts.items() if name != "verification"}
+    replace(known, parts=earlier).write(folder)
+    (folder / "verification.safetensors").unlink()
+    agent = ActivePerception.from_pretrained(folder)
+    assert agent.verification is None
+    assert isinstance(agent.searching.observer, Target)
+    assert with_models(DecisionConfig(models=folder)).verification is None
+    assert (
+        demo([str(home / "photographs/0.png"), "--target", "red", "--models", str(folder), "--out", str(tmp_path)]) == 0
+    )
+
+
+def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    file = str(folder / "verification.safetensors")
+    assert with_models(DecisionConfig(models=folder)).verification == file
+    assert with_models(DecisionConfig(models=folder, verification="other")).verification == "other"
+    given = ["--models", str(folder), "--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
+    out = tmp_path / "decide"
+    assert decide([*data(home), *given, "--out", str(out), "--cache", str(home / "cache")]) == 0
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert any(record["closer"] > 0 for record in records if record["policy"] == "target-evidence")
+    assert {record["closer"] for record in records if "no closer looks" in record["policy"]} == {0}
+
+
+def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, monkeypatch):
+    config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
+    scenes = EmbeddedScenes(("cat", "cup"), count=8)
+    bench = Bench(config, SimpleNamespace(scenes=scenes))
+    bench.parts["evidence"] = Fitted(Part("evidence.safetensors", "0", False, "not better"), "")
+    forbid(monkeypatch, "verification")
+    fitted = VerificationFit(bench).fit()
+    assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")
+
+
+def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_left_out(home, tmp_path, monkeypatch):
+    folder = copy_models(home, tmp_path)
+    (folder / "progress/verification.json").unlink()
+    seen = []
+
+    def fail(photographs, *_):
+        seen.extend(photographs)
+        raise DataError("data: too few")
+
+    monkeypatch.setattr("semfov.fit.detector_parts.verification.fit_and_verify", fail)
+    assert main(arguments(home, "--out", str(folder))) == 0
+    assert len(seen) >= 2
+    assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
+    part = Manifest.read(folder).parts["verification"]
+    assert (part.file, part.used, part.why) == (None, False, "could not be fitted: data: too few")
+    assert ActivePerception.from_pretrained(folder, detector=home / "colours.onnx").verification is None
+    assert "Could not be fitted: data: too few" in (folder / "report.md").read_text()
+
+
+def test_decisions_are_scored_by_photograph():
+    """Present and absent classes have equal weight, whatever their number."""
+    kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
+    searches = [Verified(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
+    ends = [(right, 2) for _, _, right in kinds]
+    np.testing.assert_allclose(scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
+
+
+def test_experiments_take_their_settings_from_the_folder(home):
+    folder = home / "models"
+    config = with_models(SearchConfig(models=folder, policies=("target-evidence", "predictive-calibrated")))
+    assert config.detector.name == str(folder / "../colours.onnx")
+    assert (config.sensor.sigma, config.sensor.growth, config.belief.columns) == (60, 1, 4)
+    assert config.belief.target_model == str(folder / "evidence.safetensors")
+    assert config.belief.model == str(folder / "observation.safetensors")
+    assert with_models(SearchConfig()) == SearchConfig()
+    moved = SearchConfig(models=folder, detector=DetectorConfig(name="elsewhere.onnx"))
+    assert with_models(moved).detector.name == "elsewhere.onnx"
+    with pytest.raises(InputError, match=r"belief\.map_model: expected null, since models defines it"):
+        with_models(SearchConfig(models=folder, belief=SearchConfig().belief.__class__(map_model="x")))
+
+
+def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, observation=Part(None, None, False, "too few detections"))
+    kept = with_models(SearchConfig(models=folder)).policies
+    assert "predictive-raw" not in kept
+    assert {"random", "non-predictive-raw", "target-evidence"} <= set(kept)
+    named = SearchConfig(models=folder, policies=(PolicyConfig("non-predictive", "calibrated"),))
+    with pytest.raises(InputError, match="lacks: too few detections"):
+        with_models(named)
+
+
+def test_a_folder_without_models_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"manifest\.json: no such file; .*train\.fit_detector"):
+        ActivePerception.from_pretrained(tmp_path)
+
+
+def test_an_unknown_model_name_is_refused():
+    with pytest.raises(
+        InputError, match=r"got 'mymodels'; make a folder by `python -m train\.fit_detector .*mymodels`"
+    ):
+        ActivePerception.from_pretrained("mymodels")
+
+
+def test_a_network_without_models_names_the_command_that_fits_them(home):
+    network = str(home / "colours.onnx")
+    for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
+        with pytest.raises(InputError, match=r"python -m train\.fit_detector \S+colours\.onnx --data\.root"):
+            make(network)
+
+
+def test_a_known_network_is_recognised_by_its_checksum(home, monkeypatch):
+    network = home / "colours.onnx"
+    assert semfov.load_detector(network).name == "colours"
+    monkeypatch.setitem(semfov.io.compatibility.NETWORKS, sha256(network), "yolox-nano")
+    assert semfov.load_detector(network).name == "yolox-nano"
+
+
+def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_path, capsys):
+    record = json.loads((home / "photographs/instances.json").read_text())
+    for category in record["categories"]:
+        category["name"] = f"other {category['id']}"
+    (tmp_path / "instances.json").write_text(json.dumps(record))
+    given = arguments(home, "--data.annotations", str(tmp_path / "instances.json"), "--out", str(tmp_path / "out"))
+    assert main(given) == 1
+    error = capsys.readouterr().err
+    assert "expected some of the detector's 3 classes (red, green, blue" in error
+    assert "'other 1'" in error
+
+
+def test_unknown_settings_of_the_call_are_named():
+    with pytest.raises(InputError, match="got 'clases'"):
+        semfov.fit_detector("mine.onnx", "photographs", "instances.json", clases=["cat"])
+
+
+def test_the_requested_number_of_absent_classes_is_chosen(home):
+    """Also for a photograph without a target."""
+    scenes = EmbeddedScenes(("person", "cat", "cup", "zebra"), count=4)
+    for index in range(4):
+        annotation = scenes.annotation(index)
+        held = set(annotation.labels.tolist())
+        for area in (0.0, 1.0):
+            chosen = choose_classes(scenes, index, annotation, 1, area, 0, 3)
+            absent = [target for target in chosen if target not in held]
+            assert len(absent) == len(set(absent)) == min(3, 4 - len(held))
+            assert len(chosen) - len(absent) == (1 if area else 0)
+
+
+def test_the_highest_threshold_can_be_limited():
+    there, looked = torch.tensor([True, False]), torch.ones(1, 2, dtype=torch.bool)
+    anywhere, left = torch.tensor([[0.95, 0.99]]), torch.tensor([[0.4, 0.0]])
+    assert choose_thresholds(FitSearchConfig(), anywhere, looked, left, there).confirm == 1
+    thresholds = choose_thresholds(FitSearchConfig(surest=0.9), anywhere, looked, left, there)
+    assert thresholds.confirm == 0.9
+
+
+def test_classes_with_few_objects_are_reported():
+    report = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
+    assert "**No object to learn from** (1 classes): cup." in report
+    assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in report
+    assert thin_classes({"cat": 20}, 20) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_differences_match_a_paired_t_test(seed):
+    draw = np.random.default_rng(seed)
+    fitted, raw = draw.random((2, 8))
+    difference = Difference.of(fitted, raw)
+    test = stats.ttest_rel(fitted, raw)
+    assert difference.mean / difference.error == pytest.approx(test.statistic)
+    assert difference.better == (test.statistic > 1)
+
+
+def test_one_photograph_or_no_difference_is_not_an_improvement():
+    assert not Difference.of(np.array([1.0]), np.array([0.0])).better
+    assert not Difference.of(np.ones(5), np.ones(5)).better
+    assert Difference.of(np.ones(5), np.zeros(5)).better
+
+
+def test_one_progress_bar_covers_all_stages(capsys):
+    """Stages and tasks count by their weights; unknown tasks do not count, and skipped stages count as done."""
+    with Whole("all", {"one": {"a": 3, "b": 1}, "two": {"c": 4}, "three": {"d": 2}}) as whole:
+        with whole.stage("one"):
+            seen = [(item, whole.done) for item in track(range(6), "a", "unit")]
+            assert [share for _, share in seen] == pytest.approx([0.05 * number for number in range(6)])
+            assert [item for item, _ in seen] == list(range(6))
+            assert list(track(range(3), "not among them", "unit")) == [0, 1, 2]
+            assert whole.done == pytest.approx(0.3)
+        assert whole.done == pytest.approx(0.4)
+        with whole.stage("three"):
+            assert whole.done == pytest.approx(0.8)
+            bar = task_bar(4, "d", "unit")
+            bar.update(2)
+            assert whole.done == pytest.approx(0.9)
+        assert whole.done == pytest.approx(1)
+    printed = capsys.readouterr().err
+    assert "all: one" in printed
+    assert "not among them" not in printed
+    # Outside the stages a task has its own bar again.
+    assert list(track(range(2), "alone", "unit")) == [0, 1]
+    assert "alone" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    root = home / "photographs"
+    agent = semfov.fit_detector(
+        home / "colours.onnx", root, root / "instances.json", out=tmp_path / "out", limit=6, columns=4, rows=4,
+        holdout=3, steps=3, map_steps=3, cache=home / "cache", threshold=0.05,
+    )  # fmt: skip
+    torch.set_num_threads(threads)
+    assert agent.eye.detector.selection.threshold == 0.05
+    assert Manifest.read(tmp_path / "out").training["photographs"] == 6
+    # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.
+    folder = ModelFolder(tmp_path / "out")
+    assert isinstance(agent.searching.observer, Target) == folder.used("evidence")
+    assert isinstance(agent.exploring.policy, Closer) == folder.used("map")
+
+
+def test_fitting_uses_targets_of_all_sizes():
+    config = FitDetectorConfig(model=Path("a.onnx"), data=DataConfig(max_target_area=0.1)).named()
+    assert config.data.max_target_area is None
+    assert config.detector.background is None
+    assert config.evidence(3).absent == 2
+    assert config.evidence(80).absent is None

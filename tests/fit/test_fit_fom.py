@@ -1,0 +1,95 @@
+"""`python -m train.fit_fom` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import json
+
+import pytest
+import torch
+
+from eval.calibration import main as calibrate
+from semfov import FovealObservationModel
+from semfov.fit.observation import fit_fom
+from semfov.fit.observation_settings import FitConfig
+from semfov.observation import match
+from semfov.runs.config import DataConfig
+from semfov.runs.samples import Sampler, SampleSettings
+from train.fit_fom import main
+
+pytestmark = [pytest.mark.weights, pytest.mark.slow]
+
+SMALL = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--shard", "2", "--method", "newton", "--workers"]
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A model fitted to two looks at each of 6 embedded scenes, in three shards."""
+    out = tmp_path_factory.mktemp("fit")
+    threads = torch.get_num_threads()
+    assert main([*SMALL, "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    return out
+
+
+def test_fit_writes_a_model_and_a_report(fitted):
+    model = FovealObservationModel.from_pretrained(fitted / "yolov3-tiny.safetensors")
+    counts = torch.tensor(model.metadata["counts"])
+    assert counts.shape == (81, 8)
+    assert counts.sum() == model.metadata["samples"] > 30
+    person, cup = model.classes.index("person") + 1, model.classes.index("cup") + 1
+    assert counts[person].sum() > 0
+    assert counts[cup].sum() > 0
+    report = (fitted / "report.md").read_text()
+    for word in ("raw scores", "Dirichlet, fixed_point", "uses level"):
+        assert word in report
+    assert json.loads((fitted / "manifest.json").read_text())["model"]["method"] == "newton"
+    assert (fitted / "reliability.png").stat().st_size > 3000
+
+
+def test_estimators_agree(fitted):
+    rows = [line for line in (fitted / "report.md").read_text().splitlines() if line.startswith("| Dirichlet, ")]
+    figures = [[float(cell) for cell in row.split("|")[2:-1]] for row in rows]
+    assert len(figures) == 3
+    # The last digit may be rounded either way.
+    assert figures[1] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
+    assert figures[2] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
+
+
+def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, tmp_path):
+    data = DataConfig(limit=6, min_instances=0, max_target_area=None)
+    fit_fom(FitConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
+    figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
+    # No comparison with raw scores: a hundred detections of four scenes are too few for it.
+    assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
+
+
+def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
+    model = fitted / "yolov3-tiny.safetensors"
+    arguments = ["--data.limit", "3", "--fixations", "2", "--model", str(model), "--out", str(tmp_path)]
+    assert calibrate([*arguments, "--beliefs", "false", "--workers", "1"]) == 0
+    assert "classwise ECE" in capsys.readouterr().out
+    assert (tmp_path / "reliability.png").exists()
+    rows = [line.split("|") for line in (tmp_path / "calibration.md").read_text().splitlines()[2:]]
+    counts = [int(row[3]) for row in rows if row[2].strip() == "raw"]
+    assert len(counts) == 9
+    assert sum(counts[:-1]) == counts[-1]
+
+
+def test_samples_match_looks_at_random_fixations(tmp_path):
+    settings = SampleSettings(DataConfig(limit=2), FitConfig().detector, FitConfig().sensor, 2, 0.5, 0)
+    sampler = Sampler(settings, tmp_path)
+    samples = sampler.sample(0)
+    scene = sampler.scenes[1]
+    mine = samples[samples.scene == 1]
+    first = torch.rand(2, 2, generator=_generator(0, scene.id))[0] * torch.tensor([scene.size]).float() - 0.5
+    seen = sampler.eye(scene.image[None], first)
+    count = int(seen.count)
+    torch.testing.assert_close(mine.scores[:count], seen.scores[0])
+    expected = match(seen.boxes[0], scene.boxes, scene.labels)
+    assert torch.equal(mine.labels[:count], expected)
+    centre = (seen.boxes[0, :, :2] + seen.boxes[0, :, 2:]) / 2 - 0.5
+    torch.testing.assert_close(mine.distance[:count], (centre - first).norm(dim=1) / max(scene.size))
+
+
+def _generator(seed, scene):
+    from semfov.runs.seeds import generator_for
+
+    return generator_for("fixations", seed, scene)

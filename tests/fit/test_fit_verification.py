@@ -1,0 +1,357 @@
+"""`python -m train.fit_verification`: small on the embedded scenes, and its parts against loops and SciPy."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from semfov import ActivePerception, Eye, Foveation
+from semfov.belief import TargetEvidence, Verification
+from semfov.belief.observers import Semantic, Target
+from semfov.belief.target_evidence import Thresholds
+from semfov.data.scenes import EmbeddedScenes
+from semfov.errors import DataError
+from semfov.fit.closer_looks import photographs, search
+from semfov.fit.verification_decisions import LEVELS, Verified, choose_confirm, verify
+from semfov.fit.verification_fit import SHIPPED, STRENGTH, Examined, examine, fit, shipped_mean
+from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.gaze.policies import NonPredictive, Random
+from semfov.io.storage import read
+from semfov.runs.looks import look_from
+from semfov.runs.store import cell_store
+from tests.small import CLASSES, Blobs
+from train.fit_verification import main
+
+
+def examined(count=200, seed=0):
+    """Closer looks whose outcome depends on two of the features."""
+    generator = torch.Generator().manual_seed(seed)
+    features = 2 * torch.randn(count, 7, generator=generator)
+    noise = torch.randn(2, count, generator=generator)
+    return Examined(features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4)
+
+
+def test_the_fit_minimises_the_penalised_cross_entropy():
+    known = examined()
+    chosen = known.fold != 1
+    model = fit(known, chosen)
+    phi = known.features[chosen].double().numpy()
+    mean, scale = phi.mean(0), phi.std(0, ddof=1)
+    for row, goal in enumerate((known.right, known.present)):
+        there = goal[chosen].numpy()
+
+        def loss(parameters, there=there):
+            odds = (phi - mean) / scale @ parameters[:7] + parameters[7]
+            return np.logaddexp(0, np.where(there, -odds, odds)).mean() + 1e-4 * (parameters[:7] ** 2).sum()
+
+        best = minimize(loss, np.zeros(8), tol=1e-12).x
+        weight = best[:7] / scale
+        np.testing.assert_allclose(model.linear.weight[row].numpy(), weight, atol=2e-3)
+        assert float(model.linear.bias[row]) == pytest.approx(best[7] - weight @ mean, abs=2e-3)
+
+
+def test_the_fit_ignores_the_closer_looks_that_are_held_out():
+    known = examined()
+    other = known.features.clone()
+    other[known.fold == 2] = 100.0
+    changed = Examined(other, known.right, known.present, known.fold)
+    assert torch.equal(fit(known, known.fold != 2).linear.weight, fit(changed, known.fold != 2).linear.weight)
+
+
+def test_the_fit_with_a_prior_minimises_the_cross_entropy_and_the_distance_to_it():
+    known = examined(60)
+    chosen = known.fold != 1
+    prior = shipped_mean()
+    model = fit(known, chosen, prior)
+    phi = known.features[chosen].double().numpy()
+    mean, scale = phi.mean(0), phi.std(0, ddof=1)
+    for row, goal in enumerate((known.right, known.present)):
+        there = goal[chosen].numpy()
+        given = prior.linear.weight[row].double().numpy()
+        centre = np.append(given * scale, float(prior.linear.bias[row]) + given @ mean)
+
+        def loss(parameters, there=there, centre=centre):
+            odds = (phi - mean) / scale @ parameters[:7] + parameters[7]
+            distance = ((parameters - centre) ** 2).sum()
+            return np.logaddexp(0, np.where(there, -odds, odds)).mean() + STRENGTH / len(phi) * distance
+
+        best = minimize(loss, np.zeros(8), tol=1e-12).x
+        weight = best[:7] / scale
+        np.testing.assert_allclose(model.linear.weight[row].numpy(), weight, atol=2e-3)
+        assert float(model.linear.bias[row]) == pytest.approx(best[7] - weight @ mean, abs=2e-3)
+
+
+def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without():
+    prior, distances = shipped_mean(), []
+    for count in (8, 80, 800, 8000):
+        known = examined(count)
+        near, far = fit(known, known.fold >= 0, prior), fit(known, known.fold >= 0)
+        logits = [each(known.features) for each in (prior, near, far)]
+        distances.append(float((logits[1] - logits[0]).abs().mean() / (logits[2] - logits[0]).abs().mean()))
+    assert distances == sorted(distances)
+    assert distances[0] < 0.3
+    assert distances[-1] > 0.85
+
+
+def test_a_single_closer_look_is_not_enough():
+    known = examined(4)
+    with pytest.raises(DataError, match=r"expected closer looks in all folds but one, got 1; give more photographs"):
+        fit(known, known.fold == 0, shipped_mean())
+
+
+def test_the_prior_is_the_mean_of_the_shipped_models():
+    files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in SHIPPED]
+    for name, tensor in shipped_mean().state_dict().items():
+        torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
+
+
+def searched(present, places, ends, presence, looks):
+    """A search of a photograph without the search that makes no closer looks."""
+    return Verified(0, present, False, places, ends, presence, looks, (None, looks))
+
+
+PLACES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=3)
+
+
+@given(PLACES, st.sampled_from(LEVELS))
+def test_the_decision_at_a_threshold_equals_a_walk_through_the_closer_looks(places, confirm):
+    ends = tuple(range(2, 2 + len(places)))
+    verified = searched(True, tuple(places), ends, 0.5, 9)
+    expected = None, 9
+    best = 0.0
+    for (place, right), end in zip(places, ends, strict=True):
+        if place >= confirm + (1 - confirm) / 2:
+            expected = right, end
+            break
+        if place >= confirm and (place > best or (place == best and right)):
+            expected, best = (right, 9), place
+    assert verified.found(confirm) == expected
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12), st.floats(0, 1))
+def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
+    searches = [searched(False, ((place, False),), (2,), place, 3) for place in places]
+    searches.append(searched(True, ((1.0, True),), (2,), 1.0, 2))
+    chosen = choose_confirm(searches, share)
+    assert choose_confirm(searches, share, 0.6) == min(chosen, 0.6)
+
+    def alarms(confirm):
+        return sum(place >= confirm for place in places) / len(places)
+
+    fits = [level for level in LEVELS if alarms(level) <= share + 1e-12]
+    assert chosen == (fits[0] if fits else LEVELS[-1])
+
+
+def opened(detector, store=None):
+    """Three embedded scenes with classes to search for, and the evidence of an untrained model."""
+    eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
+    scenes = EmbeddedScenes(CLASSES, count=3)
+    options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
+    torch.manual_seed(0)
+    evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
+    kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
+    return photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
+
+
+@pytest.fixture
+def seen():
+    return opened(Blobs())
+
+
+def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
+    found, evidence = seen
+    photograph = found[0]
+    first = list(search(photograph, photograph.sought[0], Target(evidence), 3))
+    count = len(photograph.looks.looks)
+    again = list(search(photograph, photograph.sought[0], Target(evidence), 3))
+    assert len(photograph.looks.looks) == count == 3
+    view = photograph.eye.open(photograph.image)
+    for one, other in zip(first, again, strict=True):
+        assert torch.equal(one.belief.probability(1), other.belief.probability(1))
+        assert torch.equal(one.detections.scores, photograph.eye.look(view, one.fixation).scores)
+    box = torch.tensor([3.0, 4.0, 30.0, 40.0])
+    expected = photograph.eye.close_up(photograph.image, box)
+    assert torch.equal(photograph.close_up(box).boxes, expected.boxes)
+    photograph.close()
+    assert torch.equal(photograph.close_up(box + 1).scores, photograph.eye.close_up(photograph.image, box + 1).scores)
+
+
+def test_looks_from_a_store_equal_those_of_the_eye(seen):
+    live, evidence = seen
+    eye, scenes = live[0].eye, live[0].scenes
+    calls = []
+
+    def stored(index):
+        calls.append(index)
+        return look_from(eye, scenes[index].image, live[index].grid.centres)
+
+    options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
+    found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
+    for _ in range(2):
+        for one, other in zip(live, found, strict=True):
+            for sought in one.sought:
+                pairs = zip(*(search(each, sought, Target(evidence), 5) for each in (one, other)), strict=True)
+                for first, second in pairs:
+                    torch.testing.assert_close(first.belief.probability(1), second.belief.probability(1))
+            other.close()
+    assert calls == 2 * [0, 1, 2]  # read once before each `close`
+
+
+def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
+    live, evidence = seen
+    options = {"classes": 1, "absent": 0, "max_area": 1.0, "seed": 0}
+    few, many = (photographs(live[0].eye, live[0].scenes, [0, 1, 2], (4, 3), **options, spare=n) for n in (0, 1))
+    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    for one, other in zip(few, many, strict=True):
+        assert [each.target for each in other.sought if not each.spare] == [each.target for each in one.sought]
+        assert all(not each.present for each in other.sought if each.spare)
+    assert any(each.spare for photograph in many for each in photograph.sought)
+    first, second = examine(few, evidence, config), examine(many, evidence, config)
+    assert torch.equal(first.features, second.features)
+    searches = list(verify(many, 2 * [shipped_mean()], evidence, config))
+    assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.sought]
+
+
+@pytest.mark.parametrize("confirm", [0.5, 0.7])
+def test_searches_end_as_those_of_an_agent(seen, confirm):
+    """The agent looks by itself and with other code, with closer looks and without."""
+    found, evidence = seen
+    evidence.thresholds = Thresholds(0.55, 0.3, 0.3)
+    model = shipped_mean()
+    config = FitVerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
+    model.thresholds = Thresholds(confirm, config.give_up, config.place)
+    searching, exploring = (Target(evidence), NonPredictive()), (Semantic(4), Random())
+    agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
+    searches = iter(verify(found, [model, model], evidence, config))
+    ends = []
+    for photograph in found:
+        for sought in photograph.sought:
+            verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1}
+            scanpath = agent.search(photograph.image[0], sought.target, **options)
+            right, looks = verified.found(confirm)
+            assert scanpath.found == (right is not None)
+            assert len(scanpath.cells) + len(scanpath.closer) == looks
+            if scanpath.found:
+                assert bool(sought.goal[scanpath.decision.cell]) == right
+                assert scanpath.decision.place == pytest.approx(max(place for place, _ in verified.places), abs=1e-5)
+            plain = agent.search(photograph.image[0], sought.target, **options, closer=0)
+            right = bool(sought.goal[plain.decision.cell]) if plain.found else None
+            assert (right, len(plain.cells)) == verified.unverified
+            ends.append((scanpath.found, len(scanpath.closer), plain.found))
+    assert any(closer for _, closer, _ in ends)
+
+
+def test_classes_are_present_and_absent_as_the_goal_says(seen):
+    for photograph in seen[0]:
+        annotation = photograph.scenes.annotation(photograph.index)
+        for sought in photograph.sought:
+            assert sought.present == (sought.target in annotation.labels.tolist())
+            for cell in range(len(photograph.grid)):
+                alone = torch.zeros(len(photograph.grid)).bool()
+                alone[cell] = True
+                boxes = annotation.boxes[annotation.labels == sought.target]
+                covered = len(boxes) > 0 and bool(photograph.grid.footprint(boxes)[:, cell].any())
+                assert bool(sought.goal[cell]) == covered
+
+
+def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
+    found, evidence = seen
+    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    known = examine(found, evidence, config)
+    assert known.features.shape == (len(known.right), 7)
+    assert set(known.fold.tolist()) == {0, 1}
+    # A place can only be right in a photograph that holds the target.
+    assert bool((known.present | ~known.right).all())
+    models = [fit(known, known.fold != fold) for fold in (0, 1)]
+    searches = list(verify(found, models, evidence, config))
+    assert len(searches) == sum(len(photograph.sought) for photograph in found)
+    for each in searches:
+        assert len(each.places) == len(each.ends) <= 2
+        assert list(each.ends) == sorted(each.ends)
+        assert each.looks >= max(each.ends, default=1)
+    with pytest.raises(DataError, match="got only one kind"):
+        examine([], evidence, config)
+
+
+class Limited(Blobs):
+    """A detector that counts its passes and stops after some."""
+
+    def __init__(self, most=10**9):
+        super().__init__()
+        self.most, self.passes = most, 0
+
+    def propose(self, canvas):
+        if self.passes == self.most:
+            raise KeyboardInterrupt
+        self.passes += 1
+        return super().propose(canvas)
+
+
+def all_of(detector, store):
+    """Examine and verify the embedded scenes."""
+    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    found, evidence = opened(detector, store)
+    known = examine(found, evidence, config)
+    return known, list(verify(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
+
+
+def test_interrupted_searches_continue_with_the_stored_looks(tmp_path):
+    """Only the photograph that was interrupted is looked at again, and the results are those of one run."""
+    whole = Limited()
+    known, searches = all_of(whole, None)
+    most, total = whole.passes // 2, 0
+    with pytest.raises(KeyboardInterrupt):
+        all_of(Limited(most), tmp_path)
+    finished = len(list(tmp_path.rglob("*.safetensors")))
+    assert 0 < finished < 3
+    resumed = Limited()
+    again, verified = all_of(resumed, tmp_path)
+    total = resumed.passes + most
+    assert whole.passes < total < 2 * whole.passes
+    assert resumed.passes < whole.passes
+    for one, other in zip(vars(known).values(), vars(again).values(), strict=True):
+        assert torch.equal(one, other)
+    assert searches == verified
+    idle = Limited(0)
+    assert all_of(idle, tmp_path)[1] == searches
+    assert idle.passes == 0
+
+
+def test_stored_looks_are_read_as_they_were_written_or_not_at_all(tmp_path):
+    (photograph, *_), _ = opened(Blobs(), tmp_path)
+    first, box = photograph.look(5), torch.tensor([3.0, 4.0, 30.1, 40.0])
+    closer = photograph.close_up(box)
+    photograph.close()
+    (path,) = tmp_path.rglob("*.safetensors")
+    (again, *_), _ = opened(Limited(0), tmp_path)
+    assert torch.equal(again.look(5).scores, first.scores)
+    assert torch.equal(again.close_up(box).boxes, closer.boxes)
+    again.close()
+    path.write_bytes(path.read_bytes()[:-9])
+    counting = Limited()
+    (anew, *_), _ = opened(counting, tmp_path)
+    assert torch.equal(anew.look(5).boxes, first.boxes)
+    assert counting.passes == 1
+    # Another grid has other looks.
+    eye = anew.eye
+    assert cell_store(tmp_path, eye.settings(), 4, 3, 4).folder == path.parent
+    assert cell_store(tmp_path, eye.settings(), 3, 4, 4).folder != path.parent
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_command_fits_a_model_that_the_agent_can_load(tmp_path, capsys):
+    small = ["--data.limit", "3", "--looks", "2", "--folds", "2", "--data.min_instances", "0"]
+    assert main([*small, "--out", str(tmp_path), "--cache", str(tmp_path / "cache")]) == 0
+    model = Verification.from_pretrained(tmp_path / "yolov3-tiny.safetensors")
+    assert model.thresholds is not None
+    assert model.metadata["training"]["looks"] == 2
+    figures = json.loads((tmp_path / "judged.json").read_text())
+    assert figures["area"] >= 0
+    report = (tmp_path / "report.md").read_text()
+    assert "(chosen)" in report
+    assert report in capsys.readouterr().out

@@ -1,0 +1,288 @@
+"""From a policy's settings to observer, policy and models."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from eval.explore.config import ExploreConfig
+from eval.search.config import SearchConfig
+from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
+from semfov.belief import ContextPrior, MapEvidence
+from semfov.errors import InputError
+from semfov.gaze.acquisition import (
+    ExpectedAccuracy,
+    NeighbourhoodPosterior,
+    PredictedTargetPosterior,
+    SaliencyPrior,
+    Static,
+    TargetPosterior,
+)
+from semfov.runs import candidates
+from semfov.runs.candidates import Candidate, Models, load_models, make_strategy, needs_observation
+from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.presets import known_policies, presets, resolve
+from semfov.strategy import Strategy
+
+GRID = Grid(4, 3, (40, 30))
+FOVEA = 100 / 640
+
+
+@pytest.fixture
+def model():
+    return FovealObservationModel.identity(["cup", "cat"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+
+
+@pytest.fixture
+def context():
+    weights = {"evidence": (0.5, 0.25), "map": (1.0, 2.0)}
+    return ContextPrior(["cup", "cat"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 1), [], weights=weights)
+
+
+def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
+    """The strategy of a policy for two classes, made with the given models."""
+    return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, Models(**models), fovea)
+
+
+def needs_model(belief=None, *choices, task="search"):
+    return needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
+
+
+def test_prediction_calibration_and_misses_need_an_observation_model():
+    soft = PolicyConfig("non-predictive", footprint="soft")
+    assert not needs_model(None, "random", "target-evidence", "vocus2", "non-predictive-raw", soft)
+    assert not needs_model(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
+    assert needs_model(None, PolicyConfig("non-predictive", misses=True))
+    assert needs_model(None, "random", "non-predictive-calibrated")
+    assert needs_model(None, "closer-look-calibrated", task="exploration")
+    assert needs_model(BeliefConfig(misses=True), "non-predictive-raw")
+    assert not needs_model(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
+    ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
+    assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
+    without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
+    for name in known_policies("exploration"):
+        scores = "learned" if name == "expected-gain" else "raw"
+        given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
+        assert needs_model(None, given, task="exploration") == (name not in without)
+
+
+def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model):
+    """`needs_observation` agrees with what making the strategy requires."""
+    others = {"evidence": TargetEvidence(4, 4), "map": MapEvidence(4, 4)}
+    for task in ("search", "exploration"):
+        for preset in presets(task).values():
+            assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
+            if needs_observation([preset], BeliefConfig()):
+                with pytest.raises(InputError, match="observation model"):
+                    strategy(preset, task, **others)
+            else:
+                strategy(preset, task, **others)
+
+
+def test_saliency_does_not_change_which_models_a_policy_needs():
+    for policy in ("random", "non-predictive", "predictive", "target-evidence"):
+        assert needs_model(None, PolicyConfig(policy, saliency="vocus2")) == needs_model(None, PolicyConfig(policy))
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    """The models that a run loads, as pairs of kind and name."""
+    loaded = []
+    for kind in ("observation", "target_evidence", "map_evidence", "context"):
+
+        def make(name, eye, kind=kind):
+            loaded.append((kind, name))
+            return kind
+
+        monkeypatch.setattr(candidates, f"make_{kind}", make)
+    return loaded
+
+
+def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
+    eye = SimpleNamespace()
+    assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == Models()
+    assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
+    assert loaded == []
+    learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
+    assert load_models(learned, "exploration", eye) == Models(map="map_evidence")
+    assert loaded == [("map_evidence", "everything")]
+    loaded.clear()
+    guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
+    every = SearchConfig(
+        policies=("random", guided, "predictive-raw"),
+        belief=BeliefConfig(model="mine", target_model="sought", context_model="cooccurrence"),
+    )
+    models = load_models(every, "search", eye)
+    assert models == Models("observation", "target_evidence", {"cooccurrence": "context"})
+    assert sorted(loaded) == [
+        ("context", "cooccurrence"),
+        ("observation", "mine"),
+        ("target_evidence", "sought"),
+    ]
+
+
+def test_context_is_loaded_when_a_policy_or_the_run_uses_it(loaded):
+    eye = SimpleNamespace()
+
+    def loads(belief, *choices):
+        return list(load_models(SearchConfig(policies=choices, belief=belief), "search", eye).context)
+
+    both = PolicyConfig("target-evidence", context="both")
+    assert loads(BeliefConfig(), "random", both) == ["coco"]
+    assert loads(BeliefConfig(context="place"), "target-evidence") == ["coco"]
+    assert loads(BeliefConfig(), "target-evidence", PolicyConfig("non-predictive", footprint="soft")) == []
+    assert loads(BeliefConfig(context="place"), PolicyConfig("target-evidence", context="none")) == []
+    own = replace(both, context_model="mine")
+    assert loads(BeliefConfig(context_model="theirs"), both, own, both) == ["theirs", "mine"]
+
+
+def test_each_policy_gets_the_context_that_it_names(context):
+    evidence = TargetEvidence(8, 6, components=3)
+    other = context.permuted(1)
+    given = {"coco": context, "mine": other}
+    for name, prior in ((None, context), ("mine", other)):
+        policy = PolicyConfig("target-evidence", context="both", context_model=name)
+        assert strategy(policy, evidence=evidence, context=given).observer.prior is prior
+
+
+@pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
+def test_a_run_without_policies_is_refused(config):
+    with pytest.raises(InputError, match="policies: expected at least one"):
+        load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
+
+
+def test_strategies_follow_their_settings(model):
+    ahead = strategy(PolicyConfig("predictive", misses=True, tempering=0.25), observation=model)
+    assert ahead.observer.misses is model
+    assert ahead.observer.observation is None
+    assert ahead.observer.tempering == 0.25
+    assert isinstance(ahead.policy(1, GRID), PredictedTargetPosterior)
+    explorer = strategy(PolicyConfig("expected-accuracy", "calibrated", misses=True), "exploration", observation=model)
+    assert explorer.observer.observation is model
+    assert explorer.observer.misses is model
+    assert isinstance(explorer.policy(None, GRID), ExpectedAccuracy)
+    with pytest.raises(InputError, match="misses"):
+        strategy("random", belief=BeliefConfig(misses=True))
+    with pytest.raises(InputError, match="scores"):
+        strategy("non-predictive-calibrated")
+
+
+def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
+    run = BeliefConfig(prior=0.3, fusion="sum", footprint="soft", tempering=0.7, memory="closest", misses=True)
+    plain = strategy("non-predictive-raw", belief=run, observation=model).observer
+    settings = plain.prior, plain.fusion, plain.footprint, plain.tempering, plain.memory, plain.misses
+    assert settings == (0.3, "sum", "soft", 0.7, "closest", model)
+    own = PolicyConfig("non-predictive", tempering=1.0, footprint="box_centre", memory="all", misses=False)
+    changed = strategy(own, belief=run, observation=model).observer
+    settings = changed.prior, changed.fusion, changed.footprint, changed.tempering, changed.memory, changed.misses
+    assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
+
+
+def test_the_neighbourhood_policy_needs_an_observation_model(model):
+    made = strategy("neighbourhood-raw", observation=model)
+    assert isinstance(made.policy(1, GRID), NeighbourhoodPosterior)
+    with pytest.raises(InputError, match="observation model"):
+        strategy("neighbourhood-raw")
+
+
+def test_kl_divergence_is_measured_from_the_prior_of_the_run(model):
+    explorer = strategy("kl-raw", "exploration", BeliefConfig(prior=0.25), observation=model)
+    assert explorer.policy(None, GRID).prior == explorer.observer.prior == 0.25
+
+
+def test_closer_look_uses_the_fovea_of_the_run():
+    assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
+
+
+def test_target_evidence_brings_its_own_belief():
+    evidence = TargetEvidence(4, 4)
+    sought = strategy("target-evidence", evidence=evidence)
+    assert isinstance(sought.observer, observers.Target)
+    assert sought.observer.model is evidence
+    assert isinstance(sought.policy, policies.NonPredictive)
+    with pytest.raises(InputError, match="learned"):
+        strategy("target-evidence")
+
+
+def test_context_is_added_when_a_policy_or_the_run_asks_for_it(context):
+    given = {"context": {"coco": context}, "evidence": TargetEvidence(4, 4)}
+    assert isinstance(strategy("non-predictive-raw", **given).observer, observers.Semantic)
+    parts = {"both": (1.0, 2.0), "place": (1.0, 0.0), "cooccurrence": (0.0, 2.0)}
+    for part, expected in parts.items():
+        own = strategy(PolicyConfig("non-predictive", context=part), **given).observer
+        of_the_run = strategy("non-predictive-raw", belief=BeliefConfig(context=part), **given).observer
+        for observer in (own, of_the_run):
+            assert isinstance(observer, observers.Context)
+            assert isinstance(observer.observer, observers.Semantic)
+            assert observer.weights == expected
+    sought = strategy(PolicyConfig("target-evidence", context="both"), **given).observer
+    assert isinstance(sought.observer, observers.Target)
+    assert sought.weights == (0.5, 0.25)
+    none = strategy(PolicyConfig("non-predictive", context="none"), belief=BeliefConfig(context="both"), **given)
+    assert isinstance(none.observer, observers.Semantic)
+    with pytest.raises(InputError, match="context: expected a fitted context"):
+        strategy(PolicyConfig("non-predictive", context="both"))
+
+
+def test_context_is_refused_for_policies_that_cannot_use_it(context, model):
+    for policy, task in (("predictive", "search"), ("random", "search"), ("random", "exploration")):
+        with pytest.raises(
+            InputError,
+            match="context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive'",
+        ):
+            strategy(PolicyConfig(policy, context="both"), task, context=context, observation=model)
+
+
+def test_saliency_alone_keeps_the_belief_of_the_run(model):
+    made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
+    assert isinstance(made.policy, policies.SaliencyMaximum)
+    assert made.observer.observation is model
+
+
+@pytest.mark.parametrize("rows", [1, 12], ids=["of the picture", "from every cell"])
+def test_saliency_replaces_a_policy_or_is_combined_with_it(rows):
+    cell, visited = torch.tensor([5, 0]), torch.zeros(2, 12, dtype=torch.bool)
+    table = torch.rand(rows, 12, generator=torch.Generator().manual_seed(0))
+    seen = table[cell] if rows > 1 else table.expand(2, -1)
+    belief = DirichletBelief(0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)))
+    salient = Strategy(observers.Semantic(3), policies.SaliencyMaximum())
+    alone = Candidate(salient, table).acquisition(1, GRID, cell)
+    assert isinstance(alone, Static)
+    torch.testing.assert_close(alone(belief, visited), seen)
+    sought = Strategy(observers.Semantic(3), policies.NonPredictive())
+    beside = Candidate(sought, saliency=table, weight=0.4).acquisition(1, GRID, cell)
+    assert isinstance(beside, SaliencyPrior)
+    raised = seen + 1e-3 * seen.amax(-1, keepdim=True)
+    expected = belief.probability(1).log() + 0.4 * (raised / raised.sum(-1, keepdim=True)).log()
+    torch.testing.assert_close(beside(belief, visited), expected)
+    plain = Candidate(sought)
+    assert plain.observer is sought.observer
+    assert isinstance(plain.acquisition(1, GRID, cell), TargetPosterior)
+
+
+@pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "ideal-observer"])
+def test_policies_that_need_a_target_position_work_with_learned_evidence(model, name):
+    """The belief is that of `target-evidence`, and the policy searches for the position that it estimates."""
+    evidence = TargetEvidence(4, 4, components=3)
+    made = strategy(PolicyConfig(name, "learned"), observation=model, evidence=evidence)
+    assert isinstance(made.observer, observers.Target)
+    assert made.observer.model is evidence
+    assert made.policy.name == name
+    belief = made.observer.start(2, GRID, torch.zeros(()))
+    visited = torch.zeros(2, 12, dtype=torch.bool)
+    assert made.policy(torch.tensor([1, 2]), GRID)(belief, visited).shape == (2, 12)
+    with pytest.raises(InputError, match="learned target evidence"):
+        strategy(PolicyConfig(name, "learned"), observation=model)
+
+
+def test_attention_maps_replace_a_policy():
+    attention = torch.rand(12, 2, 12)
+    candidate = Candidate(strategy("ivsn", fovea=0.2), attention)
+    acquisition = candidate.acquisition(torch.tensor([2]), GRID, torch.tensor([5]))
+    visited = torch.zeros(1, 12, dtype=torch.bool)
+    visited[0, 5] = True
+    belief = candidate.observer.start(1, GRID, torch.zeros(()))
+    torch.testing.assert_close(acquisition(belief, visited)[0], attention[5, 1])
+    with pytest.raises(InputError, match="policy 'ivsn': expected a target"):
+        candidate.acquisition(None, GRID, torch.tensor([5]))

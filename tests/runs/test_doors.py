@@ -1,0 +1,137 @@
+"""Invalid values are refused before any work, with one line that names the argument and its range."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from semfov import load_detector
+from semfov.data.scenes import EmbeddedScenes
+from semfov.detection import Selection
+from semfov.errors import InputError
+from semfov.runs import config as settings
+from semfov.runs.settings import Range, check_settings
+from tests import small
+
+
+@pytest.fixture
+def agent():
+    return small.agent(small.Fixed(), grid=(4, 3), sigma=10.0, reference=64.0)
+
+
+IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("image", [IMAGE * 255, IMAGE - 0.5, IMAGE.masked_fill(IMAGE > 0.99, torch.nan)])
+def test_invalid_images_are_refused_by_the_detector_and_the_eye(agent, image):
+    for look in (lambda: agent.eye.detector(image[None]), lambda: agent.eye.open(image[None])):
+        with pytest.raises(InputError, match=r"^images: expected RGB in \[0, 1\]"):
+            look()
+
+
+def test_rounding_errors_just_above_one_are_accepted(agent):
+    agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
+
+
+@pytest.mark.parametrize("wrong", [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}])
+def test_invalid_selections_are_refused(wrong):
+    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
+        Selection(**wrong)
+
+
+@pytest.mark.parametrize("stride", ["auto", 0, -32, 1.5, True])
+def test_invalid_strides_are_refused(stride):
+    with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
+        small.Fixed(stride=stride)
+
+
+@pytest.mark.weights
+def test_invalid_strides_and_thresholds_are_refused_when_a_detector_is_loaded():
+    with pytest.raises(InputError, match=r"^stride: expected None or a multiple of 32, got 'auto'"):
+        load_detector("yolov3-tiny", stride="auto")
+    with pytest.raises(InputError, match=r"^threshold: expected a number from 0 to 1, got 2"):
+        load_detector("yolov3-tiny", threshold=2)
+
+
+def test_invalid_seeds_and_counts_of_embedded_scenes_are_refused():
+    for wrong in ({"seed": -1}, {"count": 0}):
+        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
+            EmbeddedScenes(("cup",), **wrong)
+
+
+CONFIGS = [value for value in vars(settings).values() if dataclasses.is_dataclass(value) and isinstance(value, type)]
+
+
+def ranges():
+    """Every setting with a range: its class, name, type and range."""
+    from typing import Annotated, get_args, get_origin, get_type_hints
+
+    for config in CONFIGS:
+        for name, hint in get_type_hints(config, include_extras=True).items():
+            for option in (hint, *get_args(hint)):
+                if get_origin(option) is Annotated:
+                    base, allowed = get_args(option)[:2]
+                    if isinstance(allowed, Range):
+                        yield config, name, base, allowed
+
+
+def test_settings_with_a_range_are_found():
+    assert len(list(ranges())) > 25
+
+
+@pytest.mark.parametrize(("config", "name", "base", "allowed"), list(ranges()), ids=str)
+def test_settings_out_of_their_range_are_refused_by_name(config, name, base, allowed):
+    required = {"policy": "random"} if config is settings.PolicyConfig else {}
+    wrong = [allowed.high + 1, float("nan"), float("inf"), True, [1]]
+    wrong.append(allowed.above if allowed.above > -1e300 else allowed.low - 1)
+    wrong += [1.5] if base is int else []
+    for value in wrong:
+        with pytest.raises(InputError, match=f"^{name}: expected a (whole )?number "):
+            config(**required, **{name: value})
+        with pytest.raises(InputError, match=f"^before.{name}: expected "):
+            check_settings(config, {name: value}, "before.")
+    config(**required, **{name: base(allowed.high)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--protocol.batch", "0"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got 0"),
+        (["--protocol.batch", "-1"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got -1"),
+        (["--protocol.starts", "0"], "protocol.starts: expected a whole number from 1 to 10,000, got 0"),
+        (["--protocol.seed", "-1"], "protocol.seed: expected a whole number from 0 to"),
+        (["--protocol.shifts", "-1"], "protocol.shifts: expected a whole number from 0 to 10,000, got -1"),
+        (["--detector.threshold", "2"], "detector.threshold: expected a number from 0 to 1, got 2"),
+        (["--detector.iou", "-0.1"], "detector.iou: expected a number from 0 to 1, got -0.1"),
+        (["--belief.columns", "0"], "belief.columns: expected a whole number from 1 to 200, got 0"),
+        (["--sensor.sigma", "0"], "sensor.sigma: expected a number above 0"),
+        (["--workers", "0"], "workers: expected a whole number from 1 to 1,024, got 0"),
+        (
+            ["--data.root", "nosuch", "--data.annotations", "no.json"],
+            "data.root: no such folder: nosuch; check the path",
+        ),
+        (["--data.root", "tests", "--data.annotations", "no.json"], "data.annotations: no such file: no.json; check"),
+        (["--data.root", "tests"], "data: expected both data.root and data.annotations"),
+        (["--detector.name", "yolo"], "unknown detector 'yolo'; did you mean 'yolov3'"),
+        (["--detector.name", "nosuch.onnx"], "detector: no such file: nosuch.onnx; check the path"),
+    ],
+)
+def test_invalid_command_lines_are_refused_before_any_work(arguments, message, capsys, tmp_path):
+    from eval.search import main
+
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {message}")
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def test_help_shows_ranges(capsys):
+    from eval.search import main
+
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "(type: int from 1 to 10,000, default: 10)" in text
+    assert "(type: float from 0 to 1, default: 0.02)" in text
+    assert "Annotated" not in text

@@ -1,0 +1,182 @@
+"""The exploration protocol against a scalar reference implementation."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from semfov import Detections, FovealObservationModel, Grid, policies
+from semfov.belief.observers import SemanticLook
+from semfov.data import Annotation
+from semfov.metrics.exploration import answers_of
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise, run_explorations
+from semfov.strategy import Strategy
+from tests.small import FixedLook
+
+GRID = Grid(4, 3, (80, 60))
+NOTHING = Detections.empty(12, 3)
+ANNOTATION = Annotation(
+    torch.tensor([[1.0, 1, 19, 19], [15, 5, 45, 15], [62, 42, 78, 58]]),
+    torch.tensor([1, 2, 3]),
+    torch.zeros(3, dtype=torch.bool),
+    (80, 60),
+)
+
+
+class Scenes:
+    """Two scenes; the protocol reads only their ids."""
+
+    ids = (7, 8)
+
+
+@pytest.fixture
+def look():
+    """Likelihoods of four classes for three detections from each of 12 cells."""
+    torch.manual_seed(0)
+    likelihood = torch.rand(12, 3, 4) ** 3
+    return SemanticLook(likelihood, torch.rand(12, 3, 12) < 0.25, torch.zeros(12, 12))
+
+
+@pytest.fixture
+def model():
+    clarity = torch.tensor([6.0, 1.0])
+    alpha = 1 + torch.eye(4)[:, None] * clarity[:, None]
+    return FovealObservationModel(alpha, [0.3], ["cat", "cup", "dog"]).requires_grad_(False).eval()
+
+
+def kaplan(beta, likelihood):
+    """Equation 7 of Luzio, Bernardino and Moreno (2024)."""
+    expected = (beta * likelihood).sum()
+    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
+
+
+def from_prior(beta):
+    """Their equation 19."""
+    base = torch.distributions.Dirichlet(torch.full((len(beta),), 0.5, dtype=torch.float64))
+    return float(torch.distributions.kl_divergence(torch.distributions.Dirichlet(torch.from_numpy(beta)), base))
+
+
+def explore_by_loop(episode, look, model, answers, noise, shifts):
+    """KL exploration of one episode, cell by cell, from the description in the paper."""
+    beta = np.full((12, 4), 0.5)
+    cell, cells, right, without_background = episode.start, [], [], []
+    for shift in range(shifts + 1):
+        cells.append(cell)
+        for likelihood, footprint in zip(look.likelihood[cell], look.footprint[cell], strict=True):
+            for covered in footprint.nonzero()[:, 0].tolist():
+                beta[covered] = kaplan(beta[covered], likelihood.double().numpy())
+        counts = [0, 0]
+        for place in range(12):
+            for number, offered in enumerate(([0, 1, 2, 3], [1, 2, 3])):
+                best = max(beta[place, k] for k in offered)
+                winners = [k for k in offered if beta[place, k] > best * (1 - 1e-6)]
+                counts[number] += len(winners) == 1 and winners[0] in answers[place]
+        right.append(counts[0])
+        without_background.append(counts[1])
+        values = []
+        for fixation in range(12):
+            total = 0.0
+            for place in range(12):
+                distance = float((GRID.centres[place] - GRID.centres[fixation]).norm()) / 80
+                p = beta[place] / beta[place].sum()
+                scores = p @ model.expected_scores()[:, int(distance > 0.3)].double().numpy()
+                after = kaplan(beta[place], scores)
+                total += from_prior(after) - from_prior(beta[place])
+            values.append(total)
+        free = [c for c in range(12) if c not in cells]
+        if not free:
+            right += [right[-1]] * (shifts - shift)
+            without_background += [without_background[-1]] * (shifts - shift)
+            break
+        best = max(values[c] for c in free)
+        tied = [c for c in free if values[c] > best * (1 - 1e-6)]
+        cell = max(tied, key=lambda c: float(noise[shift, c]))
+    return tuple(cells), tuple(right), tuple(without_background)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", [2, 100])
+@pytest.mark.parametrize("shifts", [5, 14])
+def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
+    protocol = ProtocolConfig(starts=5, shifts=shifts)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    answers = answers_of(ANNOTATION, GRID, 4)
+    # In float64, so that the reference finds the same ties.
+    double = SemanticLook(look.likelihood.double(), look.footprint, look.distance.double())
+    explorer = Candidate(Strategy(FixedLook(double), policies.KL(model.double())))
+    nothing = Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask)
+    progress = run_explorations(episodes, explorer, nothing, GRID, answers, noise, shifts=shifts, batch=batch)
+    right_classes = [set(row.nonzero()[:, 0].tolist()) for row in answers]
+    for episode, random, outcome in zip(episodes, noise, progress, strict=True):
+        expected = explore_by_loop(episode, look, model, right_classes, random, shifts)
+        assert (outcome.cells, outcome.right, outcome.right_without_background) == expected
+
+
+def test_answers_with_and_without_background_are_both_recorded(look):
+    """No cell has background as its answer, so leaving it out can only raise the count of right cells."""
+    protocol = ProtocolConfig(starts=6, shifts=5)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    answers = answers_of(ANNOTATION, GRID, 4)
+    assert not answers[:, 0].any()
+    explorer = Candidate(Strategy(FixedLook(look), policies.Random()))
+    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=5, batch=100)
+    for outcome in progress:
+        counts = zip(outcome.right, outcome.right_without_background, strict=True)
+        assert all(right <= without_background for right, without_background in counts)
+    assert any(outcome.right != outcome.right_without_background for outcome in progress)
+
+
+def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
+    """The next fixation maximises the policy's value times the saliency as seen from the current cell."""
+    protocol = ProtocolConfig(starts=4, shifts=6)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    table = torch.rand(12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
+    observer, policy = FixedLook(look), policies.Surprise(model)
+    explorer, answers = (
+        Candidate(Strategy(observer, policy), saliency=table, weight=0.5),
+        answers_of(ANNOTATION, GRID, 4),
+    )
+    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=6, batch=3)
+    for outcome in progress:
+        belief, visited = observer.start(1, GRID, look.likelihood), torch.zeros(1, 12, dtype=torch.bool)
+        for here, there in pairwise(outcome.cells):
+            belief = observer.update(belief, look[torch.tensor([here])])
+            visited[0, here] = True
+            raised = table[here] + 1e-3 * table[here].max()
+            values = policy(None, GRID)(belief, visited)[0].double() * (raised / raised.sum()) ** 0.5
+            assert values[there] >= values.masked_fill(visited[0], 0).max() * (1 - 1e-5)
+
+
+def test_saliency_alone_replaces_the_policy(look):
+    """The next fixation is the most salient cell as seen from the current one, whatever the belief."""
+    protocol = ProtocolConfig(starts=12, shifts=11)
+    episodes = explorations_of(Scenes(), 1, 12, protocol)
+    assert sorted(episode.start for episode in episodes) == list(range(12))
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    saliency = torch.rand(12, 12, generator=torch.Generator().manual_seed(1))
+    for table in (saliency, saliency[:1]):
+        explorer = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
+        answers = answers_of(ANNOTATION, GRID, 4)
+        progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=11, batch=100)
+        for episode, outcome in zip(episodes, progress, strict=True):
+            cells = [episode.start]
+            while len(cells) < 12:
+                seen = table[cells[-1] if len(table) > 1 else 0].clone()
+                seen[cells] = -1
+                cells.append(int(seen.argmax()))
+            assert outcome.cells == tuple(cells)
+
+
+def test_starts_and_tie_breaking_noise_depend_on_the_seed():
+    one, other = ProtocolConfig(starts=6), ProtocolConfig(starts=6, seed=1)
+    assert explorations_of(Scenes(), 0, 100, one) != explorations_of(Scenes(), 0, 100, other)
+    assert explorations_of(Scenes(), 0, 100, one) == explorations_of(Scenes(), 0, 100, one)
+    episode = Exploration(0, 2, 5)
+    assert torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, one))
+    assert not torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, other))

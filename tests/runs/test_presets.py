@@ -1,0 +1,229 @@
+"""Policies in settings: names, mappings, labels in tables, and which are refused."""
+
+from dataclasses import asdict, fields, replace
+from itertools import combinations
+from typing import get_args
+
+import pytest
+import yaml
+
+from eval.explore.config import ExploreConfig
+from eval.search.config import SearchConfig
+from semfov.errors import InputError
+from semfov.gaze.policies import Task, policy_names
+from semfov.runs.command import run_command
+from semfov.runs.config import PolicyConfig
+from semfov.runs.presets import WORDS, known_policies, label, presets, resolve
+from semfov.runs.setup import plain
+
+TASKS = get_args(Task)
+ALIASES = {
+    "search": {
+        "recommended": "target-evidence",
+        "published": "predictive-calibrated",
+        "maximum-a-posteriori-raw": "non-predictive-raw",
+        "maximum-a-posteriori-calibrated": "non-predictive-calibrated",
+        "maximum-a-posteriori-learned": "target-evidence",
+    },
+    "exploration": {"recommended": "closer-look-learned", "published": "kl-calibrated"},
+}
+
+# One change each; together they cover every allowed word of every setting.
+CHANGES = [
+    {"tempering": 0.25},
+    {"tempering": 0.5},
+    {"tempering": 1.0},
+    {"misses": True},
+    {"misses": False},
+    *({name: word} for name, words in WORDS.items() if name != "scores" for word in get_args(words)),
+]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_policy_has_a_preset(task):
+    made = {preset.policy for preset in presets(task).values()}
+    assert made == set(known_policies(task)) >= set(policy_names(task))
+    for name, preset in presets(task).items():
+        assert resolve(name, task) == resolve(preset, task) == preset
+
+
+def test_names_give_policy_scores_and_saliency():
+    assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
+    assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
+    assert resolve("entropy-limit-learned", "search") == PolicyConfig("entropy-limit", "learned")
+    assert resolve("vocus2", "search") == PolicyConfig("saliency", saliency="vocus2")
+    assert resolve("expected-accuracy-raw", "exploration") == PolicyConfig("expected-accuracy")
+    assert resolve("itti-koch-calibrated", "exploration") == PolicyConfig(
+        "saliency", "calibrated", saliency="itti-koch"
+    )
+    assert resolve("recommended", "search") == PolicyConfig("target-evidence")
+    assert resolve("recommended", "exploration") == PolicyConfig("closer-look", "learned")
+    assert resolve("published", "search") == PolicyConfig("predictive", "calibrated")
+    assert resolve("published", "exploration") == PolicyConfig("kl", "calibrated")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_labels_of_presets_are_their_names(task):
+    for name in presets(task):
+        assert label(name, task) == ALIASES[task].get(name, name)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_labels_are_unique(task):
+    """Two policies with the same label would be merged in the tables of a run."""
+    several = [{}, *CHANGES, *({**one, **other} for one, other in combinations(CHANGES, 2))]
+    made = set()
+    for preset in presets(task).values():
+        for change in several:
+            try:
+                made.add(resolve(replace(preset, **change), task))
+            except InputError:
+                continue
+    labels = {label(policy, task) for policy in made}
+    assert len(labels) == len(made) > 500
+    assert labels >= {label(name, task) for name in presets(task)}
+
+
+def test_labels_list_the_differences_from_a_preset():
+    central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
+    assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
+    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine")
+    assert len(fields(PolicyConfig)) == 9
+    expected = (
+        "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, "
+        "context none, context_model mine"
+    )
+    assert label(everything, "search") == expected
+    assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"
+    assert label(PolicyConfig("target-evidence", context="place"), "search") == "target-evidence, context place"
+    assert label(PolicyConfig("kl", saliency="itti-koch"), "exploration") == "kl-raw, saliency itti-koch"
+
+
+@pytest.mark.parametrize(
+    ("choice", "task", "suggested"),
+    [
+        ("predicitve-raw", "search", "predictive-raw"),
+        ("target-evidenc", "search", "target-evidence"),
+        ("recomended", "exploration", "recommended"),
+        ("random", "exploration", "random-raw"),
+        (PolicyConfig("predictiv"), "search", "predictive"),
+        (PolicyConfig("closer-lok"), "exploration", "closer-look"),
+        (PolicyConfig("kl", memory="closets"), "exploration", "closest"),
+        (PolicyConfig("kl", footprint="box-centre"), "exploration", "box_centre"),
+        (PolicyConfig("kl", saliency="vocus"), "exploration", "vocus2"),
+        (PolicyConfig("kl", "calibratd"), "exploration", "calibrated"),
+        (PolicyConfig("non-predictive", context="cooccurence"), "search", "cooccurrence"),
+    ],
+    ids=str,
+)
+def test_unknown_names_get_a_suggestion(choice, task, suggested):
+    for call in (resolve, label):
+        with pytest.raises(InputError, match=f"did you mean '{suggested}'"):
+            call(choice, task)
+
+
+def test_a_policy_of_the_other_task_is_refused():
+    with pytest.raises(InputError, match="policy"):
+        resolve(PolicyConfig("kl"), "search")
+    with pytest.raises(InputError, match="policy"):
+        resolve(PolicyConfig("target-evidence"), "exploration")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_saliency_without_a_model_is_refused(task):
+    with pytest.raises(InputError, match=r"^saliency: .*vocus2, itti-koch"):
+        resolve(PolicyConfig("saliency"), task)
+
+
+@pytest.mark.parametrize("tempering", [0.0, -0.5, float("nan")])
+def test_an_exponent_out_of_range_is_refused(tempering):
+    with pytest.raises(InputError, match=r"^tempering: expected a number above 0"):
+        resolve(PolicyConfig("kl", tempering=tempering), "exploration")
+
+
+@pytest.mark.parametrize("policy", ["random", "target-evidence", "saliency"])
+def test_scores_are_refused_for_policies_that_do_not_use_them(policy):
+    """Its label would be the same as with raw scores."""
+    saliency = "vocus2" if policy == "saliency" else None
+    with pytest.raises(InputError, match=f"^scores: .*'{policy}'"):
+        resolve(PolicyConfig(policy, "calibrated", saliency=saliency), "search")
+
+
+@pytest.mark.parametrize(
+    "change", [{"tempering": 0.25}, {"footprint": "soft"}, {"memory": "all"}, {"misses": True}], ids=str
+)
+def test_settings_of_a_map_are_refused_for_policies_with_their_own_belief(change):
+    with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'target-evidence'"):
+        resolve(PolicyConfig("target-evidence", **change), "search")
+
+
+def parsed(config, *arguments):
+    """The policies that a command line gives."""
+    got = []
+    assert run_command(got.append, config, "Policies.", arguments) == 0
+    (settings,) = got
+    return settings.policies
+
+
+MAPPING = "[{policy: non-predictive, tempering: 0.25}, random]"
+
+
+def test_a_policy_can_be_a_mapping_on_the_command_line():
+    assert parsed(SearchConfig, "--policies", MAPPING) == (PolicyConfig("non-predictive", tempering=0.25), "random")
+    given = "[recommended, {policy: kl, scores: calibrated, memory: closest, misses: true}]"
+    expected = "recommended", PolicyConfig("kl", "calibrated", memory="closest", misses=True)
+    assert parsed(ExploreConfig, "--policies", given) == expected
+
+
+def test_a_policy_can_be_a_mapping_in_yaml(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(f"policies: {MAPPING}\n")
+    assert parsed(SearchConfig, "--config", str(path)) == (PolicyConfig("non-predictive", tempering=0.25), "random")
+    path.write_text("policies:\n- policy: saliency\n  saliency: vocus2\n- kl-raw\n")
+    assert parsed(ExploreConfig, "--config", str(path)) == (PolicyConfig("saliency", saliency="vocus2"), "kl-raw")
+
+
+@pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
+def test_settings_that_a_run_wrote_can_be_read_back(config, tmp_path):
+    policies = (PolicyConfig("random", saliency="vocus2"), *config().policies)
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(plain(asdict(replace(config(), policies=policies))), sort_keys=False))
+    assert parsed(config, "--config", str(path)) == policies
+
+
+BAD = {
+    "temperring": "{policy: non-predictive, temperring: 0.25}",
+    "tempering": "{policy: non-predictive, tempering: cold}",
+    "scores": "{policy: non-predictive, scores: cooked}",
+    "policy": "{tempering: 0.25}",
+}
+
+
+@pytest.mark.parametrize("wrong", BAD)
+def test_an_invalid_mapping_is_refused_in_yaml(wrong, tmp_path, capsys):
+    path = tmp_path / "run.yaml"
+    path.write_text(f"policies:\n- {BAD[wrong]}\n")
+    with pytest.raises(SystemExit) as stopped:
+        parsed(SearchConfig, "--config", str(path))
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert "policies" in error
+    assert wrong in error
+
+
+@pytest.mark.parametrize("wrong", BAD)
+def test_an_invalid_mapping_is_refused_on_the_command_line(wrong, capsys):
+    """The parser may read such a mapping as text, which is then an unknown name."""
+
+    def run(config):
+        for choice in config.policies:
+            resolve(choice, "search")
+
+    try:
+        code = run_command(run, SearchConfig, "Policies.", ["--policies", f"[random, {BAD[wrong]}]"])
+    except SystemExit as stopped:
+        code = stopped.code
+    assert code in (1, 2)
+    error = capsys.readouterr().err
+    assert "policies" in error
+    assert wrong in error

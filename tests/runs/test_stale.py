@@ -1,0 +1,190 @@
+"""Stored results of other code or other images are not used, and do not depend on threads."""
+
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.comparison import run as run_module
+from eval.search import main
+from eval.search.config import SearchConfig
+from eval.search.run import SearchRun
+from semfov.errors import InputError
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.policies import POLICIES, Policy
+from semfov.runs import scene_run
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.results import Parts
+from semfov.runs.scene_run import finish, gather
+
+ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.weights
+
+
+@pytest.fixture
+def config(tmp_path):
+    return SearchConfig(
+        data=DataConfig(limit=1),
+        belief=BeliefConfig(columns=3, rows=2),
+        protocol=ProtocolConfig(starts=2, shifts=3),
+        policies=("random",),
+        cache=tmp_path / "cache",
+        out=tmp_path / "out",
+        workers=1,
+    )
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.slow
+def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, monkeypatch, caplog):
+    first = SearchRun(config)
+    finish(first, "searching")
+    assert first.parts.load(0) is not None
+    finish(SearchRun(config), "searching")
+    assert not caplog.records
+    monkeypatch.setattr(scene_run, "package_digest", lambda: "0" * 64)
+    second = SearchRun(config)
+    assert second.settings_key == first.settings_key
+    assert second.key != first.key
+    assert second.store.key == first.store.key, "stored looks do not depend on the code of the search"
+    assert second.parts.load(0) is None
+    with caplog.at_level(logging.WARNING):
+        finish(second, "searching")
+    (record,) = caplog.records
+    assert "1 scenes were finished with these settings by another version of the code" in record.getMessage()
+    assert second.parts.load(0) is not None
+
+
+def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, monkeypatch):
+    class OwnPolicy(Policy):
+        name = "own-of-a-test"
+        tasks = ("search",)
+
+        def forward(self, target, grid):
+            return TargetPosterior(target)
+
+    try:
+        chosen = replace(config, policies=(PolicyConfig("own-of-a-test"),))
+        key = SearchRun(chosen).key
+        assert SearchRun(chosen).key == key
+        monkeypatch.setattr(run_module, "class_digest", lambda kind: "changed")
+        assert SearchRun(chosen).key != key
+        assert SearchRun(config).settings_key != SearchRun(chosen).settings_key
+    finally:
+        del POLICIES["own-of-a-test"]
+
+
+def test_a_part_of_another_image_is_not_loaded(tmp_path):
+    digest = {"now": "a" * 64}
+    parts = Parts(tmp_path, "1-2", lambda index: digest["now"])
+    parts.save(3, [{"policy": "random"}], {"look": 0.5})
+    assert parts.load(3)["records"] == [{"policy": "random"}]
+    digest["now"] = "b" * 64
+    assert parts.load(3) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda part: {**part, "seconds": None},
+        lambda part: {**part, "seconds": {"look": None}},
+        lambda part: {**part, "records": None},
+        lambda part: {**part, "records": [None]},
+        lambda part: {**part, "records": 3},
+        lambda part: {key: value for key, value in part.items() if key != "seconds"},
+        lambda part: [part],
+        lambda part: None,
+    ],
+)
+def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
+    parts = Parts(tmp_path, "1-2", lambda index: "a")
+    parts.save(0, [{"policy": "random"}], {"look": 0.5})
+    part = damage(json.loads(parts.path(0).read_text()))
+    if isinstance(part, dict) and {"records", "seconds"} <= part.keys():
+        part["sha256"] = parts._sha256(0, part["records"], part["seconds"])
+    parts.path(0).write_text(json.dumps(part))
+    assert parts.load(0) is None
+
+
+def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
+    parts = Parts(tmp_path, "1-2", lambda index: "a")
+    parts.folder.mkdir()
+    for content in (b"[" * 100_000, b"\xff\xfe", b"", b'{"key": 1' * 9):
+        parts.path(0).write_bytes(content)
+        assert parts.load(0) is None
+    os.mkfifo(parts.path(1))
+    assert parts.load(1) is None
+    parts.path(2).mkdir()
+    assert parts.load(2) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("detector", ["yolov3-tiny"])
+def test_a_deleted_store_file_is_written_identically_with_more_threads(config, detector):
+    run = SearchRun(config)
+    finish(run, "searching")
+    (file,) = (config.cache / "looks").rglob("*.safetensors")
+    content = file.read_bytes()
+    file.unlink()
+    torch.set_num_threads(4)
+    again = SearchRun(config)
+    again.detections(0)
+    assert torch.get_num_threads() == 4
+    assert file.read_bytes() == content
+
+
+def test_a_policy_given_twice_is_refused(config):
+    for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
+        with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
+            SearchRun(replace(config, policies=policies))
+
+
+@pytest.mark.slow
+def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
+    """The same command and folder, after the choice of the next cell has been inverted."""
+    tree = tmp_path / "tree"
+    for name in ("semfov", "eval"):
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    small = ["--data.limit", "1", "--belief.columns", "4", "--belief.rows", "3", "--protocol.starts", "3"]
+    small += ["--protocol.shifts", "5", "--policies", '["target-evidence"]', "--scanpaths", "0", "--workers", "1"]
+
+    def search(out):
+        call = [sys.executable, "-m", "eval.search", *small, "--out", str(out), "--cache", str(tmp_path / "cache")]
+        environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(call, cwd=tree, env=environment, capture_output=True, text=True, check=True)
+        return (out / "episodes.jsonl").read_text(), done.stderr
+
+    # The first run is in this process, with the same code as the copied tree.
+    assert main([*small, "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]) == 0
+    first = (tmp_path / "out" / "episodes.jsonl").read_text()
+    choice = tree / "semfov" / "gaze" / "selection.py"
+    text = choice.read_text()
+    assert "masked_fill(visited, -torch.inf)" in text
+    choice.write_text(text.replace("masked_fill(visited, -torch.inf)", "neg().masked_fill(visited, -torch.inf)"))
+    second, error = search(tmp_path / "out")
+    assert "by another version of the code" in error
+    assert second != first
+    assert search(tmp_path / "fresh")[0] == second
+
+
+def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
+    run = SearchRun(config)
+    finish(run, "searching")
+    assert gather(run)[0]
+    monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
+    other = SearchRun(config)
+    assert other.parts.load(0) is None

@@ -1,0 +1,1 @@
+"""Fits models of how people choose their next fixation."""
