@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.settings import Count, Seed, Settings, Share, Side, Workers
+from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
+from semfov.runs.settings import Count, Seed, Share, Side
 
 
 @dataclass(frozen=True)
-class CalibrationConfig(Settings):
+class CalibrationConfig(WorkConfig):
     """Evaluate how well scores, and beliefs about a target, agree with the annotated objects.
 
     Args:
@@ -32,7 +32,6 @@ class CalibrationConfig(Settings):
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     model: str | None = None
     fixations: Count = 6
@@ -44,5 +43,3 @@ class CalibrationConfig(Settings):
     map_model: str | None = None
     target_area: Share = 0.2
     out: Path = Path("runs/calibration")
-    cache: Path | None = None
-    workers: Workers | None = None

@@ -28,12 +28,12 @@ from semfov.head.views import Views
 from semfov.head.world import Boxes, Flat, Panorama, Places, World
 from semfov.io.storage import checksum
 from semfov.metrics.exploration import right_cells
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import SOURCES, tight
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import Record
 from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
+from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
 from semfov.runs.store import DetectionStore
 
@@ -50,7 +50,7 @@ Degrees = Annotated[float, Range(1, 170)]
 
 
 @dataclass(frozen=True)
-class HeadConfig(Settings):
+class HeadConfig(WorkConfig):
     """An eye in a head that turns, in scenes larger than its field of view: search and exploration.
 
     Args:
@@ -77,7 +77,6 @@ class HeadConfig(Settings):
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
     scene: Literal["panorama", "mosaic"] = "panorama"
     scenes: Count = 20
     targets: Whole = 3
@@ -93,9 +92,7 @@ class HeadConfig(Settings):
     unseen: Weight = UNSEEN
     seed: Seed = 0
     out: Path = Path("runs/head")
-    cache: Path | None = None
     store: bool = True
-    workers: Workers | None = None
 
 
 class HeadRun(SceneRun):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +18,10 @@ from semfov.belief.look_features import highest_score
 from semfov.errors import DataError, check
 from semfov.io.files import clean, inside, write_text
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.config import (
-    BeliefConfig,
-    Context,
-    DataConfig,
-    DetectorConfig,
-    PolicyConfig,
-    ProtocolConfig,
-    SensorConfig,
-)
+from semfov.runs.config import Context, PolicyConfig, ProtocolConfig, ScenesConfig
 from semfov.runs.results import Record
 from semfov.runs.scene_run import finish
-from semfov.runs.settings import Seed, Settings, Share, Weight, Workers
+from semfov.runs.settings import Seed, Share, Weight
 from semfov.runs.setup import plain
 from semfov.runs.tables import table
 from semfov.runs.workers import rank
@@ -39,7 +31,7 @@ SHIFTS = (1, 3, 5, 10, 30)
 
 
 @dataclass(frozen=True)
-class WordsConfig(Settings):
+class WordsConfig(ScenesConfig):
     """Search without context, with context counted from annotations, and with context from tables, each with a control.
 
     Args:
@@ -58,13 +50,10 @@ class WordsConfig(Settings):
         missed: the first look counts as missing the target if the target's highest score in it is below this.
         out: folder for tables, per-episode records and the manifest.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policy: str | PolicyConfig = "target-evidence"
     context: Context = "both"
@@ -74,8 +63,6 @@ class WordsConfig(Settings):
     permuted: Seed = 0
     missed: Share = 0.1
     out: Path = Path("runs/words")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 class WordsRun(SearchRun):
@@ -95,9 +82,8 @@ def words(config: WordsConfig) -> None:
     """Run all arms, and write and print their results and differences."""
     check(config.context != "none", "context", "place, cooccurrence or both", config.context)
     arms = arms_of(config)
-    settings = {name: getattr(config, name) for name in ("data", "detector", "sensor", "belief", "protocol")}
-    settings |= {name: getattr(config, name) for name in ("out", "cache", "workers")}
-    run = WordsRun(SearchConfig(**settings, policies=tuple(arms.values()), scanpaths=0))
+    settings = {each.name: getattr(config, each.name) for each in fields(ScenesConfig)}
+    run = WordsRun(SearchConfig(**settings, protocol=config.protocol, policies=tuple(arms.values()), scanpaths=0))
     finish(run, "searching")
     if rank() > 0:
         return

@@ -21,7 +21,7 @@ from semfov.io.storage import checksum
 from semfov.runs.results import Record
 from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.search_protocol import choose_classes
-from semfov.runs.settings import Count, Range, Workers
+from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_zoom_observation
 from semfov.runs.window_looking import SHOWN, Tile, WindowLooking, WindowLookingConfig, found_in
 from semfov.runs.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
@@ -74,7 +74,6 @@ class ZoomConfig(WindowLookingConfig):
     sought: Count = 4
     observation: str | None = None
     out: Path = Path("runs/zoom")
-    workers: Workers | None = None
 
 
 class ZoomRun(WindowLooking, SceneRun):

@@ -17,7 +17,7 @@ from semfov.gaze.policies import POLICIES, Means, NonPredictive, Task, named_pol
 from semfov.gaze.policies.tables import salient_from
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
+from semfov.runs.config import BeliefConfig, PoliciesConfig, PolicyConfig
 from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
 from semfov.runs.setup import make_context, make_map_evidence, make_observation, make_target_evidence, make_templates
 from semfov.strategy import Strategy
@@ -66,7 +66,7 @@ class Models:
     templates: ClassTemplates | None = None
 
 
-def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
+def load_models(config: PoliciesConfig, task: Task, eye: Eye) -> Models:
     """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     policies = [resolve(choice, task) for choice in config.policies]

@@ -226,7 +226,43 @@ class ProtocolConfig(Settings):
 
 
 @dataclass(frozen=True)
-class LookingConfig(Settings):
+class WorkConfig(Settings):
+    """What every run and every fit has.
+
+    Args:
+        detector: the detector.
+        out: folder of the outcomes.
+        cache: folder for what is stored, shared between runs (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    out: Path = Path("runs")
+    cache: Path | None = None
+    workers: Workers | None = None
+
+
+@dataclass(frozen=True)
+class LookingConfig(WorkConfig):
+    """Looks from every cell of a grid.
+
+    Args:
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief; its columns and rows are the cells.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    store: bool = True
+
+
+@dataclass(frozen=True)
+class ScenesConfig(LookingConfig):
     """Looks at scenes from every cell of a grid.
 
     Args:
@@ -241,18 +277,38 @@ class LookingConfig(Settings):
     """
 
     data: DataConfig = field(default_factory=DataConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
-    out: Path = Path("runs/looks")
-    cache: Path | None = None
-    store: bool = True
-    workers: Workers | None = None
 
 
 @dataclass(frozen=True)
-class RunConfig(LookingConfig):
-    """Policies that look at scenes, in the episodes of a protocol.
+class PoliciesConfig(LookingConfig):
+    """Policies that choose among the cells, in the episodes of a protocol.
+
+    Args:
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief, a grid of class distributions.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        saliency: the saliency baselines.
+        protocol: the protocol of the episodes.
+        policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
+    """
+
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
+
+    @property
+    def class_templates(self) -> str | None:
+        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
+        return None
+
+
+@dataclass(frozen=True)
+class RunConfig(PoliciesConfig, ScenesConfig):
+    """Policies that look at the scenes of a data set, in the episodes of a protocol.
 
     Args:
         data: the scenes.
@@ -273,12 +329,4 @@ class RunConfig(LookingConfig):
     """
 
     task: ClassVar[Task] = "search"
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
-    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
     models: Path | None = None
-
-    @property
-    def class_templates(self) -> str | None:
-        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
-        return None

@@ -8,7 +8,7 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.runs.config import BeliefConfig, LookingConfig
+from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.results import Record
 from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
@@ -44,10 +44,12 @@ class Looking(SceneRun):
 
     def check_sources(self) -> None:
         """Check that the files of the scenes and of the detector exist, before any of them is loaded."""
+        assert isinstance(self.config, ScenesConfig)
         check_sources(self.config.data, self.config.detector)
 
     def open_scenes(self) -> Scenes:
-        """Open the scenes; a subclass may open others."""
+        """Open the scenes of the settings; a subclass may open others."""
+        assert isinstance(self.config, ScenesConfig)
         return make_scenes(self.config.data, self.eye.detector.classes)
 
     def _key(self) -> str:
@@ -86,7 +88,7 @@ def looking_of(config: Any) -> Looking:
         The looks, none of which has been taken yet (`finish` takes them).
     """
     return Looking(
-        LookingConfig(
+        ScenesConfig(
             data=config.data,
             detector=config.detector,
             sensor=config.sensor,

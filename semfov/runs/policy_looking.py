@@ -9,7 +9,7 @@ from semfov.errors import check, lookup
 from semfov.gaze.policies import Task
 from semfov.gaze.templates import at_points
 from semfov.runs.candidates import Candidate, load_models, make_strategy
-from semfov.runs.config import RunConfig, SaliencyModel
+from semfov.runs.config import PoliciesConfig, SaliencyModel
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
@@ -33,9 +33,9 @@ class PolicyLooking(Looking):
     """
 
     task: Task
-    config: RunConfig
+    config: PoliciesConfig
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: PoliciesConfig) -> None:
         labels = [label(choice, self.task) for choice in config.policies]
         for name in labels:
             check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")

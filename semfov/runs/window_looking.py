@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -14,9 +13,9 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.errors import DataError
 from semfov.observation.matching import box_iou
-from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import cache_folder
-from semfov.runs.settings import Range, Seed, Settings, Side, Whole
+from semfov.runs.settings import Range, Seed, Side, Whole
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
@@ -33,7 +32,7 @@ Tile = Annotated[int, Range(16, 16_384)]
 
 
 @dataclass(frozen=True)
-class WindowLookingConfig(Settings):
+class WindowLookingConfig(WorkConfig):
     """Large pictures, and an eye that looks at windows of them.
 
     Args:
@@ -46,8 +45,10 @@ class WindowLookingConfig(Settings):
         cut: what to do with boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         seed: random seed of mosaics.
+        out: folder of the outcomes.
         cache: folder for the stored looks (None: the user's cache).
         store: keep looks on disk; false computes them anew (the result is the same).
+        workers: number of processes (None: one per CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -59,7 +60,6 @@ class WindowLookingConfig(Settings):
     cut: Cut = "keep"
     model: str | None = None
     seed: Seed = 0
-    cache: Path | None = None
     store: bool = True
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import BeliefConfig, DetectorConfig, PolicyConfig, ProtocolConfig, SaliencyConfig, SensorConfig
-from semfov.runs.settings import Count, Positive, Range, Settings, Workers
+from semfov.runs.config import BeliefConfig, PoliciesConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.settings import Count, Positive, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ScreenConfig(Settings):
 
 
 @dataclass(frozen=True)
-class PeopleSearchConfig(Settings):
+class PeopleSearchConfig(PoliciesConfig):
     """Comparison of people, models and policies that search for the same targets in the same pictures.
 
     Args:
@@ -56,15 +56,9 @@ class PeopleSearchConfig(Settings):
     files: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
     screen: ScreenConfig = field(default_factory=ScreenConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=lambda: BeliefConfig(columns=32, rows=24))
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=9))
     policies: tuple[str | PolicyConfig, ...] = ("non-predictive-raw", "predictive-calibrated", "target-evidence")
     bandwidth: Positive = 100.0
     bootstrap: Annotated[int, Range(2, 10_000)] = 200
     out: Path = Path("runs/human_search")
-    cache: Path | None = None
-    store: bool = True
-    workers: Workers | None = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import torch
 
 from eval.comparison.run import Run
@@ -24,10 +22,7 @@ class PeopleSearchRun(Run):
     """Searches for the targets of people, one screen after the other."""
 
     task: Task = "search"
-    config: PeopleSearchConfig  # type: ignore[assignment]
-
-    def __init__(self, config: PeopleSearchConfig) -> None:
-        super().__init__(cast(Any, config))
+    config: PeopleSearchConfig
 
     def check_sources(self) -> None:
         """Check that the detector exists; pictures are looked for after people's files have been read."""

@@ -6,16 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import (
-    BeliefConfig,
-    DetectorConfig,
-    PolicyConfig,
-    ProtocolConfig,
-    SaliencyConfig,
-    SaliencyModel,
-    SensorConfig,
-)
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole, Workers
+from semfov.runs.config import PoliciesConfig, PolicyConfig, SaliencyConfig, SaliencyModel
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole
 
 
 @dataclass(frozen=True)
@@ -51,7 +43,7 @@ class DensityConfig(Settings):
 
 
 @dataclass(frozen=True)
-class ViewingConfig(Settings):
+class ViewingConfig(PoliciesConfig):
     """Comparison of people and policies that view the same pictures without a task.
 
     Args:
@@ -81,11 +73,7 @@ class ViewingConfig(Settings):
 
     people: Path = Path("fixations.json")
     data: PicturesConfig = field(default_factory=PicturesConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
     saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture"))
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     policies: tuple[str | PolicyConfig, ...] = (
         "kl-calibrated",
@@ -104,6 +92,3 @@ class ViewingConfig(Settings):
     bandwidth: Positive = 0.08
     longest: Annotated[int, Range(2, 1000)] = 20
     out: Path = Path("runs/human_viewing")
-    cache: Path | None = None
-    store: bool = True
-    workers: Workers | None = None

@@ -7,7 +7,6 @@ import json
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -49,10 +48,10 @@ class ViewingRun(Run):
     """Free viewing, one picture after the other: computes the maps of policies along people's scanpaths."""
 
     task: Task = "exploration"
-    config: ViewingConfig  # type: ignore[assignment]
+    config: ViewingConfig
 
     def __init__(self, config: ViewingConfig) -> None:
-        super().__init__(cast(Any, config))
+        super().__init__(config)
         cells, bins = len(self.grid(0)), config.density.columns * config.density.rows
         cache, common = cache_folder(config.cache) / "viewing", self._what()
         beliefs = {name: asdict(policy) for name, policy in self.policies.items()}
