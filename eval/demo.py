@@ -48,7 +48,7 @@ from semfov.runs.settings import Range, Seed, Settings, Share, Shifts, Weight, W
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 
 Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 
@@ -200,7 +200,7 @@ def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
     name = agent.eye.detector.name
     if config.agent != "recommended" or not (GlimpseEvidence.shipped / f"{name}.safetensors").is_file():
         return None
-    zooming = ZoomAgent(ZoomEye(agent.eye.detector), GlimpseEvidence.from_pretrained(name))
+    zooming = ZoomAgent(WindowEye(agent.eye.detector), GlimpseEvidence.from_pretrained(name))
     return zooming.eval().requires_grad_(False)
 
 

@@ -1,5 +1,6 @@
 """semfov: semantic active perception with foveal sensors."""
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
@@ -17,7 +18,7 @@ from semfov.paths import Scanpath
 from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__
-from semfov.zoom import ZoomEye
+from semfov.zoom import WindowEye
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
@@ -45,7 +46,7 @@ __all__ = [
     "SemfovError",
     "TargetEvidence",
     "ZoomAgent",
-    "ZoomEye",
+    "WindowEye",
     "__version__",
     "acquisition",
     "as_image",
@@ -73,4 +74,7 @@ def __getattr__(name: str) -> Any:
         from semfov.fit.detector import fit_detector
 
         return fit_detector
+    if name == "ZoomEye":
+        warnings.warn("semfov.ZoomEye is now semfov.WindowEye", DeprecationWarning, stacklevel=2)
+        return WindowEye
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

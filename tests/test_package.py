@@ -38,7 +38,7 @@ SURFACE = {
     "SemfovError",
     "TargetEvidence",
     "ZoomAgent",
-    "ZoomEye",
+    "WindowEye",
     "__version__",
     "acquisition",
     "as_image",

@@ -17,7 +17,7 @@ from semfov.paths.endings import Ending
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import Cut, ZoomEye
+from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything, look_for
@@ -52,7 +52,7 @@ class ZoomAgent(nn.Module):
         print(path.objects.boxes, path.passes)
     """
 
-    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence) -> None:
+    def __init__(self, eye: WindowEye, evidence: GlimpseEvidence) -> None:
         super().__init__()
         kinds = len(eye.detector.classes)
         check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
@@ -67,7 +67,7 @@ class ZoomAgent(nn.Module):
         Args:
             name: name of the detector.
             finest: largest magnification, in canvas pixels per picture pixel.
-            cut: treatment of boxes that the border of a window cuts (`ZoomEye`).
+            cut: treatment of boxes that the border of a window cuts (`WindowEye`).
             **options: options of `semfov.load_detector`.
 
         Returns:
@@ -77,7 +77,7 @@ class ZoomAgent(nn.Module):
             InputError: no evidence is shipped for a detector of this name.
             DataError: the weights cannot be downloaded, or they are damaged.
         """
-        eye = ZoomEye(load_detector(name, **options), finest=finest, cut=cut)
+        eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
         return cls(eye, evidence).eval().requires_grad_(False)
 

@@ -17,7 +17,7 @@ from semfov.observation.statistics import DirichletStatistics
 from semfov.runs.samples import Samples, SampleSettings, collect
 from semfov.runs.workers import rank
 from semfov.runs.zoom_samples import MosaicSettings
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 
 
 def fit_fom(config: FitConfig) -> None:
@@ -52,7 +52,7 @@ class Looker(Protocol):
     """The source of the detections: a `Sampler`, or a run with looks from every cell."""
 
     @property
-    def eye(self) -> Eye | ZoomEye:
+    def eye(self) -> Eye | WindowEye:
         """The eye that looked."""
         ...
 

@@ -28,7 +28,7 @@ from semfov.runs.tables import table
 from semfov.runs.workers import available_cores, run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.survey import Survey
 
 DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
@@ -46,9 +46,9 @@ JUDGED = ("judged", "judged far", "judged crowded")
 _log = logging.getLogger(__name__)
 
 
-def make_eye(config: FitZoomConfig) -> ZoomEye:
+def make_eye(config: FitZoomConfig) -> WindowEye:
     """Make the eye that looks at the mosaics."""
-    return ZoomEye(make_detector(config.detector)).eval().requires_grad_(False)
+    return WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
 
 
 def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
@@ -75,7 +75,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
     }
 
 
-def make_store(config: FitZoomConfig, eye: ZoomEye) -> GlanceStore:
+def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
     """Open the store of looks at mosaics."""
     return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
@@ -100,7 +100,7 @@ def look(task: tuple[str, int]) -> tuple[str, int]:
     return task
 
 
-def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
+def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
     """Read the results of the looks at all mosaics."""
     return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store)) for n in range(len(mosaics))]
 
@@ -147,7 +147,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
 
 
 def look_at_all(
-    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> dict[str, list[ZoomExample]]:
     """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
     looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
@@ -161,7 +161,7 @@ def look_at_all(
 
 
 def fit_looks(
-    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
+    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
 ) -> GlimpseEvidence:
     """Fit the prediction of closer looks, class by class."""
     torch.manual_seed(config.seed)
@@ -190,7 +190,7 @@ def survey_again(
 
 
 def fit_decision(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> list[str]:
     """Fit the decisions of searches: the probability of presence, and the thresholds.
 

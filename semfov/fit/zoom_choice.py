@@ -11,7 +11,7 @@ from semfov.data.scene import Annotation
 from semfov.runs.window_looking import SHOWN, found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, Window, around
 from semfov.zoom.search import find_everything, look_for
 
@@ -21,7 +21,7 @@ PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 @torch.inference_mode()
 def choose_foresight(
-    model: GlimpseEvidence, eye: ZoomEye, kinds: Mapping[str, Mosaics], store: GlanceStore
+    model: GlimpseEvidence, eye: WindowEye, kinds: Mapping[str, Mosaics], store: GlanceStore
 ) -> list[list[str]]:
     """Set the `foresight` of the survey to the one with which most objects are found.
 
@@ -57,7 +57,7 @@ def choose_foresight(
 
 
 @torch.inference_mode()
-def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
+def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
     """Set `patience` to the value with which a class is found soonest.
 
     The measure is the mean number of passes until a look at a photograph that shows the class.
@@ -83,7 +83,7 @@ def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: 
     return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
 
 
-def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
+def open_all(eye: WindowEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
     """Open the stored looks of each mosaic."""
     return [StoredGlances(eye, mosaics, index, store) for index in range(len(mosaics))]
 

@@ -49,7 +49,7 @@ def zoom_data(
         picture: the picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
         pool: collects the pictures.
         name: name of the picture.
-        settings: settings of the eye (`ZoomEye.settings()`), for the name of the detector; None leaves the name out.
+        settings: settings of the eye (`WindowEye.settings()`), for the name of the detector; None leaves the name out.
         width: largest width in pixels of the whole picture on the page.
         quality: of the JPEG files.
 

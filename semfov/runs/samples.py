@@ -26,7 +26,7 @@ from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes, prepare_worker
 from semfov.runs.store import SceneStore, looks_digest
 from semfov.runs.workers import available_cores, mine, run_tasks, wait_for_others
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Sampler:
         }
         self.store = SceneStore(folder, what, looks_digest(*self.sources), schema)
 
-    def make(self) -> tuple[Eye | ZoomEye, Scenes]:
+    def make(self) -> tuple[Eye | WindowEye, Scenes]:
         """Make the eye and open the scenes."""
         eye = make_eye(self.settings.detector, self.settings.sensor)
         return eye, make_scenes(self.settings.data, eye.detector.classes)

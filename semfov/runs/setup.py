@@ -25,7 +25,7 @@ from semfov.presets import PUBLISHED_SENSORS
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -168,7 +168,7 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     return model.requires_grad_(False)
 
 
-def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationModel | None:
+def make_zoom_observation(name: str | None, eye: WindowEye) -> FovealObservationModel | None:
     """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
     own = f"{eye.detector.name}-zoom"
     if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():

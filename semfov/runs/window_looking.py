@@ -19,7 +19,7 @@ from semfov.runs.settings import Range, Seed, Side, Whole
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import Cut, ZoomEye
+from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge
@@ -82,7 +82,7 @@ class WindowLooking:
     def __init__(self, config: WindowLookingConfig) -> None:
         self.config = config
         detector = make_detector(config.detector)
-        self.eye = ZoomEye(detector, cut=config.cut).eval().requires_grad_(False)
+        self.eye = WindowEye(detector, cut=config.cut).eval().requires_grad_(False)
         self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         photographs = self.open_scenes(detector.classes)

@@ -19,7 +19,7 @@ from semfov.runs.samples import Sampler, Samples, SampleSettings
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.zoom_store import SOURCES as GLANCES
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 
 COLUMNS, ROWS, TILE = 8, 6, (480, 360)
@@ -94,10 +94,10 @@ class MosaicSampler(Sampler):
     sources = (*GLANCES, "semfov.data.mosaics", __name__)
     coordinates = 3
 
-    def make(self) -> tuple[ZoomEye, Scenes]:
+    def make(self) -> tuple[WindowEye, Scenes]:
         """Make the eye and the mosaics."""
         settings = self.settings
-        eye = ZoomEye(make_detector(settings.detector)).eval().requires_grad_(False)
+        eye = WindowEye(make_detector(settings.detector)).eval().requires_grad_(False)
         kept, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
         near, far = (
             Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed) for some in (kept, held)
@@ -116,7 +116,7 @@ class MosaicSampler(Sampler):
 
     def _look(self, index: int) -> Samples:
         scene = self.scenes[index]
-        eye = cast(ZoomEye, self.eye)
+        eye = cast(WindowEye, self.eye)
         view = eye.open(scene.image)
         windows = choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
         fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]

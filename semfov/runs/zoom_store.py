@@ -12,7 +12,7 @@ from semfov.detection.load import load_detector
 from semfov.io.schema import Field
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.store import LookStore, pack, unpack
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
@@ -26,7 +26,7 @@ class GlanceStore(LookStore[Window, Glance]):
 
     Args:
         folder: folder of the store.
-        settings: `ZoomEye.settings()`.
+        settings: `WindowEye.settings()`.
         classes: number of the detector's classes.
     """
 
@@ -82,7 +82,7 @@ class StoredGlances(Glances):
         store: store of the looks; None keeps them in memory.
     """
 
-    def __init__(self, eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
+    def __init__(self, eye: WindowEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
         self.lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
 
         def open_picture() -> Callable[[Window], Glance]:

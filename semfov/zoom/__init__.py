@@ -1,9 +1,10 @@
 """Pictures larger than the detector's input: where to look, and how close."""
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import ZoomEye, ZoomView
+from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
 
@@ -14,8 +15,8 @@ __all__ = [
     "GlimpseEvidence",
     "Lattice",
     "Objects",
-    "ZoomEye",
-    "ZoomView",
+    "WindowEye",
+    "WindowView",
     "export_look",
     "merge",
 ]
@@ -27,4 +28,8 @@ def __getattr__(name: str) -> Any:
         from semfov.zoom.export import export_look
 
         return export_look
+    if name in ("ZoomEye", "ZoomView"):
+        new = name.replace("Zoom", "Window")
+        warnings.warn(f"semfov.zoom.{name} is now semfov.zoom.{new}", DeprecationWarning, stacklevel=2)
+        return globals()[new]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -268,7 +268,7 @@ class GlimpseEvidence(Pretrained):
         """Raise `InputError` for another detector than the evidence was fitted for.
 
         Args:
-            settings: `ZoomEye.settings()`.
+            settings: `WindowEye.settings()`.
         """
         check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
 

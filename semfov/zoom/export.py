@@ -22,7 +22,7 @@ from semfov.errors import InputError, check
 from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence, pool_all
 from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
-from semfov.zoom.eye import ZoomEye
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.gist import FINEST, Gist
 from semfov.zoom.networks import STEPS
 
@@ -30,14 +30,14 @@ METADATA_KEY = "semfov.look"
 
 
 def export_look(
-    eye: ZoomEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = FINEST
+    eye: WindowEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = FINEST
 ) -> None:
     """Write a look of an eye as one ONNX model, which runs without torch and without semfov.
 
     Inputs:
 
     - `picture`: `(H, W, 3)`, bytes, RGB, of any size;
-    - `fixation`: `(3,)`, float32, `(x, y, magnification)` as for `ZoomEye.look`.
+    - `fixation`: `(3,)`, float32, `(x, y, magnification)` as for `WindowEye.look`.
 
     Outputs:
 
@@ -69,7 +69,7 @@ def export_look(
 
     Example::
 
-        eye = ZoomEye(semfov.load_detector("yolox-nano"))
+        eye = WindowEye(semfov.load_detector("yolox-nano"))
         export_look(eye, "look.onnx", GlimpseEvidence.from_pretrained("yolox-nano"))
     """
     try:
@@ -260,7 +260,7 @@ def main() -> None:
     options = parser.parse_args()
     detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
     evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
-    export_look(ZoomEye(detector).eval(), options.output, evidence, cells=options.cells)
+    export_look(WindowEye(detector).eval(), options.output, evidence, cells=options.cells)
     print(f"written: {options.output}")
 
 

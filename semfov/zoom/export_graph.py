@@ -49,7 +49,7 @@ class LookGraph(Graph):
         return [output.name for output in model.graph.output]
 
     def window(self, picture: str, fixation: str) -> tuple[str, str, str]:
-        """Resample a window to the canvas, as `ZoomEye` does.
+        """Resample a window to the canvas, as `WindowEye` does.
 
         Args:
             picture: name of the picture `(H, W, 3)`, bytes.

@@ -29,7 +29,7 @@ BORDER = 2.0
 
 
 @dataclass(frozen=True)
-class ZoomView:
+class WindowView:
     """A picture that an eye can look at. Opening it reads no pixels.
 
     Attributes:
@@ -38,7 +38,7 @@ class ZoomView:
 
     Example::
 
-        view = ZoomEye(load_detector("yolox-nano")).open("harbour.tif")
+        view = WindowEye(load_detector("yolox-nano")).open("harbour.tif")
         view.picture.size, view.lattice.levels
     """
 
@@ -63,7 +63,7 @@ class Seen:
     windows: Tensor
 
 
-class ZoomEye(nn.Module):
+class WindowEye(nn.Module):
     """Looks at windows of a picture: resamples a window to the detector's input and detects in it.
 
     A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
@@ -85,7 +85,7 @@ class ZoomEye(nn.Module):
 
     Example::
 
-        eye = ZoomEye(load_detector("yolox-nano"))
+        eye = WindowEye(load_detector("yolox-nano"))
         view = eye.open("harbour.tif")
         eye.look(view, torch.tensor([[2000.0, 1500.0, 0.5]])).boxes
     """
@@ -98,7 +98,7 @@ class ZoomEye(nn.Module):
         self.finest = finest
         self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
 
-    def open(self, picture: LargePicture | ImageLike) -> ZoomView:
+    def open(self, picture: LargePicture | ImageLike) -> WindowView:
         """Open a picture to look at it.
 
         Args:
@@ -108,9 +108,9 @@ class ZoomEye(nn.Module):
             The picture with its lattice.
         """
         source = open_large(picture)
-        return ZoomView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
+        return WindowView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
 
-    def look(self, view: ZoomView, fixations: Tensor) -> Detections:
+    def look(self, view: WindowView, fixations: Tensor) -> Detections:
         """Look at a picture and detect.
 
         Args:
@@ -124,7 +124,7 @@ class ZoomEye(nn.Module):
         return self.glance(view, fixations).detections
 
     def glance(
-        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
+        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
     ) -> Seen:
         """Look at a picture and return hints too.
 
@@ -155,7 +155,7 @@ class ZoomEye(nn.Module):
         return Seen(found, cut, tuple(placed), windows)
 
     def glimpse(
-        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
+        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Resample windows without detecting in them.
 
@@ -175,7 +175,7 @@ class ZoomEye(nn.Module):
         return _unit(canvases), torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)
 
     def _resample(
-        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
+        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None
     ) -> tuple[Tensor, list[Frame]]:
         """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames; the canvases are bytes if the padding is a byte."""
         if fixations.shape[-1] == 2:
@@ -283,7 +283,7 @@ class _Placement:
     """Maps boxes from the canvases of several looks to the picture.
 
     Args:
-        frames: frame of each look, from `ZoomEye.glimpse`.
+        frames: frame of each look, from `WindowEye.glimpse`.
         size: `(width, height)` of the picture.
         like: boxes that have the dtype and device to compute in.
     """

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.zoom.eye import Seen, ZoomEye, ZoomView
+from semfov.zoom.eye import Seen, WindowEye, WindowView
 from semfov.zoom.gist import Gist, gist
 from semfov.zoom.lattice import Lattice
 
@@ -114,10 +114,10 @@ class LiveGlances(Glances):
 
     Args:
         eye: resamples windows and detects in them.
-        view: the picture, from `ZoomEye.open`.
+        view: the picture, from `WindowEye.open`.
     """
 
-    def __init__(self, eye: ZoomEye, view: ZoomView) -> None:
+    def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:

@@ -24,7 +24,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.zoom_samples import MosaicSettings
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, Tiles
 
@@ -42,7 +42,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     fit_zoom(config)
     path = tmp_path / "out" / "bright.safetensors"
     model = GlimpseEvidence.from_pretrained(path)
-    model.check_compatible(ZoomEye(Tiles(name="bright")).settings())
+    model.check_compatible(WindowEye(Tiles(name="bright")).settings())
     assert model.metadata["training"]["steps"] == 3
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert all(map(math.isfinite, figures.values()))
@@ -83,7 +83,7 @@ def tables_of_choices(report):
 
 
 def test_examples_do_not_depend_on_the_store(tmp_path):
-    eye = ZoomEye(Tiles(name="bright"))
+    eye = WindowEye(Tiles(name="bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
     glances = StoredGlances(eye, mosaics, 0, store)
@@ -116,7 +116,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
     assert model.edges.tolist() == [0.5, 1.5, 2.5]
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
-    model.check_compatible(ZoomEye(Tiles(name="bright")).settings())
+    model.check_compatible(WindowEye(Tiles(name="bright")).settings())
     # The model was fitted on one of the two mosaics and evaluated on the other; all samples of the first are counted.
     sampler = MosaicSettings.of(config).sampler(tmp_path / "out" / "samples")
     samples = sampler.load(1)
@@ -161,7 +161,7 @@ class Squares:
 
 @pytest.mark.slow
 def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
-    eye, scenes = ZoomEye(Coloured(("red", "green", "blue"), (64, 64), fill=0.0)), Squares()
+    eye, scenes = WindowEye(Coloured(("red", "green", "blue"), (64, 64), fill=0.0)), Squares()
     opened = [StoredGlances(eye, scenes, n, None) for n in range(len(scenes))]
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)

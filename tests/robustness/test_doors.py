@@ -13,8 +13,8 @@ from semfov import (
     ActivePerception,
     MapEvidence,
     TargetEvidence,
+    WindowEye,
     ZoomAgent,
-    ZoomEye,
     as_image,
     foveate,
 )
@@ -45,7 +45,7 @@ def agent():
 def zooming():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return ZoomAgent(ZoomEye(CUP), GlimpseEvidence(2, 8)).eval()
+        return ZoomAgent(WindowEye(CUP), GlimpseEvidence(2, 8)).eval()
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from semfov.agents import ZoomAgent
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief, before_of
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.gist import Gist
@@ -18,7 +18,7 @@ from semfov.zoom.sums import WindowSums
 
 @pytest.fixture
 def glances(detector, picture):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     return LiveGlances(eye, eye.open(picture))
 
 
@@ -66,7 +66,7 @@ def test_cached_window_sums_equal_recomputed_sums():
 def test_long_pictures_are_searched(detector, evidence, size):
     """At some levels windows are higher than the picture, and cells of coarse looks reach beyond the last cell."""
     image = torch.rand(3, size[1], size[0], generator=torch.Generator().manual_seed(0)) * 0.6
-    agent = ZoomAgent(ZoomEye(detector), evidence)
+    agent = ZoomAgent(WindowEye(detector), evidence)
     path = agent.search(image, "red", passes=10, confirm=1.0, give_up=0.0)
     assert path.passes == 10
     assert path.lattice.levels > 4
@@ -309,7 +309,7 @@ def test_a_search_for_one_object_predicts_no_rates(detector, picture, evidence, 
         raise AssertionError("rates are predicted")
 
     monkeypatch.setattr(GlimpseEvidence, "rates", rates)
-    agent = ZoomAgent(ZoomEye(detector), evidence)
+    agent = ZoomAgent(WindowEye(detector), evidence)
     assert agent.search(picture, "green", passes=4, give_up=0.0).passes == 4
     with pytest.raises(AssertionError, match="rates are predicted"):
         agent.find_all(picture, "green", passes=4)

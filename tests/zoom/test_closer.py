@@ -14,7 +14,7 @@ from semfov.decision import OUTCOMES, Verifier
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError
 from semfov.io.storage import read, write
-from semfov.zoom import GlimpseEvidence, Lattice, ZoomEye
+from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
 from semfov.zoom.glances import Glance, Glances, on_lattice
 from tests.zoom.conftest import Squares
@@ -171,7 +171,7 @@ def test_improbable_places_are_examined_only_at_the_end():
 
 
 def test_a_search_looks_closely_before_it_finds(detector, picture):
-    agent = ZoomAgent(ZoomEye(detector), evidence())
+    agent = ZoomAgent(WindowEye(detector), evidence())
     plain = agent.search(picture, "red", closer=0)
     assert (plain.decision.outcome, plain.decision.place, plain.closer) == ("found", None, ())
     path = agent.search(picture, "red")
@@ -196,7 +196,7 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     """Green squares look red until a look enlarges them beyond the magnification of the last level."""
     image = torch.zeros_like(picture)
     image[1, 320:344, 640:664] = 1
-    agent = ZoomAgent(ZoomEye(Fickle().eval()), evidence(presence=0.3))
+    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     assert agent.search(image, "red", closer=0).decision.outcome == "found"
     path = agent.search(image, "red")
     assert path.decision.outcome == "absent"
@@ -206,7 +206,7 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
 
 
 def test_the_limits_of_a_search_hold(detector, picture):
-    agent = ZoomAgent(ZoomEye(detector), evidence())
+    agent = ZoomAgent(WindowEye(detector), evidence())
     assert len(agent.search(picture, "red", confirm=1.0, closer=1).closer) == 1
     for passes in (1, 2, 3):
         path = agent.search(picture, "red", passes=passes, confirm=1.0, give_up=0.0)
@@ -221,9 +221,9 @@ def test_evidence_without_verification_decides_as_before(detector, picture):
     without.load_state_dict({name: value for name, value in with_model.state_dict().items() if "verif" not in name})
     unfitted = evidence()
     unfitted.verification.thresholds = None
-    expected = ZoomAgent(ZoomEye(detector), with_model).search(picture, "red", closer=0)
+    expected = ZoomAgent(WindowEye(detector), with_model).search(picture, "red", closer=0)
     for other in (without, unfitted):
-        path = ZoomAgent(ZoomEye(detector), other).search(picture, "red")
+        path = ZoomAgent(WindowEye(detector), other).search(picture, "red")
         assert path.closer == ()
         assert path.decision.probability == expected.decision.probability
         assert [glance.window for glance in path.glances] == [glance.window for glance in expected.glances]

@@ -14,7 +14,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
 from semfov.fit.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import CASE, features
 from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import CELLS
@@ -38,7 +38,7 @@ def test_decisions_follow_the_rule(presence, looked, left, confirm, give_up):
 
 @pytest.fixture
 def eye(detector):
-    return ZoomEye(detector)
+    return WindowEye(detector)
 
 
 def turns(eye, picture, target, most=6):

@@ -12,7 +12,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.detection.selection import Selection
 from semfov.errors import InputError
 from semfov.observation.matching import box_iou
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import pool_all
 from semfov.zoom.export import METADATA_KEY, export_look
 from semfov.zoom.glances import LiveGlances, on_lattice
@@ -90,7 +90,7 @@ def compare(found, glance, pixels, score):
 )
 def test_the_exported_look_detects_the_same_as_the_eye(network, colours, tmp_path, fixation, pixels, score):
     network.selection = Selection(threshold=0.3, iou=0.4, limit=40)
-    eye = ZoomEye(network)
+    eye = WindowEye(network)
     export_look(eye, tmp_path / "look.onnx")
     found = run(tmp_path / "look.onnx", colours, fixation)
     assert set(found) == {"boxes", "scores", "cut", "window"}
@@ -103,7 +103,7 @@ def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network,
         "few": Selection(threshold=0.5, iou=0.9, limit=3),
     }.items():
         network.selection = selection
-        eye = ZoomEye(network)
+        eye = WindowEye(network)
         export_look(eye, tmp_path / "look.onnx")
         for picture in (colours[:300, :200], colours[::2, 100:]):
             found = run(tmp_path / "look.onnx", np.ascontiguousarray(picture), (90.0, 90.0, 1.0))
@@ -113,7 +113,7 @@ def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network,
 
 
 def test_a_picture_without_objects_gives_no_boxes(network, tmp_path):
-    export_look(ZoomEye(network), tmp_path / "look.onnx")
+    export_look(WindowEye(network), tmp_path / "look.onnx")
     found = run(tmp_path / "look.onnx", np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
     assert found["boxes"].shape == (0, 4)
     assert found["scores"].shape == (0, 4)
@@ -127,7 +127,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path, fi
     # With equal parameters, a mix-up of them would not be noticed.
     for parameter in evidence.parameters():
         parameter.add_(0.1 * torch.randn_like(parameter))
-    eye = ZoomEye(detector, finest=finest)
+    eye = WindowEye(detector, finest=finest)
     view = eye.open((picture * 0.9 + 0.05 * torch.rand_like(picture)).clamp(0, 1))
     lattice = view.lattice
     level = lattice.levels - 3
@@ -155,7 +155,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path, fi
 
 
 def test_the_file_records_classes_input_size_and_cells(network, tmp_path):
-    export_look(ZoomEye(network), tmp_path / "look.onnx", cells=16)
+    export_look(WindowEye(network), tmp_path / "look.onnx", cells=16)
     session = ort.InferenceSession(tmp_path / "look.onnx", providers=["CPUExecutionProvider"])
     metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
     assert metadata == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
@@ -163,7 +163,7 @@ def test_the_file_records_classes_input_size_and_cells(network, tmp_path):
 
 def test_bad_input(network, tmp_path):
     with pytest.raises(InputError, match="cells: expected a multiple of 8, got 12"):
-        export_look(ZoomEye(network), tmp_path / "look.onnx", cells=12)
+        export_look(WindowEye(network), tmp_path / "look.onnx", cells=12)
     with pytest.raises(InputError, match="evidence: expected one for 3 classes, got 5"):
-        export_look(ZoomEye(network), tmp_path / "look.onnx", GlimpseEvidence(5, 8))
+        export_look(WindowEye(network), tmp_path / "look.onnx", GlimpseEvidence(5, 8))
     assert not list(tmp_path.iterdir())

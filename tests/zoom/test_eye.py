@@ -1,19 +1,20 @@
-"""The zooming eye: what it shows, where boxes lie in the picture, what a border cuts."""
+"""The eye for windows: what it shows, where boxes lie in the picture, what a border cuts."""
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+import semfov
 from semfov.errors import InputError
 from semfov.sensor.glimpse import glimpse, windows_at
-from semfov.zoom import ZoomEye
+from semfov.zoom import WindowEye, WindowView
 from semfov.zoom.eye import BORDER
 
 
 def test_canvas_is_the_antialiased_glimpse_inside_its_border(detector):
     image = torch.rand(3, 300, 420, generator=torch.Generator().manual_seed(0))
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(image)
     fixation = torch.tensor([[199.5, 149.5, 0.64]])
     canvas, frames = eye.glimpse(view, fixation)
@@ -26,7 +27,7 @@ def test_canvas_is_the_antialiased_glimpse_inside_its_border(detector):
 
 def test_the_whole_picture_equals_a_resize_by_pillow(detector):
     pixels = np.random.default_rng(0).integers(256, size=(384, 512, 3), dtype=np.uint8)
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(pixels)
     canvas, _ = eye.glimpse(view, view.lattice.fixations(view.lattice.actions[:1]))
     expected = np.asarray(Image.fromarray(pixels).resize((128, 96), Image.Resampling.BILINEAR))
@@ -37,7 +38,7 @@ def test_the_whole_picture_equals_a_resize_by_pillow(detector):
 
 @pytest.mark.parametrize("magnification", [0.5, 1.0])
 def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     seen = eye.look(eye.open(picture), torch.tensor([[655.5, 335.5, magnification]]))
     red = seen.boxes[0][(seen.labels[0] == 1) & (seen.confidence[0] > 0.02)]
     assert len(red)
@@ -47,7 +48,7 @@ def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
 
 
 def test_a_batch_equals_its_looks_one_by_one(detector, picture):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[655.5, 335.5, 1.0], [159.5, 95.5, 0.5], [511.5, 383.5, 0.125]])
     together = eye.look(view, fixations)
@@ -61,7 +62,7 @@ def test_a_batch_equals_its_looks_one_by_one(detector, picture):
 
 def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, picture):
     fixation = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0]])  # its window ends in the red square
-    keep, drop, nothing = (ZoomEye(detector, cut=cut) for cut in ("keep", "drop", "background"))
+    keep, drop, nothing = (WindowEye(detector, cut=cut) for cut in ("keep", "drop", "background"))
     seen = keep.glance(keep.open(picture), fixation)
     assert bool(seen.cut.any())
     assert int(drop.look(drop.open(picture), fixation).count) == int(seen.detections.count) - int(seen.cut.sum())
@@ -73,12 +74,12 @@ def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, p
 def test_boxes_at_the_border_of_the_picture_do_not_count_as_cut(detector):
     image = torch.zeros(3, 256, 256)
     image[0, :32, :32] = 1
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     assert not bool(eye.glance(eye.open(image), torch.tensor([[63.5, 63.5, 1.0]])).cut.any())
 
 
 def test_the_canvas_is_filled_beyond_the_picture(detector, picture):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     canvas, frames = eye.glimpse(eye.open(picture), torch.tensor([[0.0, 0.0, 1.0]]))
     assert frames[0, :4].tolist() == [0, 0, 64, 64]
     assert float(canvas[0, :, :60, :60].abs().max()) == 0
@@ -90,7 +91,7 @@ def test_the_detector_gets_the_glimpse(detector, fill):
     detector.fill = fill
     canvases, propose = [], detector.propose
     detector.propose = lambda canvas: canvases.append(canvas) or propose(canvas)
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(torch.rand(3, 300, 420, generator=torch.Generator().manual_seed(0)))
     # Resampled, with padding, native pixels, enlarged.
     fixations = torch.tensor([[199.5, 149.5, 0.64], [0.0, 20.0, 0.5], [199.5, 149.5, 1.0], [30.0, 40.0, 2.0]])
@@ -106,7 +107,7 @@ def test_the_detector_gets_the_glimpse(detector, fill):
 
 def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
     image = torch.rand(3, 60, 90, generator=torch.Generator().manual_seed(0))
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     canvas, frames = eye.glimpse(eye.open(image), torch.tensor([[500.0, 400.0, 1.0], [-500.0, -400.0, 1.0]]))
     assert frames.tolist() == [[89, 59, 90, 60, 0, 0, 1, 1], [0, 0, 1, 1, 127, 127, 128, 128]]
     for number, (place, pixel) in enumerate((((0, 0), (59, 89)), ((127, 127), (0, 0)))):
@@ -116,7 +117,7 @@ def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
 
 
 def test_detections_of_a_batch_equal_those_of_its_looks_one_by_one(detector, picture):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[655.5, 335.5, 1.0], [640.0 - 64 + 8 - 0.5, 335.5, 1.0], [511.5, 383.5, 0.125]])
     together = eye.glance(view, fixations)
@@ -136,7 +137,7 @@ def test_detections_of_a_batch_equal_those_of_its_looks_one_by_one(detector, pic
 
 
 def test_cut_boxes_are_those_that_reach_the_border_of_the_canvas_inside_the_picture(detector, picture):
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0], [60.0, 60.0, 1.0], [511.5, 383.5, 0.125]])
     seen = eye.glance(view, fixations)
@@ -153,15 +154,24 @@ def test_cut_boxes_are_those_that_reach_the_border_of_the_canvas_inside_the_pict
 
 
 def test_settings_include_the_treatment_of_cut_boxes(detector):
-    assert ZoomEye(detector).settings() != ZoomEye(detector, cut="drop").settings()
+    assert WindowEye(detector).settings() != WindowEye(detector, cut="drop").settings()
     with pytest.raises(InputError, match="unknown treatment of cut boxes"):
-        ZoomEye(detector, cut="hide")
+        WindowEye(detector, cut="hide")
     with pytest.raises(InputError, match="finest: expected a positive"):
-        ZoomEye(detector, finest=0)
-    eye = ZoomEye(detector)
+        WindowEye(detector, finest=0)
+    eye = WindowEye(detector)
     with pytest.raises(InputError, match="fixations: expected"):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.zeros(1, 4))
     with pytest.raises(InputError, match="fixations: expected finite"):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.full((1, 3), torch.nan))
     with pytest.raises(InputError, match="fixations: expected positive magnifications"):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.tensor([[3.0, 4.0, -1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new"),
+    [(semfov, "ZoomEye", WindowEye), (semfov.zoom, "ZoomEye", WindowEye), (semfov.zoom, "ZoomView", WindowView)],
+)
+def test_former_names_of_the_eye_work_and_warn(module, old, new):
+    with pytest.warns(DeprecationWarning, match=f"{module.__name__}.{old} is now {module.__name__}.{new.__name__}"):
+        assert getattr(module, old) is new

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.detection import Candidates, Detector, Selection
 from semfov.errors import InputError
-from semfov.zoom import ZoomEye
+from semfov.zoom import WindowEye
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.hints import FAINT, hints_of
@@ -40,7 +40,7 @@ class Given(Detector):
 @pytest.mark.parametrize(("column", "row", "level"), [(0, 0, 0), (4, 3, 1), (16, 8, 1)])
 def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column, row, level):
     detector = Given(count)
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(torch.zeros(3, 384, 512))
     lattice = view.lattice
     assert column < lattice.places(level)[0]
@@ -88,7 +88,7 @@ def test_looks_of_a_batch_have_their_own_hints():
             rank = torch.arange(len(self.boxes)) / len(self.boxes)
             return Candidates(found.boxes, found.classes, found.objectness * (rank < bright))
 
-    eye = ZoomEye(Lit(400))
+    eye = WindowEye(Lit(400))
     picture = torch.linspace(0, 1, 512).expand(3, 384, 512)
     view = eye.open(picture)
     fixations = torch.tensor([[100.0, 100.0, 1.0], [300.0, 200.0, 0.7], [400.0, 300.0, 1.0]])
@@ -102,7 +102,7 @@ def test_looks_of_a_batch_have_their_own_hints():
 
 def test_a_look_without_hints_shows_its_detections():
     detector = Given(400)
-    eye = ZoomEye(detector)
+    eye = WindowEye(detector)
     view = eye.open(torch.zeros(3, 384, 512))
     last = view.lattice.levels - 1
     window = on_lattice(view.lattice, (last, 3, 3))
@@ -117,7 +117,7 @@ def test_a_look_without_hints_shows_its_detections():
 def test_hints_share_the_scores_of_detections_for_any_background():
     for policy in ("residual", "normalised", "uniform", "none"):
         detector = Given(80, policy)
-        eye = ZoomEye(detector)
+        eye = WindowEye(detector)
         seen = eye.glance(eye.open(torch.zeros(3, 128, 128)), torch.tensor([[63.5, 63.5, 1.0]]))
         hints, found = seen.hints[0], seen.detections
         same = (found.boxes[0][:, None] == hints.boxes).all(-1)

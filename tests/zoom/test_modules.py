@@ -3,7 +3,7 @@
 import torch
 
 from semfov.agents import ZoomAgent
-from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom import GlimpseEvidence, WindowEye
 from tests.base_tester import BaseTester, TensorTester
 from tests.small import Blobs, rand
 
@@ -24,11 +24,11 @@ class TestGlimpseEvidence(TensorTester):
         return module.presence(scores, summary, torch.ones(len(scores), dtype=torch.long, device=scores.device))
 
 
-class TestZoomEye(BaseTester):
+class TestWindowEye(BaseTester):
     """Pictures are bytes, as in files, and stay bytes."""
 
     def make(self):
-        return ZoomEye(Blobs())
+        return WindowEye(Blobs())
 
     def inputs(self):
         return (rand(3, 150, 200) * 255).byte(), torch.tensor([[90.0, 60.0, 1.0], [20.0, 100.0, 0.5]])
@@ -40,7 +40,7 @@ class TestZoomEye(BaseTester):
 
 class TestZoomAgent(BaseTester):
     def make(self):
-        return ZoomAgent(ZoomEye(Blobs()), GlimpseEvidence(3, 8)).eval()
+        return ZoomAgent(WindowEye(Blobs()), GlimpseEvidence(3, 8)).eval()
 
     def inputs(self):
         return ((rand(3, 300, 400) * 255).byte(),)

@@ -10,7 +10,7 @@ from semfov.agents import ZoomAgent
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 from semfov.viz.zoom import plot_zoom_path
-from semfov.zoom import GlimpseEvidence, ZoomEye, merge
+from semfov.zoom import GlimpseEvidence, WindowEye, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 from semfov.zoom.lattice import Lattice
 
@@ -18,7 +18,7 @@ from semfov.zoom.lattice import Lattice
 @pytest.fixture
 def agent(detector):
     torch.manual_seed(0)
-    return ZoomAgent(ZoomEye(detector), GlimpseEvidence(3, 8)).eval()
+    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
 
 
 def test_search_finds_a_target_in_the_picture(agent, picture):
@@ -127,7 +127,7 @@ def test_invalid_arguments_are_refused(agent, picture):
 
 def test_evidence_must_have_the_classes_of_the_detector(detector):
     with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
-        ZoomAgent(ZoomEye(detector), GlimpseEvidence(5, 8))
+        ZoomAgent(WindowEye(detector), GlimpseEvidence(5, 8))
     for wrong, message in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
         with pytest.raises(InputError, match=message):
             GlimpseEvidence(**wrong)
@@ -214,7 +214,7 @@ def test_merging_equals_a_plain_loop():
 def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     found = {}
     for cut in ("keep", "drop", "background"):
-        eye = ZoomEye(detector, cut=cut)
+        eye = WindowEye(detector, cut=cut)
         view = eye.open(picture)
         window = on_lattice(view.lattice, (view.lattice.levels - 1, 33, 15))  # its border lies in the red square
         other = on_lattice(view.lattice, (view.lattice.levels - 1, 34, 15))
