@@ -56,13 +56,7 @@ def with_models(config: Config) -> Config:
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
     config = replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
-    return config
-
-
-def verification_of(models: Path) -> str | None:
-    """The model of verification of a folder, if its agent uses one."""
-    folder = ModelFolder(models)
-    return _text(folder.file("verification")) if folder.used("verification") else None
+    return config.complete(folder)
 
 
 def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:

@@ -11,9 +11,9 @@ photograph. Detections from every cell are stored and shared with `python -m eva
 
 import json
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 
-from eval.comparison.model_folder import verification_of, with_models
+from eval.comparison.model_folder import with_models
 from eval.comparison.summary import announce, sensing
 from eval.decide.config import DecideConfig, DecisionConfig
 from eval.decide.report import probabilities, summary
@@ -30,11 +30,7 @@ from semfov.viz.style import save_figure
 def search_and_decide(config: DecideConfig) -> None:
     """Run the searches, and write their tables, records and ROC curves."""
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
-    completed = with_models(DecisionConfig(**settings))
-    if completed.models is not None and completed.verification is None:
-        # A model of verification that is given explicitly takes the place of the folder's.
-        completed = replace(completed, verification=verification_of(completed.models))
-    run = DecisionRun(completed)
+    run = DecisionRun(with_models(DecisionConfig(**settings)))
     finish(run, "deciding")
     if rank() > 0:
         return

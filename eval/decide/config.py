@@ -1,11 +1,12 @@
 """Settings of decisions."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 from eval.search.config import SearchConfig
 from semfov.decision import MOST
+from semfov.model_folder import ModelFolder
 from semfov.runs.config import PolicyConfig, ProtocolConfig, ScenesConfig
 from semfov.runs.settings import Range, Share
 
@@ -52,3 +53,9 @@ class DecisionConfig(DecideConfig, SearchConfig):
     """Searches that end in a decision. `policies` is ignored."""
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
+
+    def complete(self, folder: ModelFolder) -> Self:
+        """The settings with the folder's model of verification, if its agent uses one and none is given explicitly."""
+        if self.verification is not None or not folder.used("verification"):
+            return self
+        return replace(self, verification=str(folder.file("verification")))

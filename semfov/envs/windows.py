@@ -231,8 +231,8 @@ def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
         `(x, y, magnification)`, each from 0 to 1.
 
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
-    >>> action_of(lattice, on_lattice(lattice, (0, 0, 0))).tolist()
-    [0.5, 0.5, 0.0]
+    >>> float(action_of(lattice, on_lattice(lattice, (lattice.levels - 1, 0, 0)))[2])
+    1.0
     """
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Memory
@@ -10,6 +10,7 @@ from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.gaze.policies import Task
 from semfov.gaze.saliency.cells import Reduction
+from semfov.model_folder import ModelFolder
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers
 from semfov.sensor import SENSORS, Foveation, named_sensor
 from semfov.sensor.named import SensorName
@@ -330,3 +331,7 @@ class RunConfig(PoliciesConfig, ScenesConfig):
 
     task: ClassVar[Task] = "search"
     models: Path | None = None
+
+    def complete(self, folder: ModelFolder) -> Self:
+        """The settings with what they alone take from a folder of models."""
+        return self
