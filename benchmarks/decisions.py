@@ -30,7 +30,7 @@ from semfov import (
     saliency,
 )
 from semfov.gaze import select_fixation
-from semfov.sensor import named_sensor
+from semfov.sensor import Foveation
 
 TARGET, LOOKS, TIMES = 5, 3, 10
 KL = "KL divergence, raw"
@@ -119,7 +119,7 @@ def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) 
 
 def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
     """Programs of decisions by the saliency of a foveated view, and of the preparations for them."""
-    image, gaze, sensor = photograph(), torch.tensor(GAZE), named_sensor("published")
+    image, gaze, sensor = photograph(), torch.tensor(GAZE), Foveation(100.0, growth=1.0)
     bands, visited = sensor.pyramid(image), torch.zeros(1, len(grid), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
 

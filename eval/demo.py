@@ -45,7 +45,7 @@ from semfov.paths.stimulus import reduced
 from semfov.report import Pool, episode_data, write_page, zoom_data
 from semfov.runs.command import run_command
 from semfov.runs.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
-from semfov.sensor import SENSORS
+from semfov.sensor import SENSORS, Foveation
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -185,7 +185,10 @@ def make_agent(config: DemoConfig) -> ActivePerception:
         return own(config.models, **moved(config.detector))
     if config.agent == "recommended":
         sensor = SENSORS[config.sensor or "gradual"]
-        return ActivePerception.recommended(config.detector, sigma=sensor["sigma"], growth=sensor["growth"])
+        kind = sensor.make.__name__
+        check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
+        shape = {name: sensor.settings[name] for name in ("sigma", "growth")}
+        return ActivePerception.recommended(config.detector, **shape)
     make = ActivePerception.published if config.agent == "published" else ActivePerception.raw
     return make(config.detector, sensor=config.sensor or "published")
 

@@ -24,7 +24,8 @@ from semfov.io.files import inside
 from semfov.io.manifest import PARTS, Manifest, find_file
 from semfov.io.shipped import fit_command
 from semfov.observation.foveal import FovealObservationModel
-from semfov.sensor.foveation import Foveation
+from semfov.sensor.base import Sensor
+from semfov.sensor.named import SENSORS
 
 Model = FovealObservationModel | TargetEvidence | Verification | MapEvidence
 
@@ -148,10 +149,14 @@ class ModelFolder:
             )
         return loaded
 
-    def sensor(self) -> Foveation:
+    @property
+    def _sensor(self) -> type[Sensor]:
+        """The class of the sensor."""
+        return SENSORS[lookup(self.manifest.sensor["name"], SENSORS, "sensor")].make
+
+    def sensor(self) -> Sensor:
         """The sensor that the models were fitted for."""
-        names = "sigma", "growth", "levels", "convention"
-        return Foveation(**{name: self.manifest.sensor[name] for name in names})
+        return self._sensor.from_settings(self.manifest.sensor)
 
     def eye(self, **source: Any) -> Eye:
         """Load the eye, sensor and detector, with arguments for `load_detector`; checks the models against it."""
@@ -206,7 +211,7 @@ class ModelFolder:
         """Observer and policy for exploration."""
         learned, sensor = self._models.get("map"), self.manifest.sensor
         if isinstance(learned, MapEvidence):
-            return LearnedMap(learned), Closer(sensor["sigma"] / sensor["reference"])
+            return LearnedMap(learned), Closer(self._sensor.width(sensor) / sensor["reference"])
         return Semantic(len(self.manifest.classes) + 1), Random()
 
     def parts(self, **source: Any) -> dict[str, Any]:

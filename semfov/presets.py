@@ -22,9 +22,9 @@ from semfov.io.shipped import shipped_model
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.foveation import Foveation
-from semfov.sensor.named import named_sensor
+from semfov.sensor.named import SENSORS, named_sensor
 
-PUBLISHED_SENSORS = ("published", "published-narrow")
+PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
 

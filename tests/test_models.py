@@ -186,7 +186,8 @@ def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
 def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(detector, sensor):
     model = semfov.FovealObservationModel.from_pretrained(f"{detector}-{sensor}")
     fitted = model.metadata["sensor"]
-    assert (fitted["sigma"], fitted["growth"]) == pytest.approx((SENSORS[sensor]["sigma"], SENSORS[sensor]["growth"]))
+    named = SENSORS[sensor].settings
+    assert (fitted["sigma"], fitted["growth"]) == pytest.approx((named["sigma"], named["growth"]))
     assert model.metadata["method"] == "newton"
     assert not model.log_prior.any()
     assert float(model.tempering) == 1
@@ -197,7 +198,7 @@ def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(de
 @pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
 def test_published_agent_searches_and_explores(sensor):
     agent = semfov.ActivePerception.published("yolov3-tiny", sensor=sensor, search="non-predictive")
-    assert float(agent.eye.sensor.sigma) == pytest.approx(SENSORS[sensor]["sigma"])
+    assert float(agent.eye.sensor.sigma) == pytest.approx(SENSORS[sensor].settings["sigma"])
     assert agent.eye.sensor.growth == 1
     scene = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)[0]
     assert len(agent.search(scene.image, "person", start=0, shifts=2)) <= 3

@@ -74,7 +74,7 @@ def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
 
 def sensor_of(folder: ModelFolder) -> SensorConfig:
     """The settings of a folder's sensor."""
-    return SensorConfig(**folder.manifest.sensor)
+    return SensorConfig.of(folder.manifest.sensor)
 
 
 def recommended(folder: ModelFolder, config: RunConfig) -> Choice:

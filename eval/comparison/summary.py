@@ -24,7 +24,7 @@ from semfov.io.storage import checksum
 from semfov.metrics.averages import standard_error
 from semfov.runs.results import Record
 from semfov.runs.scene_run import gather
-from semfov.runs.setup import fovea_of, plain
+from semfov.runs.setup import growth_of, plain
 from semfov.runs.tables import percent
 from semfov.version import __version__
 
@@ -198,10 +198,9 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, obj
 
 def sensing(run: Run) -> str:
     """Detector, sensor and observation model of a run, as text for titles."""
-    sensor, model = run.config.sensor, run.config.belief.model
-    spread = fovea_of(run.eye)
-    what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"
+    sensor, model, seeing = run.config.sensor, run.config.belief.model, run.eye.sensor
+    what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"
     if run.models.observation is None:
         return what
-    own = model or recommended(run.eye.detector.name, float(spread.growth))
+    own = model or recommended(run.eye.detector.name, growth_of(run.eye))
     return f"{what}, observation model {Path(own).stem}"

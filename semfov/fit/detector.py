@@ -17,13 +17,12 @@ from semfov.fit.detector_report import class_counts, next_commands, report
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.looking import Looking, looking_of
 from semfov.runs.progress import Whole
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import detector_options, plain
 from semfov.runs.workers import available_cores, rank
-from semfov.sensor import SENSORS
 
 _log = logging.getLogger(__name__)
 
@@ -165,7 +164,7 @@ def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Mani
     Returns:
         The manifest.
     """
-    detector, sensor = run.eye.detector, config.sensor
+    detector = run.eye.detector
     options = plain(detector_options(config.detector))
     weights = options.pop("weights", None)
     is_file = Path(config.detector.name).is_file()
@@ -179,7 +178,7 @@ def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Mani
             "weights_file": None if weights is None else place_of(weights, config.out),
             "options": options,
         },
-        sensor={**asdict(sensor), **SENSORS[sensor.name], **given_of(sensor)},
+        sensor=config.sensor.record(),
         grid=(config.columns, config.rows),
         parts={name: fitted.part for name, fitted in shop.parts.items()},
         training={
@@ -189,9 +188,3 @@ def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Mani
             "settings": {name: getattr(config, name) for name in SETTINGS},
         },
     )
-
-
-def given_of(sensor: SensorConfig) -> dict[str, float]:
-    """Return the sensor settings that were given explicitly instead of by the sensor's name."""
-    given = {"sigma": sensor.sigma, "growth": sensor.growth}
-    return {name: value for name, value in given.items() if value is not None}

@@ -57,13 +57,11 @@ _SCHEMA = Schema(
         "sensor": Object(
             {
                 "name": Text(),
-                "sigma": Number(above=0),
-                "growth": Number(above=0),
-                "levels": Number(1, 30),
-                "convention": Text(("kornia", "opencv")),
                 "reference": Number(above=0),
             },
-            required=("name", "sigma", "growth", "levels", "convention", "reference"),
+            # The others depend on the sensor, which checks them when it is made.
+            others=Anything(),
+            required=("name", "reference"),
         ),
         "grid": Array(Number(1, 200), 2),
         "parts": Object(dict.fromkeys(PARTS, _PART)),
@@ -100,7 +98,7 @@ class Manifest:
         detector: `name`, `sha256` of its weights, the `options` of `semfov.load_detector`, and the model to load:
             either `model`, a name, or `model_file` and `weights_file`, each as a path relative to the folder and as an
             absolute path.
-        sensor: settings of the foveal sensor.
+        sensor: `name` of the sensor, its settings, and their `reference`.
         grid: `(columns, rows)` of the belief.
         parts: the parts by name; the names are among `PARTS`.
         training: JSON values that describe the data and settings of the fits.

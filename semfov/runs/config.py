@@ -1,18 +1,20 @@
 """Settings of the evaluation: dataclasses that are filled in from the command line and from YAML files."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Memory
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
+from semfov.errors import lookup
 from semfov.gaze.policies import Task
 from semfov.gaze.saliency.cells import Reduction
 from semfov.model_folder import ModelFolder
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers
-from semfov.sensor import SENSORS, Foveation, named_sensor
+from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
@@ -85,8 +87,8 @@ class SensorConfig(Settings):
     """The foveal sensor.
 
     Args:
-        name: `published` (the paper's wide fovea), `published-narrow` (the paper's narrow fovea), or `gradual` (the
-            agent's fovea); see `semfov.sensor.SENSORS`.
+        name: `published` (the paper's wide fovea), `published-narrow` (the paper's narrow fovea), `gradual` (the
+            agent's fovea), or another of `semfov.sensor.SENSORS`.
         sigma: width of the fovea in pixels of an image whose longer side is `reference` (None: that of the named
             sensor).
         growth: factor by which the window of each coarser band is wider than that of the next finer band (None: that of
@@ -94,6 +96,7 @@ class SensorConfig(Settings):
         levels: number of bands of the Laplacian pyramid.
         convention: whether the pyramid is computed as `kornia` or as `opencv` does it.
         reference: longer side, in pixels, of the images for which sigma is given.
+        settings: changed settings by name, of a sensor that has others than these (None: those of the named sensor).
     """
 
     name: SensorName = "gradual"
@@ -102,17 +105,39 @@ class SensorConfig(Settings):
     levels: Annotated[int, Range(1, 30)] = 5
     convention: Literal["kornia", "opencv"] = "kornia"
     reference: Positive = 640.0
+    settings: dict[str, float] | None = None
 
-    def make(self) -> Foveation:
+    @property
+    def kind(self) -> type[Sensor]:
+        """Class of the sensor."""
+        return SENSORS[lookup(self.name, SENSORS, "sensor")].make
+
+    def whole(self) -> dict[str, Any]:
+        """List all settings of the sensor: those of its name, changed by those that are given."""
+        own = [each for each in fields(self) if each.name not in ("name", "reference", "settings")]
+        changes = {each.name: getattr(self, each.name) for each in own if getattr(self, each.name) != each.default}
+        named = SENSORS[lookup(self.name, SENSORS, "sensor")]
+        return named.changed({**changes, **(self.settings or {})})
+
+    def make(self) -> Sensor:
         """Build the sensor."""
-        given = {"sigma": self.sigma, "growth": self.growth}
-        changes = {name: value for name, value in given.items() if value is not None}
-        return named_sensor(self.name, levels=self.levels, convention=self.convention, **changes)
+        return self.kind.from_settings(self.whole())
 
     @property
     def fovea(self) -> float:
         """Width of the fovea as a fraction of the image's longer side."""
-        return (SENSORS[self.name]["sigma"] if self.sigma is None else self.sigma) / self.reference
+        return self.kind.width(self.whole()) / self.reference
+
+    def record(self) -> dict[str, Any]:
+        """List the name, all settings and the reference, as a model folder keeps them."""
+        return {"name": self.name, **self.whole(), "reference": self.reference}
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> Self:
+        """Make the settings from what `record` lists."""
+        own = {each.name for each in fields(cls)} - {"settings"}
+        others = {name: value for name, value in record.items() if name not in own}
+        return cls(**{name: record[name] for name in own & record.keys()}, settings=others or None)
 
 
 @dataclass(frozen=True)

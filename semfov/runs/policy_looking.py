@@ -15,7 +15,6 @@ from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 from semfov.runs.scene_run import cache_folder
-from semfov.runs.setup import fovea_of
 
 
 class PolicyLooking(Looking):
@@ -87,8 +86,8 @@ class PolicyLooking(Looking):
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
             image = self.scenes[index].image
-            sensor, reference = fovea_of(self.eye), self.config.sensor.reference
-            saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
+            reference = self.config.sensor.reference
+            saliency = saliency_table(name, self.config.saliency, self.eye.sensor, reference, image, self.grid(index))
             if self.config.store:
                 store.save(digest, saliency)
         return saliency

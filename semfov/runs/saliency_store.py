@@ -16,7 +16,7 @@ from semfov.io.schema import Field, Schema
 from semfov.runs.config import SaliencyConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.store import SceneStore, looks_digest
-from semfov.sensor import Bands, Foveation
+from semfov.sensor import Sensor
 
 Model = Callable[[Tensor], Tensor]
 
@@ -63,18 +63,18 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_table(
-    name: str, saliency: SaliencyConfig, sensor: Foveation, reference: float, image: Tensor, grid: Grid
+    name: str, saliency: SaliencyConfig, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
     """Saliency of every cell of a photograph.
 
-    It does not depend on a detector: the photograph is resized so that its longer side is `reference`, the size for
-    which the sensor's σ is given.
+    It does not depend on a detector: the photograph is resized so that its longer side is `reference`, the size that
+    the sensor's settings are for.
 
     Args:
         name: name of the saliency model.
         saliency: settings of the saliency baselines.
-        sensor: the foveal sensor.
-        reference: longer side in pixels of the images for which the sensor's σ is given.
+        sensor: the sensor.
+        reference: longer side in pixels of the images that the sensor's settings are for.
         image: `(3, H, W)`.
         grid: the grid over the image.
 
@@ -85,17 +85,17 @@ def saliency_table(
     with one_thread(), torch.inference_mode():
         if saliency.view == "picture":
             return cells_of(model, image[None], grid, saliency)
-        bands, fixations = seen_by(sensor, reference, image, grid.centres)
+        state, fixations = seen_by(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
-        return torch.cat([cells_of(model, sensor(bands, fixation), grid, saliency) for fixation in fixations])
+        return torch.cat([cells_of(model, sensor.look(state, point[None]), grid, saliency) for point in fixations])
 
 
-def seen_by(sensor: Foveation, reference: float, image: Tensor, points: Tensor) -> tuple[Bands, Tensor]:
-    """Pyramid of a photograph `(3, H, W)` resized to a longer side of `reference`, and its `points` `(F, 2)` there."""
+def seen_by(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
+    """Open a photograph `(3, H, W)`, resized to a longer side of `reference`, and move `points` `(F, 2)` there."""
     scale = reference / max(image.shape[-2:])
     size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
     ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
-    return sensor.pyramid(resize(image[None], size)), (points + 0.5) * ratio - 0.5
+    return sensor.open(resize(image[None], size), ratio.new_ones(2)), (points + 0.5) * ratio - 0.5
 
 
 def cells_of(model: Model, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:

@@ -150,20 +150,22 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
-def fovea_of(eye: Eye) -> Foveation:
-    """The foveal sensor of an eye; fitted models exist only for eyes with a foveal sensor."""
+def growth_of(eye: Eye) -> float:
+    """The growth of an eye's fovea, by which shipped models are chosen; they exist only for a `Foveation`."""
     sensor = eye.sensor
     if not isinstance(sensor, Foveation):
         raise InputError(
-            f"sensor: expected a Foveation, since models are fitted for foveal sensors, got {type(sensor).__name__}"
+            f"sensor: expected a Foveation, since models are shipped for no other sensor, got {type(sensor).__name__}; "
+            "fit models for it (python -m train.fit_detector), or choose policies that need none"
         )
-    return sensor
+    return float(sensor.growth)
 
 
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
-    own = recommended(eye.detector.name, float(fovea_of(eye).growth))
-    model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
+    if name is None:
+        name = shipped_model(FovealObservationModel, recommended(eye.detector.name, growth_of(eye)), "MODEL")
+    model = FovealObservationModel.from_pretrained(name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
@@ -187,16 +189,19 @@ def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | Non
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
     """Load learned target evidence by name, or the one shipped for the eye; check that it fits the eye."""
-    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
-    model = TargetEvidence.from_pretrained(name or shipped_model(TargetEvidence, own, "MODEL"))
+    if name is None:
+        name = shipped_model(TargetEvidence, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
+    model = TargetEvidence.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 
 
 def make_verification(name: str | None, eye: Eye) -> Verification | None:
     """Load a model of verification by name, or the one shipped for the eye, if there is one; check that it fits."""
-    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
-    model = Verification.if_shipped(own) if name is None else Verification.from_pretrained(name)
+    if name is not None:
+        model: Verification | None = Verification.from_pretrained(name)
+    else:
+        model = Verification.if_shipped(learned_for(eye.detector.name, growth_of(eye)))
     if model is None:
         return None
     model.check_compatible(eye.settings())
@@ -205,8 +210,9 @@ def make_verification(name: str | None, eye: Eye) -> Verification | None:
 
 def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
     """Load a learned map by name, or the one shipped for the eye; check that it fits the eye."""
-    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
-    model = MapEvidence.from_pretrained(name or shipped_model(MapEvidence, own, "MODEL"))
+    if name is None:
+        name = shipped_model(MapEvidence, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
+    model = MapEvidence.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 

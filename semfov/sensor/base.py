@@ -1,12 +1,13 @@
 """The interface of the sensors of an eye."""
 
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import check, check_finite, values_known
+from semfov.errors import InputError, check, check_finite, values_known
 
 
 class Sensor(nn.Module, ABC):
@@ -15,6 +16,13 @@ class Sensor(nn.Module, ABC):
     A canvas is an image that was resized and padded to the detector's input. `open` does the work that does not depend
     on the fixation, once for each image. `look` computes the views for many fixations. Where a sensor moves pixels, as
     a magnifying glass does, `boxes_to_canvas` maps the boxes that the detector found in a view back to the canvas.
+
+    A sensor that commands can select by name (`semfov.sensor.SENSORS`) also has a `kind` and the `names` of its
+    settings, from which it can be made again. If its acuity falls off from a fovea, it tells the `width` of that.
+
+    Attributes:
+        kind: kind of sensor, which `settings` lists as `kind` (of all but `Foveation`).
+        names: names of the settings, each of them an argument of the class.
 
     >>> class Half(Sensor):
     ...     def open(self, canvas, scale):
@@ -30,6 +38,9 @@ class Sensor(nn.Module, ABC):
     >>> sensor.look(state, torch.tensor([[2.0, 3.0], [5.0, 6.0]])).shape
     torch.Size([2, 3, 8, 8])
     """
+
+    kind: ClassVar[str] = "sensor"
+    names: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,6 +97,51 @@ class Sensor(nn.Module, ABC):
         Returns:
             JSON values by name.
         """
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> Self:
+        """Make the sensor from its settings.
+
+        Args:
+            settings: the settings by name; others than `names` are ignored.
+
+        Returns:
+            The sensor.
+
+        Raises:
+            InputError: a setting is missing, or out of its range.
+        """
+        for name in cls.names:
+            check(name in settings, f"sensor.{name}", f"a setting of a {cls.__name__}", "none")
+        return cls(**{name: settings[name] for name in cls.names})
+
+    @classmethod
+    def width(cls, settings: Mapping[str, Any]) -> float:
+        """Tell the width of the fovea, in pixels of the image that the settings are for.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            The width.
+
+        Raises:
+            InputError: the sensor has no fovea.
+        """
+        raise InputError(f"sensor: expected a sensor with a fovea, got {cls.__name__}, which has none")
+
+    @classmethod
+    def describe(cls, settings: Mapping[str, Any]) -> str:
+        """Describe the settings in words, for titles.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            The numbers among them with their names.
+        """
+        told = {name: each for name, each in settings.items() if isinstance(each, int | float)}
+        return ", ".join(f"{name} {value:g}" for name, value in told.items())
 
 
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:

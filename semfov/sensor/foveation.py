@@ -1,5 +1,6 @@
 """The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -114,6 +115,9 @@ class Foveation(Sensor):
     >>> views = [sensor(bands, torch.tensor([x, 32.0])) for x in (16.0, 48.0)]
     """
 
+    kind = "foveation"
+    names = ("sigma", "levels", "growth", "convention")
+
     def __init__(
         self,
         sigma: float,
@@ -167,6 +171,16 @@ class Foveation(Sensor):
             "growth": float(self.growth),
             "convention": self.convention,
         }
+
+    @classmethod
+    def width(cls, settings: Mapping[str, Any]) -> float:
+        """Tell the width of the fovea, σ."""
+        return float(settings["sigma"])
+
+    @classmethod
+    def describe(cls, settings: Mapping[str, Any]) -> str:
+        """Describe width and growth of the fovea."""
+        return f"σ {settings['sigma']:g} px, growth {settings['growth']:g}"
 
     def forward(self, image: ImageLike | Bands, gaze: PointLike) -> Tensor:
         """Foveate images around fixations.

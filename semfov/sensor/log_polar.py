@@ -1,5 +1,6 @@
 """The log-polar sensor: cortical images, whose receptors lie further apart with eccentricity, and their projections."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, exp, hypot, inf, log1p, log2, pi, sqrt
 from typing import Any
@@ -177,6 +178,9 @@ class LogPolar(Sensor):
     torch.Size([2, 3, 64, 64])
     """
 
+    kind = "log-polar"
+    names = ("fovea", "spacing", "pooling")
+
     def __init__(self, fovea: float, spacing: float = 1.0, pooling: float = 1.0) -> None:
         super().__init__()
         self.retina = Retina(fovea, spacing, pooling)
@@ -247,7 +251,12 @@ class LogPolar(Sensor):
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
         own = self.retina
-        return {"kind": "log-polar", "fovea": own.fovea, "spacing": own.spacing, "pooling": own.pooling}
+        return {"kind": self.kind, "fovea": own.fovea, "spacing": own.spacing, "pooling": own.pooling}
+
+    @classmethod
+    def width(cls, settings: Mapping[str, Any]) -> float:
+        """Tell the eccentricity at which acuity is half the acuity at the fixation."""
+        return float(settings["fovea"])
 
     def extra_repr(self) -> str:
         """Write the settings, for `repr`.

@@ -1,47 +1,93 @@
-"""Foveal sensors by name: the published ones, and the one of the recommended agent."""
+"""Sensors by name, which commands and model folders can select."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from semfov.errors import InputError, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.log_polar import LogPolar
 
-SensorName = Literal["published", "published-narrow", "gradual"]
+SensorName = Literal["published", "published-narrow", "gradual", "log-polar"]
 
-SENSORS: dict[SensorName, dict[str, float]] = {
-    "published": {"sigma": 100.0, "growth": 1.0},
-    "published-narrow": {"sigma": 50.0, "growth": 1.0},
-    "gradual": {"sigma": 100.0, "growth": 2.0},
+
+@dataclass(frozen=True)
+class NamedSensor:
+    """How a named sensor is made.
+
+    Attributes:
+        make: class of the sensor.
+        settings: all settings of the class.
+        published: whether the sensor is one of the paper's, for which observation models that are fitted by maximum
+            likelihood are shipped.
+
+    >>> SENSORS["log-polar"].make.__name__, SENSORS["log-polar"].changed({"fovea": 40.0})
+    ('LogPolar', {'fovea': 40.0, 'spacing': 1.0, 'pooling': 1.0})
+    """
+
+    make: type[Sensor]
+    settings: Mapping[str, Any]
+    published: bool = False
+
+    def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """List the settings with some of them replaced.
+
+        Args:
+            changes: new values by name.
+
+        Returns:
+            All settings.
+
+        Raises:
+            InputError: the sensor has no setting of such a name.
+        """
+        for name in changes:
+            known = ", ".join(self.make.names)
+            check(name in self.make.names, "sensor", f"settings of a {self.make.__name__} ({known})", name)
+        return {**self.settings, **changes}
+
+
+def _foveation(sigma: float, growth: float, *, published: bool = False) -> NamedSensor:
+    settings = {"sigma": sigma, "growth": growth, "levels": 5, "convention": "kornia"}
+    return NamedSensor(Foveation, settings, published)
+
+
+SENSORS: dict[SensorName, NamedSensor] = {
+    "published": _foveation(100.0, 1.0, published=True),
+    "published-narrow": _foveation(50.0, 1.0, published=True),
+    "gradual": _foveation(100.0, 2.0),
+    "log-polar": NamedSensor(LogPolar, {"fovea": 60.0, "spacing": 1.0, "pooling": 1.0}),
 }
-"""Settings of the named sensors; σ is in pixels of an image whose longer side is 640.
+"""The named sensors; lengths are in pixels of an image whose longer side is 640.
 
 - `published`: the wide fovea of Luzio, Bernardino and Moreno (2024). They print neither σ nor growth nor levels. The
   width is our choice. Growth 1, one window for all bands, follows the code of the foveal system that they cite.
 - `published-narrow`: their narrow fovea, half as wide.
 - `gradual`: the window of each coarser band is twice as wide, so that acuity falls off slowly. The recommended agent
   has this sensor.
+- `log-polar`: receptors on rings, further apart with eccentricity. No models are shipped for it.
 """
 
 
-def named_sensor(name: str, **settings: Any) -> Foveation:
-    """Make a foveal sensor by its name.
+def named_sensor(name: str, **settings: Any) -> Sensor:
+    """Make a sensor by its name.
 
     Args:
         name: a name in `SENSORS`.
-        settings: further settings of `Foveation`; they replace the settings of the name.
+        settings: further settings of the sensor's class; they replace the settings of the name.
 
     Returns:
         The sensor.
 
     Raises:
-        InputError: no sensor has this name (the message suggests the nearest names).
+        InputError: no sensor has this name (the message suggests the nearest names), or it has no such setting.
 
     >>> named_sensor("published-narrow", convention="opencv")
     Foveation(sigma=50, levels=5, growth=1, convention='opencv')
     """
-    return Foveation(**{**SENSORS[lookup(name, SENSORS, "sensor")], **settings})
+    named = SENSORS[lookup(name, SENSORS, "sensor")]
+    return named.make.from_settings(named.changed(settings))
 
 
 def sensor_of(settings: Mapping[str, Any]) -> Sensor:
@@ -59,9 +105,9 @@ def sensor_of(settings: Mapping[str, Any]) -> Sensor:
     >>> sensor_of(Foveation(20.0, growth=1.0).settings())
     Foveation(sigma=20, levels=5, growth=1, convention='kornia')
     """
-    if settings.get("kind") == "log-polar":
-        return LogPolar(settings["fovea"], settings["spacing"], settings["pooling"])
-    names = "sigma", "levels", "growth", "convention"
-    if not all(name in settings for name in names):
-        raise InputError(f"sensor: expected the settings of a Foveation or a LogPolar, got {dict(settings)}")
-    return Foveation(**{name: settings[name] for name in names})
+    kinds = dict.fromkeys(named.make for named in SENSORS.values())
+    for kind in kinds:
+        if settings.get("kind", Foveation.kind) == kind.kind and all(name in settings for name in kind.names):
+            return kind.from_settings(settings)
+    expected = " or a ".join(kind.__name__ for kind in kinds)
+    raise InputError(f"sensor: expected the settings of a {expected}, got {dict(settings)}")

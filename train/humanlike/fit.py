@@ -25,7 +25,7 @@ from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import saliency_table
 from semfov.runs.scene_run import cache_folder
 from semfov.runs.settings import Count, Name, Positive, Settings
-from semfov.runs.setup import fovea_of, make_eye, prepare_worker
+from semfov.runs.setup import make_eye, prepare_worker
 from semfov.runs.store import cell_store
 from train.humanlike.habits import Halves, fit_terms, habits_of
 from train.humanlike.report import report
@@ -175,7 +175,7 @@ class Viewer:
         strategy = self.strategies[name]
         if policy.saliency is None:
             return Candidate(strategy)
-        maps = saliency_table(policy.saliency, saliency, fovea_of(self.eye), self.config.sensor.reference, image, grid)
+        maps = saliency_table(policy.saliency, saliency, self.eye.sensor, self.config.sensor.reference, image, grid)
         if strategy.policy.table == "saliency":
             return Candidate(strategy, maps)
         return Candidate(strategy, saliency=maps, weight=saliency.weight)

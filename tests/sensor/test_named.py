@@ -1,0 +1,152 @@
+"""Sensors by name: whatever is registered can be selected by commands, and fitted models know it."""
+
+import json
+import re
+from typing import get_args
+
+import pytest
+import torch
+
+from eval.search import main as search
+from semfov import ActivePerception, FovealObservationModel, Scanpath
+from semfov.errors import InputError
+from semfov.model_folder import ModelFolder
+from semfov.runs.command import run_command
+from semfov.runs.config import SensorConfig
+from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
+from semfov.sensor.named import SensorName
+from tests.colours import write_network, write_photographs
+from train.fit_detector import main as fit_detector
+from train.fit_fom import main as fit_fom
+
+
+class Dimmed(Sensor):
+    """A sensor of a further kind, which dims the picture."""
+
+    kind = "dimmed"
+    names = ("share",)
+
+    def __init__(self, share):
+        super().__init__()
+        self.share = share
+
+    def open(self, canvas, scale):
+        return canvas
+
+    def look(self, state, gaze):
+        return self.share * state.expand(len(gaze), -1, -1, -1)
+
+    def settings(self):
+        return {"kind": self.kind, "share": self.share}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_named_sensor_is_made_again_from_its_settings(name):
+    config, sensor = SensorConfig(name), named_sensor(name)
+    assert type(sensor) is config.kind is type(sensor_of(sensor.settings()))
+    assert sensor_of(sensor.settings()).settings() == config.make().settings() == sensor.settings()
+    assert SensorConfig.of(json.loads(json.dumps(config.record()))).make().settings() == sensor.settings()
+    assert config.fovea == config.kind.width(SENSORS[name].settings) / 640
+    assert config.kind.describe(sensor.settings())
+
+
+def test_every_name_can_be_given_in_settings():
+    assert get_args(SensorName) == tuple(SENSORS)
+
+
+def test_settings_of_a_sensor_are_given_by_their_names(capsys):
+    made = []
+    arguments = ["--name", "log-polar", "--settings.fovea", "40", "--settings.pooling", "2"]
+    assert run_command(lambda config: made.append(config), SensorConfig, "Sensors.", arguments) == 0
+    (config,) = made
+    assert config.make().settings() == {"kind": "log-polar", "fovea": 40.0, "spacing": 1.0, "pooling": 2.0}
+    assert config.fovea == 40 / 640
+    assert SensorConfig.of(config.record()) == SensorConfig("log-polar", settings=config.whole())
+    for given, name in (({"sigma": 50.0}, "sigma"), ({"levels": 3}, "levels"), ({"settings": {"width": 1.0}}, "width")):
+        with pytest.raises(InputError, match=rf"settings of a LogPolar \(fovea, spacing, pooling\), got {name}"):
+            SensorConfig("log-polar", **given).make()
+    with pytest.raises(InputError, match="fovea: expected a positive number"):
+        SensorConfig("log-polar", settings={"fovea": -1.0}).make()
+    with pytest.raises(InputError, match=r"sensor.fovea: expected a setting of a LogPolar, got none"):
+        LogPolar.from_settings({})
+
+
+def test_a_further_sensor_needs_one_registration(monkeypatch):
+    monkeypatch.setitem(SENSORS, "dimmed", NamedSensor(Dimmed, {"share": 0.5}))
+    config = SensorConfig("dimmed", settings={"share": 0.25})
+    assert sensor_of(config.make().settings()).share == 0.25
+    assert Dimmed.describe(config.make().settings()) == "share 0.25"
+    with pytest.raises(InputError, match="a sensor with a fovea, got Dimmed, which has none"):
+        config.fovea  # noqa: B018
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=r"the settings of a Foveation or a LogPolar, got \{'kind': 'dimmed'"):
+        sensor_of({"kind": "dimmed", "share": 0.5})
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A folder with a network and photographs of coloured squares."""
+    folder = tmp_path_factory.mktemp("log_polar")
+    write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs", 8)
+    return folder
+
+
+def given(home, out, *more):
+    photographs = home / "photographs"
+    return [
+        "--data.root", str(photographs), "--data.annotations", str(photographs / "instances.json"),
+        "--sensor.name", "log-polar", "--out", str(home / out), "--cache", str(home / "cache"), "--workers", "1", *more,
+    ]  # fmt: skip
+
+
+def searching(home, out, policies, *more):
+    few = ["--data.min_instances", "0", "--data.limit", "2", "--belief.columns", "3", "--belief.rows", "2"]
+    few += ["--protocol.starts", "1", "--protocol.shifts", "2", "--scanpaths", "1"]
+    network = ["--detector.name", str(home / "colours.onnx")]
+    return given(home, out, *network, *few, "--policies", json.dumps(policies), *more)
+
+
+def test_searches_run_with_policies_that_need_no_fitted_model(home, capsys):
+    assert search(searching(home, "search", ["random", "non-predictive-raw", "vocus2"])) == 0
+    assert "colours, log-polar fovea (fovea 60, spacing 1, pooling 1)" in capsys.readouterr().out
+    manifest = json.loads((home / "search/manifest.json").read_text())
+    assert manifest["eye"]["sensor"]["kind"] == "log-polar"
+
+
+@pytest.mark.parametrize("policy", ["recommended", "predictive-calibrated"])
+def test_policies_that_need_a_model_say_that_none_is_shipped(home, policy, capsys):
+    assert search(searching(home, "refused", [policy])) == 1
+    error = capsys.readouterr().err
+    assert re.match(r"error: sensor: expected a Foveation, since models are shipped for no other sensor, got L", error)
+    assert "train.fit_detector" in error
+
+
+def test_an_observation_model_is_fitted_and_used(home):
+    network = ["--detector.name", str(home / "colours.onnx")]
+    assert fit_fom(given(home, "fom", *network, "--fixations", "3", "--levels", "3", "--holdout", "4")) == 0
+    model = FovealObservationModel.from_pretrained(home / "fom/colours.safetensors")
+    assert model.metadata["sensor"]["kind"] == "log-polar"
+    assert model.edges.tolist() == pytest.approx([0.5 * 60 / 640, 60 / 640])
+    chosen = "--belief.model", str(home / "fom/colours.safetensors")
+    assert search(searching(home, "calibrated", ["predictive-calibrated"], *chosen)) == 0
+
+
+def test_a_folder_of_models_keeps_its_sensor(home, tmp_path):
+    small = ["--columns", "3", "--rows", "2", "--holdout", "2", "--steps", "4", "--map_steps", "5", "--fixations", "3"]
+    arguments = given(home, "models", *small, "--judged", "2", "--sensor.settings.fovea", "80")
+    assert fit_detector([str(home / "colours.onnx"), *arguments]) == 0
+    folder = ModelFolder(home / "models")
+    assert folder.manifest.sensor == {"name": "log-polar", "fovea": 80, "spacing": 1, "pooling": 1, "reference": 640}
+    agent = ActivePerception.from_pretrained(home / "models")
+    assert isinstance(agent.eye.sensor, LogPolar)
+    image = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
+    path = agent.search(image, "red", start=0, shifts=2)
+    path.save(tmp_path / "path.safetensors")
+    kept = Scanpath.load(tmp_path / "path.safetensors")
+    seen, again = path.stimulus.views(path.fixations), kept.stimulus.views(kept.fixations)
+    assert all(torch.equal(a, b) for a, b in zip(seen, again, strict=True))
+    data = given(home, "again", "--data.min_instances", "0", "--data.limit", "2", "--models", str(home / "models"))
+    assert search([*data, "--protocol.shifts", "2", "--policies", '["recommended", "random"]']) == 0
+    assert json.loads((home / "again/manifest.json").read_text())["eye"]["sensor"]["fovea"] == 80
