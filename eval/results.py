@@ -1,12 +1,12 @@
-"""Regenerate docs/results.md: `python -m eval.results` runs its experiments and fills in the page.
+"""Regenerate docs/results.md and docs/tables.md: `python -m eval.results` runs the experiments and fills in both.
 
     python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
         --fit_root fit --fit_annotations instances_fit.json
 
 Results are measured on the photographs listed in configs/results_photographs.txt; settings are chosen on the
-photographs of the fit set. The text of the page is docs/results.template.md, in which a line `@@ table` or
-`@@ experiment table` stands for a table. Detections are computed once and shared by all experiments. To continue a
-stopped run, give the same command again.
+photographs of the fit set. The text of the findings is docs/results.template.md, and that of all other tables
+docs/tables.template.md; a line `@@ table` or `@@ experiment table` stands for a table. Detections are computed once and
+shared by all experiments. To continue a stopped run, give the same command again.
 """
 
 import sys
@@ -30,7 +30,6 @@ from eval.page.tables import (
     Runs,
     agreement,
     beside_paper,
-    decisions,
     finished,
     first_fixations,
     paired,
@@ -51,19 +50,26 @@ NOT_RUN = ["*Not run yet.*"]
 
 
 def results(config: ResultsConfig) -> None:
-    """Run the experiments and write the page."""
+    """Run the experiments and write the pages."""
     runs = experiments(config)
     chosen = list(runs) if config.only is None else [lookup(name, runs, "experiment") for name in config.only]
     for name in chosen:
         print(f"\n== {name}")
         HANDLERS[type(runs[name])](runs[name])
-    try:
-        template = config.template.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"template: {config.template} cannot be read ({error.strerror}); check the path") from None
-    write_text(config.page, fill(template, runs))
-    for path in [config.page, *draw_figures(config.pictures, runs)]:
+    pages = {config.page: config.template, config.tables: config.tables_template}
+    texts = {page: read_template(template) for page, template in pages.items()}
+    for page, template in texts.items():
+        write_text(page, fill(template, runs))
+    for path in [*pages, *draw_figures(config.pictures, runs)]:
         print(f"written: {path}")
+
+
+def read_template(path: Path) -> str:
+    """The text of a page, with lines that stand for tables."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"template: {path} cannot be read ({error.strerror}); check the path") from None
 
 
 def fill(template: str, runs: Runs) -> str:
@@ -75,7 +81,7 @@ def fill(template: str, runs: Runs) -> str:
 
 
 def fill_line(line: str, runs: Runs) -> list[str]:
-    """The table that a line names: a table of the whole page, of a study, or of one experiment."""
+    """The table that a line names: a table of several experiments, of a study, or of one experiment."""
     if line in STUDIES:
         return study_table(line, runs)
     if line in WHOLE:
@@ -89,7 +95,6 @@ def fill_line(line: str, runs: Runs) -> list[str]:
 WHOLE: dict[str, Callable[[Runs], list[str]]] = {
     "table-1": partial(beside_paper, paper.TABLE_I),
     "table-2": partial(beside_paper, paper.TABLE_II),
-    "decisions": lambda runs: decisions(),
     "findings": findings,
     "photographs": photographs,
     "readings": readings,

@@ -64,3 +64,23 @@ def test_the_reference_contains_every_public_name_of_the_package():
             value = getattr(module, name)
             if inspect.isclass(value) or inspect.isfunction(value):
                 assert id(value) in explained, f"{module.__name__}.{name}"
+
+
+def test_the_map_names_files_that_exist():
+    named = set(
+        re.findall(
+            r"`((?:semfov|eval|train|docs|tests)(?:/[\w.]+)*|mkdocs\.yml)/?`", (DOCS / "map.md").read_text("utf-8")
+        )
+    )
+    assert len(named) > 60
+    assert [name for name in sorted(named) if not (DOCS.parent / name).exists()] == []
+
+
+def test_the_map_names_every_room():
+    """Every folder and module of the package is in the map, except for the version and the errors."""
+    text = (DOCS / "map.md").read_text("utf-8")
+    rooms = {
+        path.relative_to(DOCS.parent).with_suffix("").as_posix() for path in Path(semfov.__file__).parent.glob("[a-z]*")
+    }
+    without = {"semfov/version", "semfov/errors", "semfov/py"}
+    assert [room for room in sorted(rooms - without) if f"`{room}" not in text] == []

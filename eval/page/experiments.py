@@ -168,7 +168,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class ResultsConfig(Settings):
-    """The photographs of the results page, and the files that are written.
+    """The photographs of the pages of results, and the files that are written.
 
     Args:
         root: folder of the photographs of COCO val2017.
@@ -181,11 +181,13 @@ class ResultsConfig(Settings):
         limit: use only this many photographs, the first ones, for a trial.
         study: number of photographs for the studies of settings, which compute new looks for every setting of sensor
             and detector.
-        only: names of the experiments to run (None: all); for the others the page shows the results of earlier runs, if
-            there are any.
-        page: file to write.
-        template: file with the text of the page.
-        pictures: folder for the figures of the page.
+        only: names of the experiments to run (None: all); for the others the pages show the results of earlier runs,
+            if there are any.
+        page: file to write with the findings.
+        template: file with the text of this page.
+        tables: file to write with all other tables.
+        tables_template: file with the text of that page.
+        pictures: folder for the figures of the pages.
         out: folder for the runs.
         cache: folder for the stored detections (None: the user's cache).
         workers: number of processes (None: one per CPU core).
@@ -202,6 +204,8 @@ class ResultsConfig(Settings):
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
     template: Path = Path("docs/results.template.md")
+    tables: Path = Path("docs/tables.md")
+    tables_template: Path = Path("docs/tables.template.md")
     pictures: Path = Path("docs/pictures")
     out: Path = Path("runs/results")
     cache: Path | None = None

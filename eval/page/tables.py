@@ -220,11 +220,3 @@ def photographs(runs: Runs) -> list[str]:
         "pairs of photograph and target": f"{targets:,}",
     }
     return table([["of the photographs of this page", ""], *([name, value] for name, value in figures.items())])
-
-
-def decisions(path: Path = Path("benchmarks/results/decisions.md")) -> list[str]:
-    """Table III and the cost rows of tables I and II, from the benchmark that measures them in one run."""
-    if not path.exists():
-        return ["*Not run yet.*"]
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return [f"#{line}" if line.startswith("## ") else line for line in lines if not line.startswith("# ")]

@@ -13,9 +13,9 @@ from eval.page.experiments import ResultsConfig, experiments
 from eval.page.figures import FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
 from eval.page.tables import agreement, central, first_fixations, paired, summary
-from eval.results import TABLES, WHOLE, fill
+from eval.results import TABLES, WHOLE, fill, results
 from eval.search.config import SearchConfig
-from semfov.errors import InputError
+from semfov.errors import DataError, InputError
 from semfov.runs.config import SensorConfig
 from semfov.runs.presets import label
 
@@ -135,11 +135,56 @@ def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
         assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
 
 
-def test_every_line_of_the_template_can_be_filled(runs):
-    for line in (ROOT / "docs/results.template.md").read_text(encoding="utf-8").splitlines():
+def lines_of_tables(page):
+    text = (ROOT / f"docs/{page}.template.md").read_text(encoding="utf-8")
+    return [line for line in text.splitlines() if line.startswith("@@ ")]
+
+
+@pytest.mark.parametrize("page", ["results", "tables"])
+def test_every_line_of_the_templates_can_be_filled(page, runs):
+    for line in lines_of_tables(page):
+        name, _, kind = line.removeprefix("@@ ").partition(" ")
+        assert name in WHOLE or not kind or (name in runs and kind in TABLES), line
+
+
+def test_no_table_is_on_both_pages():
+    lines = [*lines_of_tables("results"), *lines_of_tables("tables")]
+    assert len(set(lines)) == len(lines) > 40
+
+
+@pytest.mark.parametrize("page", ["results", "tables"])
+def test_the_pages_are_their_templates_with_tables(page):
+    """The text of a page between its tables is that of the template, in the same order."""
+    written = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8").splitlines()
+    place = 0
+    for line in (ROOT / f"docs/{page}.template.md").read_text(encoding="utf-8").splitlines():
         if line.startswith("@@ "):
-            name, _, kind = line.removeprefix("@@ ").partition(" ")
-            assert name in WHOLE or not kind or (name in runs and kind in TABLES), line
+            assert any(each.startswith("|") for each in written[place:]), line
+        else:
+            place = written.index(line, place) + bool(line)
+
+
+def test_one_command_writes_both_pages(runs, tmp_path):
+    templates = {page: tmp_path / f"{page}.template.md" for page in ("results", "tables")}
+    for page, template in templates.items():
+        template.write_text(f"{page}\n@@ table-1\n")
+    config = ResultsConfig(
+        root=tmp_path,
+        annotations=tmp_path / "a.json",
+        only=(),
+        page=tmp_path / "results.md",
+        template=templates["results"],
+        tables=tmp_path / "tables.md",
+        tables_template=templates["tables"],
+        pictures=tmp_path,
+        out=tmp_path / "out",
+    )
+    results(config)
+    for page in templates:
+        assert (tmp_path / f"{page}.md").read_text() == fill(f"{page}\n@@ table-1\n", runs)
+    templates["tables"].unlink()
+    with pytest.raises(DataError, match=r"tables\.template\.md cannot be read"):
+        results(config)
 
 
 def test_differences_are_paired_over_images(searched):
