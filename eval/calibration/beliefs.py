@@ -5,12 +5,10 @@ All beliefs are updated with the looks of the same searches.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -103,9 +101,9 @@ class BeliefCalibrationRun(Run):
             self.left_out[name] = str(error)
             return None
 
-    def _key(self) -> str:
-        what = ["belief calibration", super()._key(), LOOKS, BANDS, BinarySums.EDGES.tolist()]
-        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+    def depends_on(self) -> dict[str, Any]:
+        """List what searches depend on, and how calibration is measured."""
+        return {**super().depends_on(), "belief calibration": [LOOKS, BANDS, BinarySums.EDGES.tolist()]}
 
     @property
     def guide(self) -> str:

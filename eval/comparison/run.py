@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import asdict
+from typing import Any
 
 from semfov.gaze.policies import POLICIES
 from semfov.io.code import class_digest
-from semfov.io.storage import checksum
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import Record
 from semfov.runs.scene_run import digest_of
@@ -22,25 +22,21 @@ class Run(PolicyLooking):
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
         return digest_of([super()._code(), [class_digest(POLICIES[name]) for name in foreign]])
 
-    def _key(self) -> str:
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""
         config, models = self.config, self.models
-        fitted = {
-            name: None if model is None else checksum(model.state_dict())
-            for name, model in (("observation", models.observation), ("evidence", models.evidence))
+        policies = {name: asdict(policy) for name, policy in self.policies.items()}
+        for policy in policies.values():
+            policy["context_model"] = models.context.get(policy["context_model"] or config.belief.context_model)
+        return {
+            **super().depends_on(),
+            "task": self.task,
+            "models": [models.observation, models.evidence, models.map, models.templates],
+            "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
+            "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
+            "policies": policies,
+            "saliency": asdict(config.saliency) if self.saliency_stores else None,
         }
-        contexts = {name: prior.digest() for name, prior in models.context.items()}
-        if models.templates is not None:
-            fitted["templates"] = checksum(models.templates.state_dict())
-        if models.map is not None:
-            fitted["map"] = checksum(models.map.state_dict())
-        belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
-        protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
-        saliency = asdict(config.saliency) if self.saliency_stores else None
-        policies = {name: {**asdict(policy), "context_model": None} for name, policy in self.policies.items()}
-        for name, policy in self.policies.items():
-            policies[name]["context_model"] = contexts.get(policy.context_model or config.belief.context_model)
-        seen = [self.eye.settings(), self.scenes.fingerprint]
-        return digest_of([self.task, seen, belief, fitted, protocol, policies, saliency])
 
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,18 +114,11 @@ class DecisionRun(Run):
                 raise
             return None
 
-    def _key(self) -> str:
-        evidence, config = self.models.evidence, self.config
-        assert evidence is not None
-        chosen = asdict(evidence.thresholds) if evidence.thresholds else None
+    def depends_on(self) -> dict[str, Any]:
+        """List what searches depend on, the thresholds that are given, and the model of verification."""
+        config = self.config
         given = [config.confirm, config.give_up, config.place, config.closer]
-        model = self.verification
-        verified = None
-        if model is not None:
-            assert model.thresholds is not None
-            verified = [asdict(model.thresholds), *(each.tolist() for each in model.parameters())]
-        what = ["decisions", super()._key(), chosen, given, verified]
-        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+        return {**super().depends_on(), "decisions": given, "verification": self.verification}
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""

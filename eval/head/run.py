@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -26,13 +26,12 @@ from semfov.head.panoramas import Panoramas
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 from semfov.head.world import Boxes, Flat, Panorama, Places, World
-from semfov.io.storage import checksum
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import SOURCES, tight
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import Record
-from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
+from semfov.runs.scene_run import SceneRun, cache_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
 from semfov.runs.store import DetectionStore
@@ -131,11 +130,10 @@ class HeadRun(SceneRun):
         looks, components = {"eye": self.eye.settings(), "fields": config.fields}, len(self.eye.detector.classes) + 1
         self.store = DetectionStore(cache_folder(config.cache) / "head", looks, LOOKS, components)
 
-    def _key(self) -> str:
-        besides = ("out", "cache", "store", "workers", "data", "detector")
-        protocol = {name: value for name, value in asdict(self.config).items() if name not in besides}
-        models = [checksum(model.state_dict()) for model in (self.target_evidence, self.map_evidence)]
-        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, models])
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye, its models and the settings."""
+        models = [self.target_evidence, self.map_evidence]
+        return {"eye": self.eye.settings(), "models": models, "settings": self.own_settings()}
 
     def world(self, index: int) -> World:
         """The scene as a world in which the head looks around."""

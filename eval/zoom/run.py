@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,9 +17,8 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
-from semfov.io.storage import checksum
 from semfov.runs.results import Record
-from semfov.runs.scene_run import SceneRun, digest_of
+from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_zoom_observation
@@ -87,16 +86,11 @@ class ZoomRun(WindowLooking, SceneRun):
         names = self.eye.detector.classes
         self.target = None if config.target is None else class_index(config.target, names, "target")
 
-    def _key(self) -> str:
-        settings = asdict(self.config)
-        besides = ("out", "cache", "store", "workers", "data", "detector", "model", "observation")
-        protocol = {name: value for name, value in settings.items() if name not in besides}
-        evidence = self.evidence
-        thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
-        verified = None if evidence.verification is None else repr(evidence.verification.thresholds)
-        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds, verified]
-        observed = None if self.observation is None else checksum(self.observation.state_dict())
-        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye, its models and the settings."""
+        models = [self.evidence, self.observation]
+        settings = self.own_settings("model", "observation")
+        return {"eye": self.eye.settings(), "models": models, "settings": settings}
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
         """The slices of a scene: the photographs of a mosaic, or squares of a picture."""

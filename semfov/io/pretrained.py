@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from semfov.errors import DataError, InputError, check
 from semfov.io.compatibility import check_detector, check_grid, check_sensor
 from semfov.io.schema import METADATA, Schema, Text
-from semfov.io.storage import find, read, write
+from semfov.io.storage import checksum, find, read, write
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")
@@ -57,6 +57,14 @@ class Pretrained(nn.Module):
         """
         record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
         write(path, self._tensors(), record)
+
+    def digest(self) -> str:
+        """Checksum of everything that results depend on: tensors, and the values that are needed to make the model.
+
+        Returns:
+            The sha256 in hexadecimal.
+        """
+        return checksum(self.state_dict(), {"kind": self.kind, **self._record()})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:

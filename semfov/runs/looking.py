@@ -11,7 +11,7 @@ from semfov.errors import DataError
 from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.results import Record
-from semfov.runs.scene_run import SceneRun, cache_folder, digest_of
+from semfov.runs.scene_run import SceneRun, cache_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store
 
@@ -52,9 +52,9 @@ class Looking(SceneRun):
         assert isinstance(self.config, ScenesConfig)
         return make_scenes(self.config.data, self.eye.detector.classes)
 
-    def _key(self) -> str:
-        cells = [self.config.belief.columns, self.config.belief.rows]
-        return digest_of([self.eye.settings(), self.scenes.fingerprint, cells])
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye and the cells."""
+        return {"eye": self.eye.settings(), "cells": [self.config.belief.columns, self.config.belief.rows]}
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a scene depend on."""

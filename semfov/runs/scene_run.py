@@ -8,6 +8,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,15 @@ from typing import Any
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.io.code import class_digest, package_digest
+from semfov.io.pretrained import Pretrained
 from semfov.runs.results import Parts, Record
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import available_cores, mine, rank, run_tasks, wait_for_others
 
 _log = logging.getLogger(__name__)
+
+_BESIDES = ("out", "cache", "store", "workers", "data", "detector")
 
 
 class SceneRun(ABC):
@@ -40,7 +44,7 @@ class SceneRun(ABC):
     @cached_property
     def settings_key(self) -> str:
         """sha256 of all settings, models and scenes that the outcomes depend on."""
-        return self._key()
+        return digest_of({"scenes": self.scenes.fingerprint, **self.depends_on()})
 
     @cached_property
     def code(self) -> str:
@@ -53,7 +57,16 @@ class SceneRun(ABC):
         return f"{self.settings_key[:16]}-{self.code[:16]}"
 
     @abstractmethod
-    def _key(self) -> str: ...
+    def depends_on(self) -> dict[str, Any]:
+        """List the fitted models and the settings that the outcomes depend on, beside scenes and code.
+
+        Returns:
+            JSON values by name, in which a fitted model stands for itself.
+        """
+
+    def own_settings(self, *others: str) -> dict[str, Any]:
+        """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
+        return {name: value for name, value in asdict(self.config).items() if name not in (*_BESIDES, *others)}
 
     def _code(self) -> str:
         """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
@@ -137,8 +150,8 @@ def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
 
 
 def digest_of(what: object) -> str:
-    """The sha256 of a JSON value."""
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+    """The sha256 of a JSON value, in which fitted models count by their digests."""
+    return hashlib.sha256(json.dumps(what, sort_keys=True, default=Pretrained.digest).encode()).hexdigest()
 
 
 _process: dict[str, SceneRun] = {}

@@ -26,13 +26,12 @@ from semfov.detection.load import check_detector
 from semfov.episode import Looks, Stopwatch, StoredLooks
 from semfov.errors import DataError, InputError
 from semfov.gaze.policies import Objects, Task
-from semfov.io.storage import checksum
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.results import Record
 from semfov.runs.saliency_store import SALIENCY_MODELS
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import cache_folder, digest_of
 from semfov.strategy import Strategy
 
 LANDING = "landing"
@@ -81,10 +80,7 @@ class ViewingRun(Run):
     def _what(self) -> dict[str, object]:
         """Settings that the maps of all pictures and policies depend on."""
         grid = [self.config.belief.columns, self.config.belief.rows]
-        fitted = {
-            name: None if model is None else checksum(model.state_dict())
-            for name, model in (("observation", self.models.observation), ("map", self.models.map))
-        }
+        fitted = digest_of([self.models.observation, self.models.map])
         belief = {name: value for name, value in asdict(self.config.belief).items() if not name.endswith("model")}
         eye = {"eye": self.eye.settings(), "grid": grid, "belief": belief, "fitted": fitted}
         return {**eye, "longest": self.config.longest}
