@@ -11,6 +11,7 @@ from docs.api import entries, pages
 
 DOCS = Path(__file__).parents[1] / "docs"
 GUIDES = sorted(DOCS.glob("guides/*.md"))
+PAGES = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 
 
 @pytest.mark.weights
@@ -66,19 +67,24 @@ def test_the_reference_contains_every_public_name_of_the_package():
                 assert id(value) in explained, f"{module.__name__}.{name}"
 
 
+FILES = re.compile(r"`((?:semfov|eval|train|docs|tests|examples|benchmarks|configs)(?:/[\w.*]+)*|mkdocs\.yml)/?`")
+
+
 def test_the_map_names_files_that_exist():
-    named = set(
-        re.findall(
-            r"`((?:semfov|eval|train|docs|tests)(?:/[\w.]+)*|mkdocs\.yml)/?`", (DOCS / "map.md").read_text("utf-8")
-        )
-    )
+    named = set(FILES.findall((DOCS / "map.md").read_text(encoding="utf-8")))
     assert len(named) > 60
     assert [name for name in sorted(named) if not (DOCS.parent / name).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS.parent).as_posix())
+def test_files_named_on_a_page_exist(page):
+    named = set(FILES.findall(page.read_text(encoding="utf-8")))
+    assert [name for name in sorted(named) if not list(DOCS.parent.glob(name))] == []
+
+
 def test_the_map_names_every_room():
     """Every folder and module of the package is in the map, except for the version and the errors."""
-    text = (DOCS / "map.md").read_text("utf-8")
+    text = (DOCS / "map.md").read_text(encoding="utf-8")
     rooms = {
         path.relative_to(DOCS.parent).with_suffix("").as_posix() for path in Path(semfov.__file__).parent.glob("[a-z]*")
     }
