@@ -1,1 +1,1 @@
-"""The results page: its experiments, tables and figures."""
+"""The pages of results: their experiments, tables and figures."""

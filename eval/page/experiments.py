@@ -1,4 +1,4 @@
-"""The experiments of the results page: their policies, detectors, sensors and settings."""
+"""The experiments of the pages of results: their policies, detectors, sensors and settings."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

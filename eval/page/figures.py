@@ -1,4 +1,4 @@
-"""Figures of the results page: the paper's four, each for both detectors and both foveas."""
+"""Figures of the pages of results: the paper's four, each for both detectors and both foveas."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tables of the results page, made from the output of the runs."""
+"""Tables of the pages of results, made from the output of the runs."""
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby

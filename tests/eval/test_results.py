@@ -1,4 +1,4 @@
-"""The results page: tables from the files of runs, and paired differences."""
+"""The pages of results: tables from the files of runs, and paired differences."""
 
 import json
 from pathlib import Path
