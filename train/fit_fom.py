@@ -16,13 +16,13 @@ import sys
 from collections.abc import Sequence
 
 from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
 from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    return run_command(fit_fom, FitConfig, __doc__, arguments)
+    return run_command(fit_fom, FitObservationConfig, __doc__, arguments)
 
 
 if __name__ == "__main__":

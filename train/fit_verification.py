@@ -15,8 +15,7 @@ looks are stored, photograph by photograph, in the folder `cache`: the same comm
 import sys
 from collections.abc import Sequence
 
-from semfov.fit.verification import fit_verification
-from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.fit.verification import FitVerificationConfig, fit_verification
 from semfov.runs.command import run_command
 
 

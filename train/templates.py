@@ -16,29 +16,28 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detector import Detector
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.settings import NameConfig
 from semfov.gaze.templates import ClassTemplates, at_points, unit
 from semfov.runs.config import DataConfig, DetectorConfig
-from semfov.runs.settings import Name, Range, Settings
+from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker
 from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
-class FitTemplatesConfig(Settings):
+class FitTemplatesConfig(NameConfig):
     """Average a detector's features over the objects of each class.
 
     Args:
         data: photographs to learn from (by default all of them, however many objects they have).
         detector: the detector that computes the features (one of the YOLOv3 family).
         holdout: one in every n photographs is held out for the evaluation.
-        name: name of the model (None: the detector's name).
         out: folder for the model and the report.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     holdout: Annotated[int, Range(2, 10**9)] = 10
-    name: Name | None = None
     out: Path = Path("runs/fit_templates")
 
 

@@ -7,11 +7,12 @@ from typing import Annotated
 from semfov.errors import InputError
 from semfov.fit.evidence import FitSearchConfig
 from semfov.fit.map_evidence import FitMapConfig
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.settings import FovealFitConfig
 from semfov.fit.tempering import FitTemperingConfig
-from semfov.fit.verification_settings import FitVerificationConfig
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole, Workers
+from semfov.fit.verification import FitVerificationConfig
+from semfov.runs.config import DetectorConfig, WorkConfig
+from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
 FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
@@ -20,14 +21,13 @@ MANY = 100
 
 
 @dataclass(frozen=True)
-class FitDetectorConfig(Settings):
+class FitDetectorConfig(FovealFitConfig, WorkConfig):
     """Fit all models that the agent needs to your own detector.
 
     Args:
         model: the detector: a name or a file, as for `semfov.load_detector`.
         data: photographs with boxes to learn from. All of them are used unless `data.limit` or `data.ids` selects some.
         detector: options of the detector; `model` gives its name.
-        sensor: the foveal sensor.
         columns: columns of the grid.
         rows: rows of the grid.
         max_target_area: classes that cover a larger share of the image are not searched for.
@@ -39,16 +39,13 @@ class FitDetectorConfig(Settings):
         steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
         map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
         thin: the report lists classes with fewer objects than this in the training photographs.
-        seed: seed of all random choices.
         out: folder to write the models to.
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
         workers: number of processes that look (None: one for each CPU core).
     """
 
     model: Path | None = None
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(background=None))
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     columns: Side = 10
     rows: Side = 10
     max_target_area: Positive = 0.2
@@ -58,10 +55,7 @@ class FitDetectorConfig(Settings):
     steps: Count | None = None
     map_steps: Count | None = None
     thin: Whole = 20
-    seed: Seed = 0
     out: Path = Path("mymodels")
-    cache: Path | None = None
-    workers: Workers | None = None
 
     def named(self) -> "FitDetectorConfig":
         """Return these settings with `model` as the detector's name, and with targets of all sizes in the photographs.
@@ -101,9 +95,9 @@ class FitDetectorConfig(Settings):
         return {**shared, "holdout": self.holdout or 5}
 
     @property
-    def observation(self) -> FitConfig:
+    def observation(self) -> FitObservationConfig:
         """Settings of the observation model."""
-        return FitConfig(**self._common, fixations=self.fixations)  # type: ignore[arg-type]
+        return FitObservationConfig(**self._common, fixations=self.fixations)  # type: ignore[arg-type]
 
     @property
     def tempering(self) -> FitTemperingConfig:

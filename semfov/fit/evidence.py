@@ -17,8 +17,8 @@ from semfov.decision import place_known
 from semfov.episode import Step, rollout
 from semfov.fit.descent import descend
 from semfov.fit.evidence_examples import ExampleLooks, Examples, make_examples
-from semfov.fit.frame import Fit, FitOnLooksConfig, fit_and_write, split
-from semfov.fit.outputs import training_of
+from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error

@@ -15,9 +15,9 @@ from semfov.belief.observers import LearnedMap, MapBelief
 from semfov.episode import Step, rollout
 from semfov.errors import check
 from semfov.fit.descent import descend
-from semfov.fit.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.fit.map_examples import MapExampleLooks, MapExamples, make_map_examples
-from semfov.fit.outputs import training_of
+from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error

@@ -8,7 +8,7 @@ from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.fit.misses import count_misses
 from semfov.fit.observation_report import write_report
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
 from semfov.fit.outputs import model_path
 from semfov.observation import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
@@ -20,7 +20,7 @@ from semfov.runs.zoom_samples import MosaicSettings
 from semfov.zoom.eye import WindowEye
 
 
-def fit_fom(config: FitConfig) -> None:
+def fit_fom(config: FitObservationConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     kind = MosaicSettings if config.mosaics else SampleSettings
@@ -59,7 +59,7 @@ class Looker(Protocol):
     scenes: Scenes
 
 
-def fit_model(config: FitConfig, sampler: Looker, samples: Samples) -> FovealObservationModel:
+def fit_model(config: FitObservationConfig, sampler: Looker, samples: Samples) -> FovealObservationModel:
     """Fit the model with the method in the settings.
 
     Args:
@@ -77,7 +77,7 @@ def fit_model(config: FitConfig, sampler: Looker, samples: Samples) -> FovealObs
 
 
 def published_model(
-    config: FitConfig,
+    config: FitObservationConfig,
     sampler: Looker,
     samples: Samples,
     method: Method,
@@ -125,7 +125,7 @@ def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletS
 
 
 def fit_all(
-    config: FitConfig, sampler: Looker, samples: Samples, model: FovealObservationModel
+    config: FitObservationConfig, sampler: Looker, samples: Samples, model: FovealObservationModel
 ) -> dict[str, FovealObservationModel]:
     """Fit the models that the report compares: raw scores, the published estimators, and the requested model."""
     edges, classes = config.edges, sampler.eye.detector.classes

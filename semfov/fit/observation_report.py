@@ -13,7 +13,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
@@ -29,7 +29,11 @@ Models = dict[str, FovealObservationModel]
 
 
 def write_report(
-    config: FitConfig, model: FovealObservationModel, models: Models, samples: Samples, held_out: torch.Tensor
+    config: FitObservationConfig,
+    model: FovealObservationModel,
+    models: Models,
+    samples: Samples,
+    held_out: torch.Tensor,
 ) -> list[Path]:
     """Evaluate the models on held-out samples, print the tables, and write the report.
 
@@ -65,7 +69,7 @@ def write_report(
 
 
 def report_markdown(
-    config: FitConfig,
+    config: FitObservationConfig,
     model: FovealObservationModel,
     figures: dict[str, Calibration],
     likelihood: dict[str, float],

@@ -1,22 +1,20 @@
 """Settings for fitting a foveal observation model."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.settings import Count, Name, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
+from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.runs.config import WorkConfig
+from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 
 
 @dataclass(frozen=True)
-class FitConfig(Settings):
+class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
     """Fit p(scores | class, distance to the fovea) on photographs with boxes.
 
     Args:
         data: photographs to fit on (by default all of them, however many objects they have).
-        detector: the detector that processes the foveated views.
-        sensor: the foveal sensor.
-        name: name of the model (None: the detector's name).
         method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
             and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
             `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
@@ -43,10 +41,6 @@ class FitConfig(Settings):
         workers: number of processes (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: Name | None = None
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
     mosaics: Whole = 0
     fixations: Count = 8
@@ -57,11 +51,8 @@ class FitConfig(Settings):
     enough: Whole | None = None
     holdout: Annotated[int, Range(2, 10**9)] = 10
     iou: Share = 0.5
-    seed: Seed = 0
     shard: Count = 32
     out: Path = Path("runs/fit_fom")
-    cache: Path | None = None
-    workers: Workers | None = None
 
     @property
     def edges(self) -> list[float]:

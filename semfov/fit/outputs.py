@@ -1,14 +1,25 @@
-"""The outputs of every fit: metadata about the training, a report, the settings, and the report's measures as JSON."""
+"""The outputs of every fit: a model with metadata about the training, a report, the settings and measures as JSON."""
 
-from dataclasses import asdict
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import yaml
+from torch import Tensor
 
 from semfov.data.scene import Scenes
+from semfov.errors import DataError
+from semfov.fit.settings import FitOnLooksConfig
 from semfov.io.files import inside, write_text
+from semfov.io.pretrained import Pretrained
+from semfov.runs.looking import Looking, looking_of
+from semfov.runs.scene_run import finish
 from semfov.runs.setup import plain
+from semfov.runs.workers import rank
+
+Model = TypeVar("Model", bound=Pretrained)
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
@@ -53,3 +64,61 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
         write_text(inside(config.out, name), text)
     written = [*([] if model is None else [model]), *(config.out / name for name in files)]
     print("written:", *(f"  {path}" for path in written), sep="\n")
+
+
+@dataclass(frozen=True)
+class Fit(Generic[Model]):
+    """The result of a fit.
+
+    Attributes:
+        model: the model, fitted to the photographs that are not held out.
+        judged: measures on the held-out photographs after some looks.
+        trained: number of training examples.
+        held_out: number of held-out examples.
+        report: the measures as Markdown.
+    """
+
+    model: Model
+    judged: list[dict[str, float]]
+    trained: int
+    held_out: int
+    report: str
+
+
+def split(scene: Tensor, holdout: int) -> Tensor:
+    """Select the examples to hold out.
+
+    Args:
+        scene: `(E,)`, index of the photograph of each example.
+        holdout: one in every n photographs is held out, beginning with the first.
+
+    Returns:
+        Whether each example is held out, `(E,)` boolean.
+
+    Raises:
+        DataError: all examples are held out, or none is.
+    """
+    held_out = scene % holdout == 0
+    if held_out.all() or not held_out.any():
+        raise DataError(
+            "data: expected examples both to train on and to hold out, got all of one kind "
+            f"({len(scene)} examples); give more photographs"
+        )
+    return held_out
+
+
+def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
+    """Look from every cell, fit, and write the model, the report, the settings and the measures.
+
+    Args:
+        config: settings of the fit.
+        fit: makes the model from the settings and the finished looks.
+    """
+    run = looking_of(config)
+    finish(run, "looking")
+    if rank() > 0:
+        return
+    fitted = fit(config, run)
+    path = model_path(config, run.eye.detector.name)
+    fitted.model.save(path)
+    write_outputs(config, fitted.report, ("judged.json", json.dumps(fitted.judged, indent=2) + "\n"), path)

@@ -1,7 +1,7 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,24 +14,22 @@ from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
 from semfov.fit.outputs import write_outputs
+from semfov.fit.settings import FovealFitConfig
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.config import WorkConfig
 from semfov.runs.progress import track
 from semfov.runs.samples import Sampler, Samples, SampleSettings, collect
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Side, Whole, Workers
+from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from semfov.runs.workers import rank
 
 
 @dataclass(frozen=True)
-class FitTemperingConfig(Settings):
+class FitTemperingConfig(FovealFitConfig, WorkConfig):
     """Find the exponent of the likelihoods.
 
     Args:
-        data: photographs to learn from (by default all of them, however many objects they have).
-        detector: the detector that processes the foveated views.
-        sensor: the foveal sensor.
         calibrated: compute likelihoods from the scores with the observation model shipped for the detector. If false,
             the raw scores are the likelihoods.
         footprint: which cells a detection updates.
@@ -51,16 +49,12 @@ class FitTemperingConfig(Settings):
         workers: number of processes that look (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     calibrated: bool = False
     footprint: Footprint = "box_centre"
     exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
     photographs: Count | None = None
     fixations: Count = 8
     iou: Share = 0.5
-    seed: Seed = 0
     shard: Count = 32
     columns: Side = 10
     rows: Side = 10
@@ -68,8 +62,6 @@ class FitTemperingConfig(Settings):
     max_target_area: Positive = 0.2
     holdout: Annotated[int, Range(2, 10**9)] = 4
     out: Path = Path("runs/fit_tempering")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 def fit_tempering(config: FitTemperingConfig) -> None:

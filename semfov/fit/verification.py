@@ -1,19 +1,159 @@
 """Fit the verification of targets by closer looks, from searches of photographs with boxes."""
 
-from __future__ import annotations
-
 import json
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
 
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.verification import FEATURES, Verification
+from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
-from semfov.fit.closer_looks import photographs
 from semfov.fit.outputs import model_path, training_of, write_outputs
-from semfov.fit.verification_fit import fit_and_verify
-from semfov.fit.verification_report import report
-from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.fit.searches import Photograph, TargetSearch, photograph_searches, photographs
+from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.presence import area_under_roc
+from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import cache_folder
+from semfov.runs.settings import Count, Positive, Range, Share, Side
 from semfov.runs.setup import make_eye, make_scenes, make_target_evidence
 from semfov.runs.store import cell_store
+from semfov.runs.tables import mean, share, table
+
+LEVELS = tuple(number / 100 for number in range(50, 100))
+"""Values from which the threshold `confirm` is chosen."""
+
+SHIPPED = ("yolox-nano", "yolov3-tiny")
+"""Shipped models whose mean is the centre of the prior for other detectors."""
+
+STRENGTH = 10.0
+"""Strength of this prior, chosen on photographs that no result is reported on (docs/decisions/closer_looks.md)."""
+
+_EACH = 3  # places examined after some looks
+_LEAST = 0.03  # least probability of these places
+_RIDGE = 1e-4
+
+SHOWN = (0.5, 0.6, 0.7, 0.8, 0.9)
+"""Values of the threshold `confirm` in the table, besides the chosen one."""
+
+SearchEnd = tuple[bool | None, int]
+"""End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
+
+
+@dataclass(frozen=True)
+class FitVerificationConfig(FovealFitConfig, NameConfig):
+    """Fit the verification of targets.
+
+    Args:
+        data: photographs to learn from.
+        detector: the detector that processes the foveated views and the closer looks.
+        target_model: learned target evidence, by name or file (None: the one for the detector and the sensor).
+        fitted: number of photographs that this evidence was fitted to (`--data.limit` of `train.fit_search` with
+            `--data.min_instances 2`); those from which it learned are left out here (None: none is left out).
+        columns: columns of the grid.
+        rows: rows of the grid.
+        classes: maximum number of present classes to search for in each photograph.
+        absent: maximum number of absent classes to search for (None: as many as present ones).
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        looks: number of looks in a search.
+        place: least probability of a cell that is worth a closer look.
+        give_up: least probability of a cell that is worth a fixation.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
+        folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
+        seed: seed of the choice of classes and of the first fixations.
+        out: folder for the model and the report.
+        cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    target_model: str | None = None
+    fitted: Count | None = None
+    columns: Side = 10
+    rows: Side = 10
+    classes: Count = 2
+    absent: Count | None = None
+    max_target_area: Positive = 0.2
+    looks: Annotated[int, Range(2, 10_000)] = 12
+    place: Share = 0.2
+    give_up: Share = 0.2
+    false_alarms: Share = 0.01
+    folds: Annotated[int, Range(2, 1000)] = 5
+    out: Path = Path("runs/fit_verification")
+
+
+@dataclass(frozen=True)
+class VerifiedSearch:
+    """A search in which all closer looks were made, whatever they showed.
+
+    Attributes:
+        picture: number of the picture.
+        present: whether the picture holds the target.
+        spare: whether the search only serves to choose thresholds.
+        places: for each closer look, the probability that the target is there, and whether it is.
+        ends: for each closer look, the number of looks of both kinds that were made up to it.
+        presence: probability that the image holds the target, at the end.
+        looks: number of looks of both kinds.
+        unverified: end of the same search without closer looks, by the thresholds of the target evidence.
+    """
+
+    picture: int
+    present: bool
+    spare: bool
+    places: tuple[tuple[float, bool], ...]
+    ends: tuple[int, ...]
+    presence: float
+    looks: int
+    unverified: SearchEnd
+
+    def found(self, confirm: float) -> SearchEnd:
+        """Return the end of the search at a threshold."""
+        chances = [chance for chance, _ in self.places]
+        for number, end in enumerate(self.ends, 1):
+            if verified(chances[:number], self.presence, confirm, over=False):
+                return self.places[number - 1][1], end
+        if OUTCOMES[verified(chances, self.presence, confirm, over=True)] != "found":
+            return None, self.looks
+        return self.places[chances.index(max(chances))][1], self.looks
+
+
+@dataclass(frozen=True)
+class CloserLooks:
+    """Closer looks at places that seemed to hold a target.
+
+    Attributes:
+        features: `(N, 7)`, features of the closer looks.
+        right: `(N,)` boolean, whether the target is at the place.
+        present: `(N,)` boolean, whether the picture holds it.
+        fold: `(N,)`, part of the pictures.
+    """
+
+    features: Tensor
+    right: Tensor
+    present: Tensor
+    fold: Tensor
+
+
+@dataclass(frozen=True)
+class VerificationResult:
+    """A fitted model and its evaluation in folds.
+
+    Attributes:
+        model: the model, fitted to all closer looks, with thresholds.
+        folds: for each fold, the model fitted to the others.
+        closer: the closer looks.
+        searches: the searches, each with the model of its fold.
+    """
+
+    model: Verification
+    folds: list[Verification]
+    closer: CloserLooks
+    searches: list[VerifiedSearch]
 
 
 def fit_verification(config: FitVerificationConfig) -> None:
@@ -43,9 +183,304 @@ def fit_verification(config: FitVerificationConfig) -> None:
         seed=config.seed,
         store=store,
     )
-    fitted = fit_and_verify(seen, evidence, config)
+    fitted = fit_in_folds(seen, evidence, config)
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
     text, figures = report(fitted, f"{len(seen)} photographs")
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
+
+
+def fit_in_folds(
+    seen: Sequence[Photograph],
+    evidence: TargetEvidence,
+    config: FitVerificationConfig,
+    prior: Verification | None = None,
+    surest: float = LEVELS[-1],
+) -> VerificationResult:
+    """Fit the model to closer looks at photographs, repeat the searches in folds, and choose the threshold `confirm`.
+
+    Args:
+        seen: the photographs.
+        evidence: the target evidence.
+        config: the settings.
+        prior: model towards which to fit (`fit`).
+        surest: upper limit of the threshold.
+
+    Returns:
+        The model with its evaluation.
+
+    Raises:
+        DataError: there is no candidate, or none of them is right, or none wrong.
+    """
+    closer = examine(photograph_searches(seen, evidence, config.looks, "looking"), config.folds)
+    if closer is None:
+        raise DataError("data: expected places that hold the target and places that do not, got only one kind")
+    folds = [fit(closer, closer.fold != fold, prior) for fold in range(config.folds)]
+    model = fit(closer, closer.fold >= 0, prior)
+    again = photograph_searches(seen, evidence, config.looks, "verifying")
+    limits = Thresholds(1.0, config.give_up, config.place)
+    searches = list(verify(again, folds, limits, evidence.thresholds))
+    confirm = choose_confirm(searches, config.false_alarms, surest)
+    model.thresholds = Thresholds(confirm, config.give_up, config.place)
+    return VerificationResult(model, folds, closer, searches)
+
+
+@torch.inference_mode()
+def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLooks | None:
+    """Look closely at the most evident places after some looks of every search.
+
+    Args:
+        searches: the searches.
+        folds: number of parts of the pictures.
+
+    Returns:
+        The closer looks; None if no place is right, or none is wrong.
+    """
+    rows: list[tuple[Tensor, bool, bool, int]] = []
+    for search in searches:
+        if search.spare:
+            continue
+        for count in (each for each in search.after if each <= len(search)):
+            candidates = search.candidates()
+            for index in range(count):
+                candidates.see(search.look(index, index + 1))
+            for _ in range(_EACH):
+                candidate = candidates.due(_LEAST, last=True)
+                if candidate is None:
+                    break
+                features, box = candidates.examine(candidate, search.close_up)
+                rows.append((features, search.right(box), search.present, search.picture % folds))
+    if len({right for _, right, _, _ in rows}) < 2:
+        return None
+    columns = list(zip(*rows, strict=True))
+    return CloserLooks(torch.stack(columns[0]), *(torch.tensor(column) for column in columns[1:]))
+
+
+@torch.inference_mode()
+def verify(
+    searches: Iterable[TargetSearch[Any]],
+    folds: Sequence[Verification],
+    limits: Thresholds,
+    thresholds: Thresholds | None,
+) -> Iterator[VerifiedSearch]:
+    """Make all closer looks of searches, with the model that was not fitted to their picture.
+
+    Args:
+        searches: the searches.
+        folds: for each fold, the model fitted to the others.
+        limits: thresholds of closer looks; `confirm` is 1, so that no search ends at a place.
+        thresholds: thresholds of the evidence, which decide without closer looks (`unverified`).
+
+    Yields:
+        The searches.
+    """
+    for search in searches:
+        model = folds[search.picture % len(folds)]
+        verifier, count, ends = Verifier(model, search.candidates(), search.close_up, limits), 0, list[int]()
+        for index in range(len(search)):
+            count += 1
+            room = search.passes - count
+            verifier.see(search.look(index, count), last=search.last(index, room))
+            closer = len(verifier.look_closely(room))
+            ends += range(count + 1, count + closer + 1)
+            count += closer
+            if verifier.outcome() or count >= search.passes:
+                break
+        yield VerifiedSearch(
+            picture=search.picture,
+            present=search.present,
+            spare=search.spare,
+            places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
+            ends=tuple(ends),
+            presence=verifier.decision(over=True).probability,
+            looks=count,
+            unverified=unverified(search, thresholds),
+        )
+
+
+def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> SearchEnd:
+    """Decide along the looks of a search without closer looks; nothing is found without thresholds.
+
+    Args:
+        search: the search.
+        thresholds: thresholds of the evidence.
+
+    Returns:
+        The end of the search.
+    """
+    if thresholds is None:
+        return None, len(search)
+    for index in range(len(search)):
+        outcome = search.outcome(index, thresholds)
+        if outcome:
+            return (search.found(index) if OUTCOMES[outcome] == "found" else None), index + 1
+    return None, len(search)
+
+
+def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, surest: float = LEVELS[-1]) -> float:
+    """Choose the least threshold at which few enough absent targets are found.
+
+    Args:
+        searches: the searches.
+        false_alarms: maximum share of absent targets that may be found.
+        surest: upper limit of the threshold.
+
+    Returns:
+        The threshold, from `LEVELS`; `surest` if no smaller one suffices.
+    """
+    absent = [each for each in searches if not each.present]
+    for confirm in LEVELS:
+        if sum(each.found(confirm)[0] is not None for each in absent) <= false_alarms * len(absent):
+            return min(confirm, surest)
+    return surest
+
+
+def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
+    r"""Fit both logistic regressions by penalised maximum likelihood.
+
+    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \qquad
+              \lambda = 10^{-4}
+
+    where w' are the weights of the features scaled to zero mean and unit variance. With a prior the fit keeps close to
+    a model with parameters :math:`w_0, b_0`, the closer the fewer the closer looks:
+
+    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i)
+              + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right), \qquad \kappa = 10
+
+    This is the maximum a posteriori estimate for normal distributions around :math:`w'_0` and :math:`b'_0`.
+
+    Args:
+        closer: the closer looks.
+        chosen: `(N,)` boolean, the closer looks to fit to.
+        prior: model at the centre of the prior; None fits without.
+
+    Returns:
+        The model, without thresholds.
+
+    Raises:
+        DataError: fewer than two closer looks are chosen.
+    """
+    phi = closer.features[chosen].double()
+    if len(phi) < 2:
+        raise DataError(f"data: expected closer looks in all folds but one, got {len(phi)}; give more photographs")
+    goal = torch.stack([closer.right, closer.present], -1)[chosen].double()
+    mean, scale = phi.mean(0), phi.std(0).clamp(min=1e-6)
+    centre, level = torch.zeros(2, FEATURES, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    weights, biases = _RIDGE, 0.0
+    if prior is not None:
+        given = prior.linear.weight.detach().double()
+        centre, level = given * scale, prior.linear.bias.detach().double() + given @ mean
+        weights = biases = STRENGTH / len(phi)
+    weight, bias = centre.clone().requires_grad_(True), level.clone().requires_grad_(True)
+    optimiser = torch.optim.LBFGS([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        odds = (phi - mean) / scale @ weight.mT + bias
+        value = F.binary_cross_entropy_with_logits(odds, goal, reduction="none").mean(0).sum()
+        value = value + weights * (weight - centre).square().sum() + biases * (bias - level).square().sum()
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    model = Verification()
+    with torch.no_grad():
+        model.linear.weight.copy_(weight / scale)
+        model.linear.bias.copy_(bias - (weight / scale) @ mean)
+    return model.eval().requires_grad_(False)
+
+
+def shipped_mean() -> Verification:
+    """Return the mean of two shipped models (`SHIPPED`), without thresholds: the centre of the prior."""
+    known = [Verification.from_pretrained(name).linear for name in SHIPPED]
+    model = Verification()
+    with torch.no_grad():
+        model.linear.weight.copy_(torch.stack([each.weight for each in known]).mean(0))
+        model.linear.bias.copy_(torch.stack([each.bias for each in known]).mean(0))
+    return model.eval().requires_grad_(False)
+
+
+def report(
+    fitted: VerificationResult,
+    pictures: str,
+    how: str = "Each photograph is evaluated with a model fitted to other folds.",
+) -> tuple[str, dict[str, float | None]]:
+    """Evaluate the models in folds.
+
+    Args:
+        fitted: the models with their closer looks and searches.
+        pictures: number and kind of the pictures.
+        how: sentence on which pictures a model is evaluated.
+
+    Returns:
+        The report as Markdown, and its measures by name; None for an area that only one kind of searches leaves
+        undefined.
+    """
+    closer, searches = fitted.closer, fitted.searches
+    odds = torch.stack([fold(closer.features) for fold in fitted.folds])
+    odds = odds[closer.fold, torch.arange(len(closer.fold))]
+    figures: dict[str, float | None] = {}
+    for name, logit, there in (
+        ("cell", closer.features[:, 1], closer.right),
+        ("place", odds[:, 0], closer.right),
+        ("image", closer.features[:, 0], closer.present),
+        ("presence", odds[:, 1], closer.present),
+    ):
+        figures[f"{name}_nll"] = float(F.binary_cross_entropy_with_logits(logit, there.to(logit)))
+        figures[f"{name}_ece"] = float(calibration_error(logit.sigmoid(), there))
+        figures[f"{name}_area"] = _area(logit, there)
+    there = torch.tensor([each.present for each in searches])
+    figures["area"] = _area(torch.tensor([each.presence for each in searches]), there)
+    chances = [["", "NLL", "ECE", "area under ROC"]]
+    for where, name in (
+        ("at the place, before", "cell"),
+        ("at the place, after", "place"),
+        ("in the image, before", "image"),
+        ("in the image, after", "presence"),
+    ):
+        chances.append([where, *(_shown(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
+    assert fitted.model.thresholds is not None
+    chosen = fitted.model.thresholds.confirm
+    decisions = [["confirm", "found, there", "found, not there", "place right", "looks, there", "looks, not there"]]
+    decisions.append(["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])])
+    for confirm in sorted({*SHOWN, chosen}):
+        mark = " (chosen)" if confirm == chosen else ""
+        ended = [each.found(confirm) for each in searches]
+        decisions.append([f"{confirm:.2f}{mark}", *_row(there.tolist(), ended)])
+    return "\n".join(
+        [
+            f"{len(searches)} searches of {pictures}, {int(there.sum())} of them for a present class; "
+            f"{len(closer.fold)} closer looks. {how}",
+            "",
+            "Probability of the target before and after a closer look:",
+            "",
+            *table(chances),
+            "",
+            f"Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
+            f"the target evidence decide. Area under the ROC of the final probability: {_shown(figures['area'])}.",
+            "",
+            *table(decisions),
+            "",
+        ]
+    ), figures
+
+
+def _area(score: Tensor, there: Tensor) -> float | None:
+    return area_under_roc(score, there) if there.any() and not there.all() else None
+
+
+def _shown(figure: float | None) -> str:
+    return "-" if figure is None else f"{figure:.3f}"
+
+
+def _row(present: Sequence[bool], ended: Sequence[SearchEnd]) -> list[str]:
+    """Hits, false alarms, right places and looks of decisions."""
+    shares, places, looks = [], [], []
+    for kind in (True, False):
+        of_kind = [each for each, there in zip(ended, present, strict=True) if there == kind]
+        found = [right for right, _ in of_kind if right is not None]
+        shares.append(share(len(found), len(of_kind)))
+        looks.append(mean([end for _, end in of_kind]))
+        places += found
+    return [*shares, share(sum(places), len(places)), *looks]

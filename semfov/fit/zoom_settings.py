@@ -4,15 +4,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from semfov.runs.config import DataConfig, DetectorConfig
-from semfov.runs.settings import Count, Seed, Settings, Share, Workers
+from semfov.fit.settings import FitConfig
+from semfov.runs.config import DetectorConfig, WorkConfig
+from semfov.runs.settings import Count, Share
 from semfov.runs.window_looking import Tile
 
 Part = Literal["decision", "survey", "verification"]
 
 
 @dataclass(frozen=True)
-class FitZoomConfig(Settings):
+class FitZoomConfig(FitConfig, WorkConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
@@ -47,7 +48,6 @@ class FitZoomConfig(Settings):
         workers: number of processes (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
     mosaics: Count = 400
     far: Count = 40
@@ -67,7 +67,4 @@ class FitZoomConfig(Settings):
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300
-    seed: Seed = 0
     out: Path = Path("runs/fit_zoom")
-    cache: Path | None = None
-    workers: Workers | None = None

@@ -252,8 +252,23 @@ class ProtocolConfig(Settings):
 
 
 @dataclass(frozen=True)
-class WorkConfig(Settings):
-    """What every run and every fit has.
+class OutcomeConfig(Settings):
+    """What every run and every fit with a detector has.
+
+    Args:
+        detector: the detector.
+        out: folder of the outcomes.
+        cache: folder for what is stored, shared between runs (None: the user's cache).
+    """
+
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    out: Path = Path("runs")
+    cache: Path | None = None
+
+
+@dataclass(frozen=True)
+class WorkConfig(OutcomeConfig):
+    """What runs and fits in several processes have.
 
     Args:
         detector: the detector.
@@ -262,9 +277,6 @@ class WorkConfig(Settings):
         workers: number of processes (None: one per CPU core).
     """
 
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    out: Path = Path("runs")
-    cache: Path | None = None
     workers: Workers | None = None
 
 

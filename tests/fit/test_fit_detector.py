@@ -30,7 +30,7 @@ from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.held_out import Difference
-from semfov.fit.verification_decisions import Verified
+from semfov.fit.verification import VerifiedSearch
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
@@ -166,7 +166,7 @@ FITS = {
     "observation": "fit_model",
     "tempering": "hit_rates",
     "evidence": "fit_evidence",
-    "verification": "fit_and_verify",
+    "verification": "fit_in_folds",
     "map": "fit_map_evidence",
 }
 
@@ -373,7 +373,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.detector_parts.verification.fit_and_verify", fail)
+    monkeypatch.setattr("semfov.fit.detector_parts.verification.fit_in_folds", fail)
     assert main(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
@@ -386,7 +386,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
 def test_decisions_are_scored_by_photograph():
     """Present and absent classes have equal weight, whatever their number."""
     kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
-    searches = [Verified(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
+    searches = [VerifiedSearch(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
     ends = [(right, 2) for _, _, right in kinds]
     np.testing.assert_allclose(scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 

@@ -8,7 +8,7 @@ import torch
 from eval.calibration import main as calibrate
 from semfov import FovealObservationModel
 from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
 from semfov.observation import match
 from semfov.runs.config import DataConfig
 from semfov.runs.samples import Sampler, SampleSettings
@@ -55,7 +55,7 @@ def test_estimators_agree(fitted):
 
 def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, tmp_path):
     data = DataConfig(limit=6, min_instances=0, max_target_area=None)
-    fit_fom(FitConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
+    fit_fom(FitObservationConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
     figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
     # No comparison with raw scores: a hundred detections of four scenes are too few for it.
     assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
@@ -74,7 +74,9 @@ def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
 
 
 def test_samples_match_looks_at_random_fixations(tmp_path):
-    settings = SampleSettings(DataConfig(limit=2), FitConfig().detector, FitConfig().sensor, 2, 0.5, 0)
+    settings = SampleSettings(
+        DataConfig(limit=2), FitObservationConfig().detector, FitObservationConfig().sensor, 2, 0.5, 0
+    )
     sampler = Sampler(settings, tmp_path)
     samples = sampler.sample(0)
     scene = sampler.scenes[1]

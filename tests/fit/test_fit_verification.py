@@ -15,10 +15,21 @@ from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
-from semfov.fit.closer_looks import photographs, search
-from semfov.fit.verification_decisions import LEVELS, Verified, choose_confirm, verify
-from semfov.fit.verification_fit import SHIPPED, STRENGTH, Examined, examine, fit, shipped_mean
-from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.fit.searches import photograph_searches, photographs, search
+from semfov.fit.verification import (
+    LEVELS,
+    SHIPPED,
+    STRENGTH,
+    CloserLooks,
+    FitVerificationConfig,
+    VerifiedSearch,
+    choose_confirm,
+    examine,
+    fit,
+    fit_in_folds,
+    shipped_mean,
+    verify,
+)
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.io.storage import read
 from semfov.runs.looks import look_from
@@ -32,7 +43,9 @@ def examined(count=200, seed=0):
     generator = torch.Generator().manual_seed(seed)
     features = 2 * torch.randn(count, 7, generator=generator)
     noise = torch.randn(2, count, generator=generator)
-    return Examined(features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4)
+    return CloserLooks(
+        features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4
+    )
 
 
 def test_the_fit_minimises_the_penalised_cross_entropy():
@@ -58,7 +71,7 @@ def test_the_fit_ignores_the_closer_looks_that_are_held_out():
     known = examined()
     other = known.features.clone()
     other[known.fold == 2] = 100.0
-    changed = Examined(other, known.right, known.present, known.fold)
+    changed = CloserLooks(other, known.right, known.present, known.fold)
     assert torch.equal(fit(known, known.fold != 2).linear.weight, fit(changed, known.fold != 2).linear.weight)
 
 
@@ -109,9 +122,20 @@ def test_the_prior_is_the_mean_of_the_shipped_models():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
 
+def examined_in(seen, evidence, config):
+    """Closer looks at the most evident places of photographs."""
+    return examine(photograph_searches(seen, evidence, config.looks, "looking"), config.folds)
+
+
+def verified_in(seen, models, evidence, config):
+    """The searches of photographs with all their closer looks."""
+    limits = Thresholds(1.0, config.give_up, config.place)
+    return verify(photograph_searches(seen, evidence, config.looks, "verifying"), models, limits, evidence.thresholds)
+
+
 def searched(present, places, ends, presence, looks):
     """A search of a photograph without the search that makes no closer looks."""
-    return Verified(0, present, False, places, ends, presence, looks, (None, looks))
+    return VerifiedSearch(0, present, False, places, ends, presence, looks, (None, looks))
 
 
 PLACES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=3)
@@ -165,9 +189,9 @@ def seen():
 def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
     found, evidence = seen
     photograph = found[0]
-    first = list(search(photograph, photograph.sought[0], Target(evidence), 3))
+    first = list(search(photograph, photograph.targets[0], Target(evidence), 3))
     count = len(photograph.looks.looks)
-    again = list(search(photograph, photograph.sought[0], Target(evidence), 3))
+    again = list(search(photograph, photograph.targets[0], Target(evidence), 3))
     assert len(photograph.looks.looks) == count == 3
     view = photograph.eye.open(photograph.image)
     for one, other in zip(first, again, strict=True):
@@ -193,7 +217,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
     found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
     for _ in range(2):
         for one, other in zip(live, found, strict=True):
-            for sought in one.sought:
+            for sought in one.targets:
                 pairs = zip(*(search(each, sought, Target(evidence), 5) for each in (one, other)), strict=True)
                 for first, second in pairs:
                     torch.testing.assert_close(first.belief.probability(1), second.belief.probability(1))
@@ -207,13 +231,13 @@ def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
     few, many = (photographs(live[0].eye, live[0].scenes, [0, 1, 2], (4, 3), **options, spare=n) for n in (0, 1))
     config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
     for one, other in zip(few, many, strict=True):
-        assert [each.target for each in other.sought if not each.spare] == [each.target for each in one.sought]
-        assert all(not each.present for each in other.sought if each.spare)
-    assert any(each.spare for photograph in many for each in photograph.sought)
-    first, second = examine(few, evidence, config), examine(many, evidence, config)
+        assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]
+        assert all(not each.present for each in other.targets if each.spare)
+    assert any(each.spare for photograph in many for each in photograph.targets)
+    first, second = examined_in(few, evidence, config), examined_in(many, evidence, config)
     assert torch.equal(first.features, second.features)
-    searches = list(verify(many, 2 * [shipped_mean()], evidence, config))
-    assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.sought]
+    searches = list(verified_in(many, 2 * [shipped_mean()], evidence, config))
+    assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.targets]
 
 
 @pytest.mark.parametrize("confirm", [0.5, 0.7])
@@ -226,10 +250,10 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     model.thresholds = Thresholds(confirm, config.give_up, config.place)
     searching, exploring = (Target(evidence), NonPredictive()), (Semantic(4), Random())
     agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
-    searches = iter(verify(found, [model, model], evidence, config))
+    searches = iter(verified_in(found, [model, model], evidence, config))
     ends = []
     for photograph in found:
-        for sought in photograph.sought:
+        for sought in photograph.targets:
             verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1}
             scanpath = agent.search(photograph.image[0], sought.target, **options)
             right, looks = verified.found(confirm)
@@ -248,7 +272,7 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
 def test_classes_are_present_and_absent_as_the_goal_says(seen):
     for photograph in seen[0]:
         annotation = photograph.scenes.annotation(photograph.index)
-        for sought in photograph.sought:
+        for sought in photograph.targets:
             assert sought.present == (sought.target in annotation.labels.tolist())
             for cell in range(len(photograph.grid)):
                 alone = torch.zeros(len(photograph.grid)).bool()
@@ -261,20 +285,20 @@ def test_classes_are_present_and_absent_as_the_goal_says(seen):
 def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
     found, evidence = seen
     config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
-    known = examine(found, evidence, config)
+    known = examined_in(found, evidence, config)
     assert known.features.shape == (len(known.right), 7)
     assert set(known.fold.tolist()) == {0, 1}
     # A place can only be right in a photograph that holds the target.
     assert bool((known.present | ~known.right).all())
     models = [fit(known, known.fold != fold) for fold in (0, 1)]
-    searches = list(verify(found, models, evidence, config))
-    assert len(searches) == sum(len(photograph.sought) for photograph in found)
+    searches = list(verified_in(found, models, evidence, config))
+    assert len(searches) == sum(len(photograph.targets) for photograph in found)
     for each in searches:
         assert len(each.places) == len(each.ends) <= 2
         assert list(each.ends) == sorted(each.ends)
         assert each.looks >= max(each.ends, default=1)
     with pytest.raises(DataError, match="got only one kind"):
-        examine([], evidence, config)
+        fit_in_folds([], evidence, config)
 
 
 class Limited(Blobs):
@@ -295,8 +319,8 @@ def all_of(detector, store):
     """Examine and verify the embedded scenes."""
     config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
     found, evidence = opened(detector, store)
-    known = examine(found, evidence, config)
-    return known, list(verify(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
+    known = examined_in(found, evidence, config)
+    return known, list(verified_in(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
 
 
 def test_interrupted_searches_continue_with_the_stored_looks(tmp_path):

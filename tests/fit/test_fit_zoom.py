@@ -14,11 +14,12 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.verification import unverified, verify
 from semfov.fit.zoom import fit_zoom
 from semfov.fit.zoom_examples import example_of
 from semfov.fit.zoom_settings import FitZoomConfig
-from semfov.fit.zoom_verification import fit_closer, sought_in, unverified, verify
+from semfov.fit.zoom_verification import fit_closer, mosaic_searches
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
@@ -106,7 +107,7 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (96, 72))
-    config = FitConfig(
+    config = FitObservationConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
         out=tmp_path / "out", workers=1,
@@ -166,17 +167,17 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
     config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
-    searches = list(sought_in(model, scenes, opened, config, "test"))
+    searches = list(mosaic_searches(model, scenes, opened, config, "test"))
     names = "background", *scenes.classes
     for sought in searches:
-        assert sought.present == (sought.target in scenes.annotation(sought.mosaic).labels.tolist())
+        assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
         path = search(sought.looks, model, names, sought.target, passes=8)
         found, count = unverified(sought, model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
-        assert [turn.glance.window for turn in sought.turns[:count]] == [each.window for each in path.glances]
+        assert [glance.window for glance in sought.glances[:count]] == [each.window for each in path.glances]
         if found is not None:
-            boxes = scenes.annotation(sought.mosaic).boxes[scenes.annotation(sought.mosaic).labels == sought.target]
+            boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
     kinds = "searched", "judged"
     text = fit_closer(model, dict.fromkeys(kinds, scenes), dict.fromkeys(kinds, opened), config)
@@ -185,7 +186,9 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     assert f"| {fitted.confirm:.2f} (chosen)" in text
     # The searches from which the threshold was chosen end as those of the agent.
     ends = []
-    for sought, each in zip(searches, verify(searches, model.verification, model, config), strict=True):
+    limits = Thresholds(1.0, model.thresholds.give_up, config.place)
+    again = verify(searches, [model.verification], limits, model.thresholds)
+    for sought, each in zip(searches, again, strict=True):
         path = search(sought.looks, model, names, sought.target, passes=8)
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)

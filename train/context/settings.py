@@ -1,6 +1,6 @@
 """The cells that the objects of photographs occupy, from which context is counted."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes, legal_targets
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight, Whole, Workers
+from semfov.fit.settings import FovealFitConfig
+from semfov.runs.config import WorkConfig
+from semfov.runs.settings import Count, Name, Positive, Range, Share, Side, Weight, Whole
 
 
 @dataclass(frozen=True)
-class FitContextConfig(Settings):
+class FitContextConfig(FovealFitConfig, WorkConfig):
     """Fit the context of searches.
 
     Args:
-        data: photographs to learn from (by default all of them, however many objects they have).
         name: name of the model.
         resolution: rows and columns of the grid on which places are counted.
         edges: borders between the bands of distance, in units of the image's longer side. The last band has no upper
@@ -46,7 +46,6 @@ class FitContextConfig(Settings):
         heights: CSV table of classes by heights in a picture, to use with `table`.
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     name: Name = "coco"
     resolution: Side = 10
     edges: tuple[Weight, ...] = (0.0, 0.15, 0.35)
@@ -56,17 +55,12 @@ class FitContextConfig(Settings):
     pair_smoothing: Positive = 20.0
     holdout: Annotated[int, Range(2, 10**9)] = 10
     weigh: Whole = 0
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     fixations: Count = 8
     iou: Share = 0.5
-    seed: Seed = 0
     shard: Count = 32
     folds: Annotated[int, Range(2, 1000)] = 5
     min_objects: Whole = 4
     out: Path = Path("runs/fit_context")
-    cache: Path | None = None
-    workers: Workers | None = None
     table: Path | None = None
     source: str | None = None
     heights: Path | None = None

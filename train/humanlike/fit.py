@@ -18,13 +18,21 @@ from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, lookup
 from semfov.eye import Eye
 from semfov.fit.outputs import model_path, write_outputs
+from semfov.fit.settings import NameConfig
 from semfov.runs.candidates import Candidate, load_models, make_strategy
-from semfov.runs.config import BeliefConfig, DetectorConfig, PolicyConfig, RunConfig, SaliencyConfig, SensorConfig
+from semfov.runs.config import (
+    BeliefConfig,
+    OutcomeConfig,
+    PolicyConfig,
+    RunConfig,
+    SaliencyConfig,
+    SensorConfig,
+)
 from semfov.runs.presets import label, resolve
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import saliency_table
 from semfov.runs.scene_run import cache_folder
-from semfov.runs.settings import Count, Name, Positive, Settings
+from semfov.runs.settings import Count, Positive
 from semfov.runs.setup import make_eye, prepare_worker
 from semfov.runs.store import cell_store
 from train.humanlike.habits import Halves, fit_terms, habits_of
@@ -33,7 +41,7 @@ from train.humanlike.viewings import Choices, cells_of, choices_in, values_in
 
 
 @dataclass(frozen=True)
-class FitHumanlikeConfig(Settings):
+class FitHumanlikeConfig(NameConfig, OutcomeConfig):
     """Fit a model of how people choose their next fixation.
 
     Args:
@@ -49,14 +57,12 @@ class FitHumanlikeConfig(Settings):
         limit: use only the first so many pictures (None: all).
         ridge: penalty on the squares of the weights.
         smoothing: number of fixations added to every cell when the centre bias is counted.
-        name: name of the model (None: the detector's name).
         out: folder for the model and the report.
         cache: folder for the detections from every cell, shared with other runs (None: the user's cache).
     """
 
-    root: Path
-    fixations: Path
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    root: Path = field(kw_only=True)
+    fixations: Path = field(kw_only=True)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture", reduction="mean"))
@@ -65,9 +71,7 @@ class FitHumanlikeConfig(Settings):
     limit: Count | None = None
     ridge: Positive = 1.0
     smoothing: Positive = 1.0
-    name: Name | None = None
     out: Path = Path("runs/fit_humanlike")
-    cache: Path | None = None
 
 
 def fit_humanlike(config: FitHumanlikeConfig) -> None:

@@ -12,7 +12,7 @@ from semfov.fit.detector_words import in_words, section
 from semfov.fit.held_out import Difference
 from semfov.fit.misses import count_misses
 from semfov.fit.observation import fit_model
-from semfov.fit.observation_settings import FitConfig
+from semfov.fit.observation_settings import FitObservationConfig
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.samples import cells_of
@@ -25,7 +25,7 @@ class ObservationFit(PartFit):
     name: ClassVar[str] = "observation"
 
     @property
-    def settings(self) -> FitConfig:
+    def settings(self) -> FitObservationConfig:
         """The settings of the observation model."""
         return self.config.observation
 

@@ -10,16 +10,20 @@ import numpy as np
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.fit.closer_looks import photographs
 from semfov.fit.detector_parts.evidence import SUREST_OF_FEW
 from semfov.fit.detector_parts.part import Fitted, PartFit
 from semfov.fit.detector_words import in_words
 from semfov.fit.held_out import Array, Difference
 from semfov.fit.outputs import training_of
-from semfov.fit.verification_decisions import Ended, Verified
-from semfov.fit.verification_fit import fit_and_verify, shipped_mean
-from semfov.fit.verification_report import report
-from semfov.fit.verification_settings import FitVerificationConfig
+from semfov.fit.searches import photographs
+from semfov.fit.verification import (
+    FitVerificationConfig,
+    SearchEnd,
+    VerifiedSearch,
+    fit_in_folds,
+    report,
+    shipped_mean,
+)
 from semfov.io.manifest import Part
 
 ABSENT = 200
@@ -73,7 +77,7 @@ class VerificationFit(PartFit):
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(seen)), give_up=give_up)
-        fitted = fit_and_verify(seen, evidence, config, shipped_mean(), SUREST_OF_FEW)
+        fitted = fit_in_folds(seen, evidence, config, shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
@@ -93,7 +97,7 @@ class VerificationFit(PartFit):
         return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, f"{len(seen)} photographs")[0])
 
 
-def scores(searches: Sequence[Verified], ends: Sequence[Ended]) -> Array:
+def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> Array:
     """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
 
     Args:
@@ -106,5 +110,5 @@ def scores(searches: Sequence[Verified], ends: Sequence[Ended]) -> Array:
     known: dict[int, dict[bool, list[int]]] = {}
     for each, (right, _) in zip(searches, ends, strict=True):
         score = 0 if right is None else 1 if right else -1
-        known.setdefault(each.photograph, {}).setdefault(each.present, []).append(score)
+        known.setdefault(each.picture, {}).setdefault(each.present, []).append(score)
     return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in known.values()])

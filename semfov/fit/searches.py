@@ -1,30 +1,110 @@
-"""Searches of photographs that can be repeated: looks and closer looks are made once, and remembered or stored."""
+"""Searches that a verification is fitted to, and those of photographs, whose looks are made once, and remembered."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Generic
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Observer
+from semfov.belief.observers import Observer, Target
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
+from semfov.decision import CandidateCells, CandidatePlaces, cell_of, conclude, decide
+from semfov.decision.candidates import Look
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.runs.looks import Box, photograph_looks
+from semfov.runs.progress import track
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for
 from semfov.runs.store import DetectionStore
 
 
+class TargetSearch(ABC, Generic[Look]):
+    """Base of the searches for a class in a picture, with all their looks but the closer ones.
+
+    Decisions do not move the gaze, so all of them can be made along the same looks.
+
+    Args:
+        picture: number of the picture.
+        target: the class, 1..K.
+        present: whether the picture holds it.
+        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
+        passes: maximum number of looks of both kinds.
+
+    Attributes:
+        after: numbers of looks after which places are examined for the fit.
+    """
+
+    after: ClassVar[tuple[int, ...]]
+
+    def __init__(
+        self, picture: int, target: int, *, present: bool, spare: bool = False, passes: float = math.inf
+    ) -> None:
+        self.picture, self.target, self.present, self.spare, self.passes = picture, target, present, spare, passes
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of looks."""
+
+    @abstractmethod
+    def look(self, index: int, number: int) -> Look:
+        """Return a look.
+
+        Args:
+            index: index of the look.
+            number: number of looks of both kinds up to it.
+
+        Returns:
+            The look.
+        """
+
+    @abstractmethod
+    def candidates(self) -> CandidatePlaces[Look]:
+        """Make the source of places to look at closely."""
+
+    @abstractmethod
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+
+    @abstractmethod
+    def right(self, box: Tensor) -> bool:
+        """Whether the target is at a box `(4,)`."""
+
+    @abstractmethod
+    def last(self, index: int, room: float) -> bool:
+        """Whether no look follows.
+
+        Args:
+            index: index of the look.
+            room: number of looks of both kinds that are left.
+
+        Returns:
+            Whether it is the last one.
+        """
+
+    @abstractmethod
+    def outcome(self, index: int, thresholds: Thresholds) -> int:
+        """Number of the outcome after a look without closer looks, 0 for a search that continues (`settle`)."""
+
+    @abstractmethod
+    def found(self, index: int) -> bool:
+        """Whether the place is right at which a search without closer looks finds the target after a look."""
+
+
 @dataclass(frozen=True)
-class Sought:
+class SearchTarget:
     """A class to search for in a photograph.
 
     Attributes:
@@ -54,7 +134,7 @@ class Photograph:
         index: index of the photograph.
         number: number of the photograph among those that are searched.
         grid: the cells.
-        sought: the classes to search for.
+        targets: the classes to search for.
         store: store of all looks; None keeps them in memory.
         everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
     """
@@ -66,12 +146,12 @@ class Photograph:
         index: int,
         number: int,
         grid: Grid,
-        sought: tuple[Sought, ...],
+        targets: tuple[SearchTarget, ...],
         store: DetectionStore | None = None,
         everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.sought, self.store, self.everywhere = grid, sought, store, everywhere
+        self.grid, self.targets, self.store, self.everywhere = grid, targets, store, everywhere
         self.looks: RememberedLooks[int | Box, Detections] = RememberedLooks(
             lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
         )
@@ -146,7 +226,7 @@ def photographs(
         max_area: classes that cover a larger share of the image are left out.
         seed: seed of the classes and of the first fixations.
         store: store of all looks; None keeps them in memory.
-        spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
+        spare: maximum number of further absent classes, which only serve to choose thresholds (`SearchTarget.spare`).
         everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
 
     Returns:
@@ -162,8 +242,8 @@ def photographs(
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
         wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
-        sought = tuple(
-            Sought(
+        wanted = tuple(
+            SearchTarget(
                 target,
                 covered[annotation.labels == target].any(0),
                 torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
@@ -172,18 +252,22 @@ def photographs(
             for number, target in enumerate(wide)
         )
         if targets:
-            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, everywhere))
+            found.append(Photograph(eye, scenes, index, len(found), grid, wanted, store, everywhere))
     return found
 
 
 def search(
-    photograph: Photograph, sought: Sought, observer: Observer, looks: int, ends: Callable[[Step], Tensor] | None = None
+    photograph: Photograph,
+    target: SearchTarget,
+    observer: Observer,
+    looks: int,
+    ends: Callable[[Step], Tensor] | None = None,
 ) -> Iterator[Step]:
     """Search a photograph for a class, where it is most probable.
 
     Args:
         photograph: the photograph.
-        sought: the class.
+        target: the class.
         observer: turns looks into a belief.
         looks: maximum number of looks.
         ends: maps a step to a number `(1,)` above 0 that ends the search; None makes all looks.
@@ -191,7 +275,83 @@ def search(
     Returns:
         The steps.
     """
-    source = PhotographLooks(photograph, sought.target)
+    source = PhotographLooks(photograph, target.target)
     choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
     rule = None if ends is None else lambda step: ends(step) > 0
-    return rollout(source, observer, TargetPosterior(sought.target), sought.start, choice, most=looks, ends=rule)
+    return rollout(source, observer, TargetPosterior(target.target), target.start, choice, most=looks, ends=rule)
+
+
+class PhotographSearch(TargetSearch[Step]):
+    """A search of a photograph, where the class is most probable.
+
+    Args:
+        photograph: the photograph.
+        target: the class.
+        evidence: the target evidence.
+        looks: number of looks.
+    """
+
+    after = (1, 3, 5, 8, 12)
+
+    def __init__(self, photograph: Photograph, target: SearchTarget, evidence: TargetEvidence, looks: int) -> None:
+        super().__init__(photograph.number, target.target, present=target.present, spare=target.spare)
+        self.photograph, self.goal = photograph, target.goal
+        self._search = lambda: search(photograph, target, Target(evidence), looks)
+
+    @cached_property
+    def steps(self) -> list[Step]:
+        """The steps."""
+        return list(self._search())
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def look(self, index: int, number: int) -> Step:
+        """Return a step."""
+        return self.steps[index]
+
+    def candidates(self) -> CandidateCells:
+        """Make the source of cells to look at closely."""
+        return CandidateCells(self.photograph.grid, self.target)
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+        return self.photograph.close_up(box)
+
+    def right(self, box: Tensor) -> bool:
+        """Whether an object of the class overlaps the cell of a box `(4,)`."""
+        return bool(self.goal[cell_of(box, self.photograph.grid)])
+
+    def last(self, index: int, room: float) -> bool:
+        """Whether it is the last step."""
+        return index + 1 == len(self.steps)
+
+    def outcome(self, index: int, thresholds: Thresholds) -> int:
+        """Number of the outcome by the belief alone."""
+        return int(decide(self.steps[index], self.target, thresholds))
+
+    def found(self, index: int) -> bool:
+        """Whether an object of the class overlaps the cell with the strongest evidence."""
+        shown = [step.detections for step in self.steps[: index + 1]]
+        decision = conclude(1, self.steps[index].belief, shown, self.photograph.grid, self.target)
+        return bool(self.goal[decision.cell])
+
+
+def photograph_searches(
+    seen: Sequence[Photograph], evidence: TargetEvidence, looks: int, title: str
+) -> Iterator[PhotographSearch]:
+    """Search photographs for all their classes; after the searches of a photograph, its looks are stored and freed.
+
+    Args:
+        seen: the photographs.
+        evidence: the target evidence.
+        looks: number of looks in a search.
+        title: label of the progress bar.
+
+    Yields:
+        The searches.
+    """
+    for photograph in track(seen, title, "photograph"):
+        for target in photograph.targets:
+            yield PhotographSearch(photograph, target, evidence, looks)
+        photograph.close()
