@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, Scanpath
+from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
 from semfov.detection import Candidates, Detections, Detector, Selection
@@ -39,6 +39,11 @@ def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections
     return Detections(boxes, scores, torch.rand(cells, most, generator=generator) < 0.6)
 
 
+def values_of(acquisition: nn.Module, beta: Tensor) -> Tensor:
+    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
+    return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
+
+
 def model() -> FovealObservationModel:
     """An observation model of three levels, with miss rates."""
     alpha = 0.5 + 4 * rand(4, 3, 4) + 3 * torch.eye(4)[:, None]
@@ -62,6 +67,20 @@ def mapping() -> MapEvidence:
 def observing() -> Semantic:
     """The observer of the paper with an untrained observation model."""
     return Semantic(4, model().requires_grad_(False))
+
+
+def score_evidence(kind: type[MapEvidence] | type[TargetEvidence]) -> MapEvidence | TargetEvidence:
+    """A model whose evidence is the clipped score of a class, and nothing else: no correction of cell or image."""
+    model = kind(4, 4, components=4).requires_grad_(False).eval()
+    for parameter in model.parameters():
+        parameter.zero_()
+    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
+    model.look[0].weight[0, 1] = 100
+    model.look[0].bias[0] = -60
+    model.look[2].weight[0, 0] = 1
+    model.look[4].weight[0, 0] = 0.25
+    model.look[4].bias[0] = -4
+    return model
 
 
 class FixedLook(Semantic):
@@ -100,6 +119,22 @@ def look() -> tuple[Tensor, Tensor, Tensor]:
 def detections(scores: Tensor, boxes: Tensor) -> Detections:
     """Detections without padding."""
     return Detections(boxes, scores, torch.ones(scores.shape[:2], dtype=torch.bool, device=scores.device))
+
+
+def scanpath(
+    grid: Grid, cells: Tensor, classes: tuple[str, ...] = ("background", "cat", "cup"), **given: object
+) -> Scanpath:
+    """A scanpath with random probabilities and values and without detections, unless they are given."""
+    looks, generator = len(cells), torch.Generator().manual_seed(0)
+    settings = {
+        "target": None,
+        "fixations": grid.centres[cells],
+        "detections": (Detections.empty(1, len(classes) - 1),) * looks,
+        "probabilities": torch.rand(looks, len(grid), len(classes), generator=generator),
+        "values": torch.rand(looks, len(grid), generator=generator),
+        "found": False,
+    }
+    return Scanpath(grid=grid, classes=classes, cells=cells, **settings | given)
 
 
 class Blobs(Detector):

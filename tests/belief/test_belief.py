@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-import semfov
 from semfov import Detections, Grid, InputError
 from semfov.belief import Belief, ContextPrior, DirichletBelief, TargetEvidence
 from semfov.belief.belief import dirichlet_belief, pick
@@ -168,11 +167,6 @@ def test_pick_selects_one_component_per_row():
     assert torch.equal(pick(values, torch.tensor(3)), values[..., 3])
 
 
-def test_gradients_reach_the_parameters():
-    beta = rand(2, 3, 4).requires_grad_()
-    assert torch.autograd.gradcheck(lambda b: DirichletBelief(b).probability(torch.tensor([1, 3])), beta)
-
-
 def test_beliefs_can_be_created_inside_a_compiled_graph():
     def present(beta):
         return DirichletBelief(beta).probability(2)
@@ -180,12 +174,6 @@ def test_beliefs_can_be_created_inside_a_compiled_graph():
     torch.compiler.reset()
     compiled = torch.compile(present, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(rand(2, 3, 4)), present(rand(2, 3, 4)))
-
-
-def test_beliefs_and_observers_are_public():
-    assert semfov.DirichletBelief is DirichletBelief
-    assert semfov.Belief is Belief
-    assert semfov.observers.Semantic is Semantic
 
 
 def test_put_replaces_the_beliefs_of_the_given_episodes():

@@ -172,14 +172,6 @@ def test_log_odds_of_certain_cells_are_finite():
     assert got.tolist() == pytest.approx([math.log(1e-6), math.log(0.25), 0, -math.log(1e-6)], rel=1e-6)
 
 
-def test_weights_of_zero_change_nothing(prior, looks):
-    inner = observers()[1]
-    observer = Context(inner, prior, (0.0, 0.0))
-    after = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID, 1))
-    plain = inner.update(inner.start(3, GRID, looks.scores), inner.weigh(looks, FIXATIONS, GRID, 1))
-    torch.testing.assert_close(after.present, plain.probability(1))
-
-
 def test_a_prior_saved_and_loaded_is_the_same_up_to_half_precision(tmp_path, prior):
     prior.save(tmp_path / "toy.safetensors")
     loaded = ContextPrior.from_pretrained(tmp_path / "toy.safetensors")

@@ -90,12 +90,6 @@ def test_the_permuted_control_has_the_same_values_for_other_classes(path):
     assert control.digest() != prior.digest()
 
 
-def test_a_prior_saved_and_loaded_keeps_the_record_of_its_source(path, tmp_path):
-    prior = ContextPrior.from_table(path, CLASSES, source="a test")
-    prior.save(tmp_path / "p.safetensors")
-    assert ContextPrior.from_pretrained(tmp_path / "p.safetensors").metadata == prior.metadata
-
-
 def test_a_written_table_is_read_back_unchanged(tmp_path):
     names, values = ["cup", 'a "b", c', "two\r\nlines"], torch.tensor([[math.nan, 0.125], [-3.5, 7.0], [1000, -1000]])
     values = torch.cat([values, values[:, :1]], 1)

@@ -1,4 +1,4 @@
-"""Inputs of the networks that read several looks, against numpy and scipy."""
+"""Models of evidence of both kinds: inputs of the networks that read several looks, and incomplete files."""
 
 import math
 
@@ -11,6 +11,8 @@ from torch import nn
 from semfov.belief.evidence import READOUT, blur, logarithm, nearness, network
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.errors import DataError
+from semfov.io.storage import write
 
 
 class Recorder(nn.Module):
@@ -117,3 +119,43 @@ def test_all_classes_start_with_the_same_prior(kind):
     assert model.metadata == {}
     features = torch.randn(2, 3, 10)
     assert model.evidence(features).shape == (2, 3)
+
+
+# What is wrong with a file; the other lists are only about models of one kind.
+DAMAGES = {
+    "no components": lambda record, tensors: record.pop("components"),
+    "no widths": lambda record, tensors: record.pop("widths"),
+    "no metadata": lambda record, tensors: record.pop("metadata"),
+    "classes": lambda record, tensors: record.update(components=9),
+    "no number": lambda record, tensors: record.update(components="many"),
+    "widths": lambda record, tensors: record.update(widths=[8, 7]),
+    "one width": lambda record, tensors: record.update(widths=8),
+    "no prior": lambda record, tensors: tensors.pop("prior"),
+    "one tensor more": lambda record, tensors: tensors.update(more=torch.zeros(1)),
+}
+OF_MAPS = {
+    "no emptiness": lambda record, tensors: tensors.pop("void.0.weight"),
+    "no gain": lambda record, tensors: tensors.pop("worth.4.bias"),
+}
+OF_TARGETS = {
+    "no thresholds": lambda record, tensors: record.pop("thresholds"),
+    "half a threshold": lambda record, tensors: record.update(thresholds={"confirm": 0.5}),
+    "no judge": lambda record, tensors: tensors.pop("judge.0.weight"),
+    "no guide": lambda record, tensors: tensors.pop("guide.4.bias"),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage"),
+    [(MapEvidence, name) for name in DAMAGES | OF_MAPS] + [(TargetEvidence, name) for name in DAMAGES | OF_TARGETS],
+)
+def test_incomplete_files_are_refused(tmp_path, kind, damage):
+    """Among them files of earlier versions, without a prior or a network for presence."""
+    model, path = kind(8, 6, components=4), tmp_path / "old.safetensors"
+    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
+    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
+    (DAMAGES | OF_MAPS | OF_TARGETS)[damage](record, tensors)
+    write(path, tensors, record)
+    named = "map" if kind is MapEvidence else "target"
+    with pytest.raises(DataError, match=rf"old\.safetensors: not a complete model of {named} evidence"):
+        kind.from_pretrained(path)

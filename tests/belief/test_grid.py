@@ -1,6 +1,7 @@
 """The grid against loops over cells and pixels."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -137,9 +138,7 @@ def test_distances_are_in_units_of_the_longer_side():
         lambda: Grid(0, 3, (10, 10)),
         lambda: Grid(3, 3, (10, 0)),
         lambda: Grid(3, 3, (10, 10, 10)),
-        lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(4)),
         lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"),
-        lambda: Grid(3, 3, (10, 10)).cell_of(torch.zeros(3)),
     ],
 )
 def test_bad_input(call):
@@ -176,7 +175,7 @@ def test_nan_and_infinity_are_refused_by_name(number):
     grid, box, point = Grid(3, 2, (30, 20)), torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([1.0, number])
     bad = torch.where(box == 3, number, box)
     for name, call in (
-        ("boxes", lambda: grid.footprint(bad)),
+        *(("boxes", partial(grid.footprint, bad, rule)) for rule in ("overlap", "centre", "box_centre", "soft")),
         ("boxes", lambda: grid.box_distance(bad, torch.zeros(2))),
         ("fixation", lambda: grid.box_distance(box, point)),
         ("points", lambda: grid.cell_of(point)),

@@ -222,46 +222,6 @@ def test_a_model_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
         loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda record, tensors: record.pop("components"),
-        lambda record, tensors: record.pop("widths"),
-        lambda record, tensors: record.pop("metadata"),
-        lambda record, tensors: record.update(components=9),
-        lambda record, tensors: record.update(components="many"),
-        lambda record, tensors: record.update(widths=[8, 7]),
-        lambda record, tensors: record.update(widths=8),
-        lambda record, tensors: tensors.pop("prior"),
-        lambda record, tensors: tensors.pop("void.0.weight"),
-        lambda record, tensors: tensors.pop("worth.4.bias"),
-        lambda record, tensors: tensors.update(more=torch.zeros(1)),
-    ],
-    ids=[
-        "no components",
-        "no widths",
-        "no metadata",
-        "classes",
-        "no number",
-        "widths",
-        "one width",
-        "no prior",
-        "no emptiness",
-        "no gain",
-        "one tensor more",
-    ],
-)
-def test_incomplete_files_are_refused(tmp_path, toy_map, change):
-    model = toy_map()
-    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
-    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
-    change(record, tensors)
-    path = tmp_path / "old.safetensors"
-    write(path, tensors, record)
-    with pytest.raises(DataError, match=r"old\.safetensors: not a complete model of map evidence"):
-        MapEvidence.from_pretrained(path)
-
-
 def test_files_of_another_kind_and_damaged_ones_are_refused(tmp_path, toy_map):
     model = toy_map()
     tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}

@@ -1,23 +1,20 @@
-"""Learned target evidence: features, memory and read-out against loops in scalars, the neighbourhoods against scipy."""
+"""Learned target evidence: memory against loops in scalars, read-out against numpy and scipy."""
 
 import math
 from dataclasses import fields
 
 import numpy as np
 import pytest
-import scipy.ndimage
 import torch
 
-from semfov import Detections, FovealObservationModel, Grid
+from semfov import Detections, Grid
 from semfov.belief import TargetEvidence
-from semfov.belief.evidence import Gathered, _peak, blur
-from semfov.belief.look_features import FEATURES, look_features
+from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.observers.target import TargetLook
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
-from semfov.gaze.acquisition import KLDivergence
-from semfov.io.storage import write
+from tests import small
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -41,147 +38,35 @@ FIXATED = [0, 9, 20]
 FIXATIONS = GRID.centres[FIXATED]
 
 
-def test_features_equal_a_loop(looks):
-    got = look_features(looks, FIXATIONS, GRID, 2)
-    assert got.shape == (3, 24, FEATURES)
-    for look in range(3):
-        for cell in range(24):
-            assert got[look, cell].tolist() == pytest.approx(features_by_loop(looks, look, cell), abs=1e-4)
-
-
-def features_by_loop(looks, look, cell):
-    distance = float(torch.linalg.vector_norm(GRID.centres[cell] - FIXATIONS[look])) / 90
-    chosen, touched = None, []
-    for detection in range(5):
-        weight = float(GRID.footprint(looks.boxes[look, detection][None], "soft")[0, cell])
-        if not looks.mask[look, detection] or weight == 0:
-            continue
-        background, score = (float(looks.scores[look, detection, k]) for k in (0, 2))
-        box = looks.boxes[look, detection]
-        size = float(((box[2] - box[0]) * (box[3] - box[1]) / 5400).sqrt())
-        touched.append((score, 1 - background, weight))
-        if chosen is None or score * weight > chosen[0] * chosen[2]:
-            chosen = (score, 1 - background, weight, size)
-    if chosen is None:
-        floor = np.log(1e-6) / 4 + 1
-        return [4 * distance, floor, floor, 0, 0, 0, 0, 0, 0, 1]
-    score, objectness, weight, size = chosen
-    return [
-        4 * distance,
-        np.log(score * weight) / 4 + 1,
-        np.log(max(s for s, _, _ in touched)) / 4 + 1,
-        2 * objectness,
-        2 * weight,
-        3 * size,
-        2 * score / objectness,
-        2 * max(o * w for _, o, w in touched),
-        2 * max((o - s) * w for s, o, w in touched),
-        0,
-    ]
-
-
-def test_looks_without_any_detection():
-    nothing = look_features(Detections.empty(2, 3), FIXATIONS[:2], GRID, 1)
-    assert torch.equal(nothing[..., 9], torch.ones(2, 24))
-    assert torch.isfinite(nothing).all()
-
-
-def test_blur_and_local_maxima_match_scipy():
-    torch.manual_seed(0)
-    values = torch.rand(2, 24, dtype=torch.float64)
-    steps = np.arange(-3, 4)
-    kernel = np.exp(-(steps**2) / (2 * 0.8**2))
-    kernel /= kernel.sum()
-    for image, blurred, peak in zip(values, blur(values, 6, 0.8), _peak(values, 6), strict=True):
-        grid = image.reshape(4, 6).numpy()
-        expected = scipy.ndimage.convolve(grid, np.outer(kernel, kernel), mode="constant")
-        np.testing.assert_allclose(blurred.reshape(4, 6), expected, atol=1e-12)
-        np.testing.assert_allclose(peak.reshape(4, 6), scipy.ndimage.maximum_filter(grid, 3, mode="nearest"))
-
-
 def sigmoid(value):
     return 1 / (1 + math.exp(-value))
 
 
-def run_network(network, inputs):
-    """A network of two hidden layers, in float64 scalars of numpy."""
-    value = np.array(inputs, dtype=np.float64)
-    for number, layer in enumerate(network):
-        if number % 2:
-            value = np.array([x / 2 * (1 + math.erf(x / math.sqrt(2))) for x in value])
-        else:
-            value = layer.weight.detach().double().numpy() @ value + layer.bias.detach().double().numpy()
-    return float(value[0])
-
-
-def log_scaled(odds):
-    return math.log(odds + 1e-3) / 2 + 1
-
-
-def blurred(odds, sigma, columns=6):
-    """Gaussian average over cells at most 3 cells apart, with zeros outside the grid."""
-    kernel = [math.exp(-(step**2) / (2 * sigma**2)) for step in range(-3, 4)]
-    kernel = [value / sum(kernel) for value in kernel]
-    answer = []
-    for cell in range(len(odds)):
-        total = 0.0
-        for other in range(len(odds)):
-            down, right = other // columns - cell // columns, other % columns - cell % columns
-            if abs(down) <= 3 and abs(right) <= 3:
-                total += odds[other] * kernel[down + 3] * kernel[right + 3]
-        answer.append(total)
-    return answer
-
-
-def read_cells(network, known, prior, nearest, more=None):
-    """Output of a network for 6 × 4 cells, cell by cell in scalars."""
-    best, mean, closest = known["best"], known["mean"], known["closest"]
-    odds = [sigmoid(value) for value in nearest]
-    narrow, wide = blurred(odds, 0.6), blurred(odds, 1.5)
-    cells = []
-    for cell in range(24):
-        down, right = divmod(cell, 6)
-        around = [nearest[o] for o in range(24) if abs(o // 6 - down) <= 1 and abs(o % 6 - right) <= 1]
-        y, x = 2 * down / 3 - 1, 2 * right / 5 - 1
-        inputs = [
-            nearest[cell] / 2 + 1,
-            best[cell] / 2 + 1,
-            mean[cell] / 2 + 1,
-            4 * closest[cell],
-            log_scaled(narrow[cell]),
-            log_scaled(wide[cell]),
-            max(around) / 2 + 1,
-            max(nearest) / 2,
-            max(best) / 2,
-            log_scaled(sum(odds)),
-            x**2 + y**2,
-            y,
-            math.log(known["looks"]) / 2,
-            prior,
-        ]
-        inputs += [] if more is None else [more[cell]]
-        cells.append(nearest[cell] + run_network(network, inputs))
-    return cells
-
-
-def read_out(model, known, target):
+def read_out(reference, model, known, target):
     """Log odds of all cells, of all cells if no fixated cell holds the target, and of presence."""
-    nearest, prior, visited = known["nearest"], float(model.prior[target]), known["visited"]
-    cells = read_cells(model.read, known, prior, nearest)
-    emptied = [-8.0 if seen else value for value, seen in zip(nearest, visited, strict=True)]
-    following = read_cells(model.guide, known, prior, emptied, blurred([float(seen) for seen in visited], 0.6))
+    nearest, best, mean, closest, visited = (
+        np.array(known[name]) for name in ("nearest", "best", "mean", "closest", "visited")
+    )
+    prior = float(model.prior[target])
+
+    def read(network, values, *more):
+        features = reference.readout_features(values, best, mean, closest, known["looks"], prior, 6)
+        return values + reference.run_network(network, np.column_stack([features, *more]))
+
+    cells = read(model.read, nearest)
+    following = read(model.guide, np.where(visited, -8.0, nearest), reference.blurred(visited.astype(float), 6, 0.6))
     inputs = [
         max(cells) / 3,
         math.log(sum(math.exp(value) for value in cells)) / 3,
         sorted(cells)[-5] / 3,
-        max(known["best"]) / 3,
+        max(best) / 3,
         max(nearest) / 3,
-        4 * sum(known["closest"]) / 24,
+        4 * sum(closest) / 24,
         math.log(known["looks"]) / 2,
         prior,
-        log_scaled(known["score"]),
+        reference.log_scaled(known["score"]),
     ]
-    return cells, following, max(cells) + run_network(model.judge, inputs)
+    return cells, following, max(cells) + reference.run_network(model.judge, inputs)
 
 
 def gather_by_loop(looks, model, order, target):
@@ -219,12 +104,12 @@ def believe(observer, looks, order, target):
 
 @pytest.mark.parametrize("order", [(0,), (2,), (0, 1, 2), (2, 1, 0), (1, 1, 0)], ids=str)
 @pytest.mark.parametrize("target", [1, 3])
-def test_belief_equals_a_loop_over_looks_and_cells(looks, model, order, target):
+def test_belief_equals_a_loop_over_looks_and_cells(looks, model, reference, order, target):
     with torch.no_grad():
         model.prior.copy_(torch.tensor([0.3, -1.0, 2.0, 0.7]))
         belief = believe(Target(model), looks, order, target)
         known = gather_by_loop(looks, model, order, target)
-        cells, following, anywhere = read_out(model, known, target)
+        cells, following, anywhere = read_out(reference, model, known, target)
     for name in ("nearest", "best", "closest", "total", "weight"):
         assert getattr(belief, name)[0].tolist() == pytest.approx(known[name], abs=1e-5), name
     assert float(belief.score) == pytest.approx(known["score"])
@@ -340,22 +225,8 @@ def test_looks_and_beliefs_can_be_indexed_by_episode(looks, model):
     assert said[index].target.tolist() == [2, 2]
 
 
-def score_model():
-    """A model whose evidence is the clipped score of the target, and nothing else: no correction of cell or image."""
-    model = TargetEvidence(4, 4).requires_grad_(False).eval()
-    for parameter in model.parameters():
-        parameter.zero_()
-    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
-    model.look[0].weight[0, 1] = 100
-    model.look[0].bias[0] = -60
-    model.look[2].weight[0, 0] = 1
-    model.look[4].weight[0, 0] = 0.25
-    model.look[4].bias[0] = -4
-    return model
-
-
 def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
-    observer, cell = Target(score_model()), 9
+    observer, cell = Target(small.score_evidence(TargetEvidence)), 9
     x, y = GRID.centres[cell].tolist()
     box = torch.tensor([[[x - 7, y - 7, x + 7, y + 7]]])
     shown = Detections(box, torch.tensor([[[0.02, 0.02, 0.94, 0.02]]]), torch.ones(1, 1, dtype=torch.bool))
@@ -377,27 +248,6 @@ def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
     assert float(history[0].present[0, 0]) == pytest.approx(blank)
 
 
-def test_an_acquisition_about_all_classes_refuses_a_belief_about_one_target(model):
-    belief = Target(model).start(1, GRID, torch.empty(0))
-    observation = FovealObservationModel.identity(["cup", "cat"], [0.2])
-    with pytest.raises(InputError, match="belief: expected a belief about all classes"):
-        KLDivergence(observation, GRID)(belief, torch.zeros(1, 24, dtype=torch.bool))
-
-
-def random_gathered(dtype=torch.float64, batch=2, cells=24):
-    generator = torch.Generator().manual_seed(5)
-
-    def draw(*shape):
-        return torch.randn(*shape, generator=generator, dtype=dtype)
-
-    nearest = draw(batch, cells)
-    best = nearest + draw(batch, cells).abs()
-    mean, distance = draw(batch, cells), draw(batch, cells).abs() / 4
-    score, looks = draw(batch).sigmoid(), torch.arange(1, batch + 1).to(dtype)
-    visited = draw(batch, cells) > 1
-    return Gathered(nearest, best, mean, distance, score, looks, visited, torch.tensor([1, 3])[:batch])
-
-
 def test_gradients_reach_every_parameter(looks):
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=4).double()
@@ -415,47 +265,40 @@ def test_gradients_reach_every_parameter(looks):
     assert model.prior.grad.nonzero()[:, 0].tolist() == [1]
 
 
-def test_gradients_through_log_odds_and_presence():
+def test_gradients_through_log_odds_and_presence(gathered):
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
     torch.nn.init.normal_(model.prior)
-    start = random_gathered()
+    start = gathered(episodes=1, classes=3)
 
     def odds(nearest, best, mean, distance, score, prior):
-        gathered = Gathered(nearest, best, mean, distance, score, start.looks, start.visited, start.target)
+        said = Gathered(nearest, best, mean, distance, score, start.looks, start.visited, start.target)
         with torch.nn.utils.stateless._reparametrize_module(model, {"prior": prior}):
-            cells = model.log_odds(gathered, 6)
-            return cells, model.chance(gathered, 6), model.presence(cells, gathered)
+            cells = model.log_odds(said, 6)
+            return cells, model.chance(said, 6), model.presence(cells, said)
 
     values = [start.nearest, start.best, start.mean, start.distance, start.score, model.prior]
     assert torch.autograd.gradcheck(odds, [value.detach().clone().requires_grad_() for value in values])
 
 
-def test_gradients_through_the_evidence(looks):
-    torch.manual_seed(1)
-    model = TargetEvidence(4, 4).double()
-    features = look_features(Detections(looks.boxes.double(), looks.scores.double(), looks.mask), FIXATIONS, GRID, 1)
-    assert torch.autograd.gradcheck(model.evidence, features[:1].double().clone().requires_grad_())
-
-
-def test_log_odds_equal_a_loop_in_float64():
+def test_log_odds_equal_a_loop_in_float64(gathered, reference):
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
     torch.nn.init.normal_(model.prior)
-    gathered = random_gathered()
-    cells = model.log_odds(gathered, 6)
-    emptied, image = model.chance(gathered, 6), model.presence(cells, gathered)
-    for row in range(2):
+    said = gathered(classes=3)
+    cells = model.log_odds(said, 6)
+    emptied, image = model.chance(said, 6), model.presence(cells, said)
+    for row in range(6):
         known = {
-            "nearest": gathered.nearest[row].tolist(),
-            "best": gathered.best[row].tolist(),
-            "mean": gathered.mean[row].tolist(),
-            "closest": gathered.distance[row].tolist(),
-            "score": float(gathered.score[row]),
-            "looks": float(gathered.looks[row]),
-            "visited": gathered.visited[row].tolist(),
+            "nearest": said.nearest[row].tolist(),
+            "best": said.best[row].tolist(),
+            "mean": said.mean[row].tolist(),
+            "closest": said.distance[row].tolist(),
+            "score": float(said.score[row]),
+            "looks": float(said.looks[row]),
+            "visited": said.visited[row].tolist(),
         }
-        expected, following, anywhere = read_out(model, known, int(gathered.target[row]))
+        expected, following, anywhere = read_out(reference, model, known, int(said.target[row]))
         assert cells[row].tolist() == pytest.approx(expected, abs=1e-7)
         assert emptied[row].tolist() == pytest.approx(following, abs=1e-7)
         assert float(image[row]) == pytest.approx(anywhere, abs=1e-7)
@@ -484,42 +327,6 @@ def test_a_model_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
         loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
     with pytest.raises(DataError):
         TargetEvidence.from_pretrained(tmp_path / "none.safetensors")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda record, tensors: record.pop("thresholds"),
-        lambda record, tensors: record.pop("components"),
-        lambda record, tensors: record.pop("widths"),
-        lambda record, tensors: record.update(thresholds={"confirm": 0.5}),
-        lambda record, tensors: record.update(components=9),
-        lambda record, tensors: record.update(widths=[8, 7]),
-        lambda record, tensors: tensors.pop("prior"),
-        lambda record, tensors: tensors.pop("judge.0.weight"),
-        lambda record, tensors: tensors.pop("guide.4.bias"),
-    ],
-    ids=[
-        "no thresholds",
-        "no components",
-        "no widths",
-        "half a threshold",
-        "classes",
-        "widths",
-        "no prior",
-        "no judge",
-        "no guide",
-    ],
-)
-def test_incomplete_files_are_refused(tmp_path, model, change):
-    """Among them files of earlier versions, without a prior or a network for presence."""
-    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
-    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
-    change(record, tensors)
-    path = tmp_path / "old.safetensors"
-    write(path, tensors, record)
-    with pytest.raises(DataError, match=r"old\.safetensors: not a complete model of target evidence"):
-        TargetEvidence.from_pretrained(path)
 
 
 def test_bad_input(looks, model):

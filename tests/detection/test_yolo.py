@@ -122,14 +122,3 @@ def test_settings_contain_runtime_digest_and_cfg(detector, small_cfg, write_weig
 def test_refuses_invalid_settings(small_cfg, options, message):
     with pytest.raises(InputError, match=message):
         YoloV3(Darknet(read_cfg(small_cfg)), **({"classes": ("cat", "dog")} | options))
-
-
-@pytest.mark.parametrize("image", [torch.zeros(1, 1, 32, 32), torch.zeros(3, 32, 32)])
-def test_refuses_images_of_another_shape(detector, image):
-    with pytest.raises(InputError, match=r"images: expected floating-point RGB in .* of shape"):
-        detector(image)
-
-
-def test_refuses_canvases_of_bytes(detector):
-    with pytest.raises(InputError, match="floating-point RGB"):
-        detector.propose(torch.zeros(1, 3, 32, 32, dtype=torch.uint8))

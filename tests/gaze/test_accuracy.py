@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from semfov.belief import DirichletBelief, Grid
-from semfov.errors import InputError
+from semfov.belief import Grid
 from semfov.gaze.acquisition import ExpectedAccuracy
-from semfov.gaze.policies import Accuracy, Means, named_policy
+from tests.small import values_of
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -30,13 +29,10 @@ def beta():
     return torch.rand(2, 12, 3, dtype=torch.float64) ** 2 + 0.02
 
 
-def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
-    return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
-
-
 def test_value_equals_the_loop(beta):
-    got = values_of(ExpectedAccuracy(Model(), GRID), beta)
+    acquisition = ExpectedAccuracy(Model(), GRID)
+    got = values_of(acquisition, beta)
+    torch.testing.assert_close(values_of(acquisition, beta[0]), got[0])
     right, levels = Model().expected_scores(), Model().level(GRID.cell_distance)
     for episode in range(2):
         p = beta[episode] / beta[episode].sum(-1, keepdim=True)
@@ -55,22 +51,3 @@ def test_value_is_zero_where_every_cell_is_certain():
     beta[0, :6, 0] = 1000.0
     beta[0, 6:, 2] = 1000.0
     assert values_of(ExpectedAccuracy(Model(), GRID), beta).abs().max() < 1e-5
-
-
-def test_policy_by_name(beta):
-    policy = named_policy("expected-accuracy", "exploration", Means(Model()))
-    assert isinstance(policy, Accuracy)
-    acquisition = policy(None, GRID)
-    assert torch.equal(values_of(acquisition, beta), values_of(ExpectedAccuracy(Model(), GRID), beta))
-    blind = Model()
-    blind.miss_rate = None
-    with pytest.raises(InputError, match="miss rates"):
-        ExpectedAccuracy(blind, GRID)
-
-
-def test_an_unbatched_belief_is_accepted_and_another_number_of_cells_is_refused(beta):
-    acquisition = ExpectedAccuracy(Model(), GRID)
-    torch.testing.assert_close(values_of(acquisition, beta[0]), values_of(acquisition, beta)[0])
-    for other in (beta[:, :11], beta[0, 0]):
-        with pytest.raises(InputError, match=r"^beta:"):
-            values_of(acquisition, other)

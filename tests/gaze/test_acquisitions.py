@@ -8,6 +8,7 @@ import torch
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
+from tests import small
 
 GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
@@ -39,6 +40,7 @@ EXPLORATION = {
     "ProbabilityOfImprovement": lambda: acquisition.ProbabilityOfImprovement(model(), GRID),
     "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID),
     "CloserLook": lambda: acquisition.CloserLook(GRID, 0.2),
+    "ObjectEvidence": acquisition.ObjectEvidence,
 }
 BLIND = {"Static": lambda: acquisition.Static(rand(3, 12)), "Uniform": acquisition.Uniform}
 PRIOR = {
@@ -47,6 +49,8 @@ PRIOR = {
 EVERY = SEARCH | EXPLORATION | BLIND | PRIOR
 # These need only the probabilities of the target, or no belief at all.
 OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", *BLIND}
+# These predict the belief after a look at each cell of their grid.
+GRIDDED = ["NeighbourhoodPosterior", *(name for name in EXPLORATION if name not in ("CloserLook", "ObjectEvidence"))]
 
 
 def beliefs():
@@ -80,8 +84,8 @@ def name(request):
 
 
 def test_every_acquisition_function_is_tested():
-    # These have their own tests: they need a learned map, d', templates, or all classes except background.
-    own = {"ExpectedGain", "EntropyLimit", "CorrectLocalisation", "TemplateAttention", "ObjectEvidence"}
+    # These have their own tests: they need a learned map, d', or templates.
+    own = {"ExpectedGain", "EntropyLimit", "CorrectLocalisation", "TemplateAttention"}
     assert set(acquisition.__all__) - {"AcquisitionFunction"} == set(EVERY) | own
 
 
@@ -170,3 +174,19 @@ def test_a_function_in_double_precision_keeps_the_dtype_of_the_belief(name):
     known = beliefs()
     values = EVERY[name]().double()(DirichletBelief(known.beta.float(), known.closest.float()), visits())
     assert values.dtype == torch.float32
+
+
+@pytest.mark.parametrize("shape", [(5,), (11, 4), (1, 13, 4)])
+@pytest.mark.parametrize("name", GRIDDED)
+def test_a_belief_with_another_number_of_cells_is_refused(name, shape):
+    with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 12, any\)"):
+        small.values_of(EVERY[name](), torch.ones(shape))
+
+
+def test_evidence_of_objects_equals_the_loop():
+    beta = beliefs().beta
+    got = small.values_of(acquisition.ObjectEvidence(), beta)
+    for episode in range(3):
+        for x in range(12):
+            first, *others = beta[episode, x].tolist()
+            assert float(got[episode, x]) == pytest.approx(sum(others) / (first + sum(others)), rel=1e-6)

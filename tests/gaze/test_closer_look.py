@@ -8,7 +8,6 @@ import torch
 from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
 from semfov.gaze.acquisition import CloserLook
-from semfov.gaze.policies import Closer, Means, named_policy
 
 GRID = Grid(4, 3, (80, 60))
 FOVEA = 0.2
@@ -62,11 +61,6 @@ def test_value_is_almost_zero_where_every_cell_is_certain():
     assert values.abs().max() < 1e-6
 
 
-def test_policy_by_name(belief):
-    policy = named_policy("closer-look", "exploration", Means(fovea=FOVEA))
-    assert isinstance(policy, Closer)
-    acquisition = policy(None, GRID)
-    visited = torch.zeros(2, 12, dtype=torch.bool)
-    assert torch.equal(acquisition(belief, visited), CloserLook(GRID, FOVEA)(belief, visited))
+def test_a_fovea_of_zero_width_is_refused():
     with pytest.raises(InputError, match="fovea"):
         CloserLook(GRID, 0.0)

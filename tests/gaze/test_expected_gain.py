@@ -8,7 +8,7 @@ from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import CloserLook, ExpectedGain
-from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, SaliencyMaximum, named_policy, policy_names
+from semfov.gaze.policies import POLICIES, Closer, Gain, Random, SaliencyMaximum, policy_names
 from semfov.runs.candidates import Models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.presets import label, presets, resolve
@@ -101,25 +101,6 @@ def test_closer_look_accepts_a_learned_map(model):
             assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-5)
 
 
-def test_policy_is_registered(model):
-    assert POLICIES["expected-gain"] is Gain
-    assert "expected-gain" in policy_names("exploration")
-    assert "expected-gain" not in policy_names("search")
-    policy = named_policy("expected-gain", "exploration", Means(map=model))
-    assert isinstance(policy, Gain)
-    assert policy.model is model
-    acquisition = policy(None, GRID)
-    assert isinstance(acquisition, ExpectedGain)
-    belief, visited = belief_of(model)
-    assert torch.equal(acquisition(belief, visited), ExpectedGain(model, GRID)(belief, visited))
-    for means in (None, Means()):
-        with pytest.raises(InputError, match=r"'expected-gain': expected a learned map in `Means.map`, got none"):
-            named_policy("expected-gain", "exploration", means)
-    with pytest.raises(InputError, match="expected-gain"):
-        named_policy("expected-gain", "search", Means(map=model))
-    assert [name for name, kind in POLICIES.items() if kind.needs_map] == ["expected-gain"]
-
-
 LEARNED = {
     "random-learned": PolicyConfig("random", "learned"),
     "closer-look-learned": PolicyConfig("closer-look", "learned"),
@@ -144,31 +125,31 @@ def test_presets_of_learned_maps():
             assert f"{name}-learned" not in known
 
 
-@pytest.mark.parametrize("policy", ["kl", "negative-entropy", "surprise", "two-peaks"])
-def test_policies_for_dirichlet_beliefs_refuse_a_learned_map(policy):
-    """They need an observation model of the scores, or a Dirichlet belief, and a learned map has neither."""
-    if f"{policy}-learned" in presets("exploration"):
-        pytest.fail(f"{policy} is about a Dirichlet belief")
-    with pytest.raises(
-        InputError, match=f"^scores: expected 'raw' or 'calibrated' for policy '{policy}', got 'learned'"
-    ):
-        resolve(PolicyConfig(policy, "learned"), "exploration")
-    with pytest.raises(InputError, match="policy"):
-        resolve(f"{policy}-learned", "exploration")
+DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
 
 
-@pytest.mark.parametrize("scores", ["raw", "calibrated"])
-def test_expected_gain_accepts_only_a_learned_map(scores):
-    with pytest.raises(InputError, match=f"^scores: expected 'learned' for policy 'expected-gain', got '{scores}'"):
-        resolve(PolicyConfig("expected-gain", scores), "exploration")
-    with pytest.raises(InputError, match="policy"):
-        resolve(f"expected-gain-{scores}", "exploration")
+@pytest.mark.parametrize(
+    ("task", "policy", "scores", "expected"),
+    [
+        *(("exploration", policy, "learned", "expected 'raw' or 'calibrated' for policy") for policy in DIRICHLET),
+        *(
+            ("exploration", "expected-gain", scores, "expected 'learned' for policy")
+            for scores in ("raw", "calibrated")
+        ),
+        *(("search", policy, "learned", ".*") for policy in ("random", "non-predictive", "target-evidence")),
+    ],
+)
+def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected):
+    """Policies for Dirichlet beliefs need an observation model or a Dirichlet belief; a learned map has neither."""
+    with pytest.raises(InputError, match=f"^scores: {expected} ?'{policy}', got '{scores}'"):
+        resolve(PolicyConfig(policy, scores), task)
+    if task == "exploration":
+        assert f"{policy}-{scores}" not in presets(task)
+        with pytest.raises(InputError, match="policy"):
+            resolve(f"{policy}-{scores}", task)
 
 
-def test_search_policies_refuse_a_learned_map():
-    for policy in ("random", "non-predictive", "target-evidence"):
-        with pytest.raises(InputError, match=f"^scores: .*'{policy}', got 'learned'"):
-            resolve(PolicyConfig(policy, "learned"), "search")
+def test_expected_gain_is_no_search_policy():
     with pytest.raises(InputError, match="policy"):
         resolve(PolicyConfig("expected-gain", "learned"), "search")
 

@@ -51,15 +51,6 @@ def test_logits_equal_the_loop():
             assert float(got[episode, x]) == pytest.approx(total, abs=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtypes_and_devices(dtype, device):
-    values, cell, age = (each.to(device) for each in make_state(dtype=dtype))
-    got = make_habits(dtype).to(device)(values, cell, age, GRID)
-    assert got.dtype == dtype
-    expected = make_habits(torch.float64)(*make_state(dtype=torch.float64), GRID)
-    torch.testing.assert_close(got.double().cpu(), expected, rtol=1e-4, atol=1e-5)
-
-
 @given(st.integers(0, 1000), st.floats(0.01, 100), st.floats(-100, 100))
 def test_standardised_values_do_not_depend_on_scale_and_offset(seed, scale, shift):
     values = torch.randn(2, 9, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

@@ -1,15 +1,13 @@
 """Search acquisition functions that also count cells around the fixation, against loops and closed forms."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
 
-from semfov.belief import DirichletBelief, Grid
-from semfov.errors import InputError
+from semfov.belief import Grid
 from semfov.gaze.acquisition import FovealHit, PlaceInformation
-from semfov.gaze.policies import Means, named_policy
+from tests.small import values_of
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -21,11 +19,6 @@ class Misses:
 
     def level(self, distance):
         return torch.bucketize(distance, torch.tensor([0.2, 0.5]))
-
-
-def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
-    return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
 @pytest.fixture
@@ -66,19 +59,6 @@ def test_information_is_the_expected_reduction_of_entropy(beta, target):
 
 def entropy(q):
     return -sum(value * math.log(value) for value in q if value > 0)
-
-
-@pytest.mark.parametrize("name", ["foveal-hit", "place-information"])
-def test_policies_need_miss_rates(name, beta):
-    acquisition = named_policy(name, "search", Means(Misses()))(1, GRID)
-    assert values_of(acquisition, beta).shape == (2, 12)
-    assert torch.autograd.gradcheck(partial(values_of, acquisition), beta[:1].requires_grad_())
-    blind = Misses()
-    blind.miss_rate = None
-    with pytest.raises(InputError, match="miss rates"):
-        named_policy(name, "search", Means(blind))(1, GRID)
-    with pytest.raises(InputError, match="observation model"):
-        named_policy(name, "search")
 
 
 @pytest.mark.parametrize("kind", [FovealHit, PlaceInformation])

@@ -64,6 +64,63 @@ def test_policy_names_of_each_task():
     )
 
 
+# Policies of each acquisition function, for a search for class 1 and for exploration.
+MADE = {
+    "random": lambda means: acquisition.Uniform(),
+    "non-predictive": lambda means: acquisition.TargetPosterior(1),
+    "predictive": lambda means: acquisition.PredictedTargetPosterior(1, means.model),
+    "neighbourhood": lambda means: acquisition.NeighbourhoodPosterior(1, means.model, GRID),
+    "foveal-hit": lambda means: acquisition.FovealHit(1, means.model, GRID),
+    "place-information": lambda means: acquisition.PlaceInformation(1, means.model, GRID),
+    "kl": lambda means: acquisition.KLDivergence(means.model, GRID, prior=means.prior),
+    "surprise": lambda means: acquisition.BayesianSurprise(means.model, GRID),
+    "negative-entropy": lambda means: acquisition.NegativeEntropy(means.model, GRID),
+    "two-peaks": lambda means: acquisition.TwoPeaks(means.model, GRID),
+    "upper-confidence-bound": lambda means: acquisition.UpperConfidenceBound(means.model, GRID),
+    "probability-of-improvement": lambda means: acquisition.ProbabilityOfImprovement(means.model, GRID),
+    "expected-accuracy": lambda means: acquisition.ExpectedAccuracy(means.model, GRID),
+    "closer-look": lambda means: acquisition.CloserLook(GRID, means.fovea),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_a_policy_makes_its_acquisition_function(name, model):
+    beta = 0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1))
+    for means in (Means(model, fovea=0.2), Means(model, fovea=0.2, prior=2.0)):
+        for task in POLICIES[name].tasks:
+            made = named_policy(name, task, means)(1 if task == "search" else None, GRID)
+            assert torch.equal(values_of(made, beta), values_of(MADE[name](means), beta))
+
+
+def test_the_policy_of_expected_gain_keeps_its_map(means):
+    policy = named_policy("expected-gain", "exploration", means)
+    assert policy.model is means.map
+    assert isinstance(policy(None, GRID), acquisition.ExpectedGain)
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [
+        ("foveal-hit", "search"),
+        ("place-information", "search"),
+        ("entropy-limit", "search"),
+        ("expected-accuracy", "exploration"),
+    ],
+)
+def test_a_model_without_miss_rates_is_refused(name, task):
+    means = Means(FovealObservationModel.identity(["cup", "cat"], [0.2]))
+    with pytest.raises(InputError, match="miss rates"):
+        named_policy(name, task, means)(1 if task == "search" else None, GRID)
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "meant"), [("two-peak", "exploration", "two-peaks"), ("predicitve", "search", "predictive")]
+)
+def test_a_similar_name_is_suggested(name, task, meant):
+    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+        named_policy(name, task)
+
+
 def test_every_policy_class_is_public():
     for name, kind in POLICIES.items():
         assert kind.name == name

@@ -58,13 +58,6 @@ def test_value_equals_the_loop(name, weight):
             assert float(got[row, cell]) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ACQUISITIONS)
-def test_with_weight_zero_the_order_is_that_of_the_acquisition(name):
-    plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), SALIENCY, weight=0.0))
-    torch.testing.assert_close(guided.exp(), plain)
-    assert torch.equal(guided.argsort(dim=-1, stable=True), plain.argsort(dim=-1, stable=True))
-
-
 @pytest.mark.parametrize("level", [0.0, 1e-12, 0.4, 1e6])
 @pytest.mark.parametrize("name", ACQUISITIONS)
 def test_uniform_saliency_changes_nothing(name, level):

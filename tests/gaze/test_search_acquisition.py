@@ -1,15 +1,14 @@
 """Search acquisition functions against a loop over cells that simulates every update."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
 
-from semfov.belief import DirichletBelief, Grid, fusion
+from semfov.belief import Grid, fusion
 from semfov.errors import InputError
 from semfov.gaze.acquisition import NeighbourhoodPosterior, PredictedTargetPosterior, Static, TargetPosterior, Uniform
-from semfov.gaze.policies import Means, Neighbourhood, NonPredictive, Predictive, Random, named_policy
+from tests.small import values_of
 
 GRID = Grid(3, 2, (30, 20))
 
@@ -26,11 +25,6 @@ class Model:
 
     def expected_scores(self):
         return self.table
-
-
-def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
-    return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
 @pytest.fixture
@@ -60,35 +54,12 @@ def test_predicted_posterior_equals_a_simulated_update(beta):
             torch.testing.assert_close(got[episode, cell], after[target] / after.sum())
 
 
-def test_predicted_posterior_is_differentiable(beta):
-    assert torch.autograd.gradcheck(partial(values_of, PredictedTargetPosterior(2, Model(5))), (beta.requires_grad_(),))
-
-
 def test_static_and_uniform(beta):
     assert values_of(Uniform(), beta).tolist() == [[0.0] * 6] * 4
     values = torch.arange(6.0)
     assert torch.equal(values_of(Static(values), beta), values.expand(4, 6))
     with pytest.raises(InputError, match="values"):
         values_of(Static(torch.arange(5.0)), beta)
-
-
-def test_policies_by_name(beta):
-    model = Model(5)
-    named = {
-        "random": (Random(), Uniform()),
-        "non-predictive": (NonPredictive(), TargetPosterior(1)),
-        "predictive": (Predictive(model), PredictedTargetPosterior(1, model)),
-        "neighbourhood": (Neighbourhood(model), NeighbourhoodPosterior(1, model, GRID)),
-    }
-    for name, (policy, acquisition) in named.items():
-        made = named_policy(name, "search", Means(model))
-        assert type(made) is type(policy)
-        for each in (made, policy):
-            assert torch.equal(values_of(each(1, GRID), beta), values_of(acquisition, beta))
-    with pytest.raises(InputError, match="did you mean 'predictive'"):
-        named_policy("predicitve", "search")
-    with pytest.raises(InputError, match="observation model"):
-        named_policy("predictive", "search")
 
 
 @pytest.mark.parametrize("target", [-1, 5])
@@ -101,7 +72,9 @@ def test_unknown_target(beta, target):
 def test_neighbourhood_equals_the_loop(beta, sigma):
     """The default width is 0.7 cells."""
     model, told = Model(5), {} if sigma is None else {"sigma": sigma}
-    got = values_of(NeighbourhoodPosterior(3, model, GRID, **told), beta)
+    acquisition = NeighbourhoodPosterior(3, model, GRID, **told)
+    got = values_of(acquisition, beta)
+    torch.testing.assert_close(values_of(acquisition, beta[1]), got[1])
     for episode in range(4):
         for fixation in range(6):
             total = 0.0
@@ -116,11 +89,6 @@ def test_neighbourhood_equals_the_loop(beta, sigma):
             assert float(got[episode, fixation]) == pytest.approx(total, rel=1e-6)
 
 
-def test_neighbourhood_refuses_another_number_of_cells_and_zero_width(beta):
-    acquisition = NeighbourhoodPosterior(3, Model(5), GRID)
-    torch.testing.assert_close(values_of(acquisition, beta[1]), values_of(acquisition, beta)[1])
-    for other in (beta[:, :5], beta[0, 0]):
-        with pytest.raises(InputError, match=r"^beta:"):
-            values_of(acquisition, other)
+def test_a_neighbourhood_of_zero_width_is_refused():
     with pytest.raises(InputError, match=r"^sigma:"):
         NeighbourhoodPosterior(3, Model(5), GRID, sigma=0.0)

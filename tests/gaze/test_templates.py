@@ -74,13 +74,6 @@ def test_attention_over_several_looks_equals_the_loop(dtype, device):
             assert float(got[episode, x]) == pytest.approx(total / weights, rel=1e-4, abs=1e-5)
 
 
-def test_after_one_look_attention_is_that_of_the_look():
-    visited = torch.zeros(1, 12, dtype=torch.bool)
-    visited[0, 5] = True
-    got = TemplateAttention(2, make_attention(), GRID)(uniform_beliefs(1), visited)
-    torch.testing.assert_close(got[0], make_attention()[5, 1])
-
-
 def test_an_episode_does_not_depend_on_the_others():
     visited = torch.rand(5, 12, generator=torch.Generator().manual_seed(0)) < 0.4
     target = torch.tensor([1, 2, 3, 2, 1])
@@ -115,8 +108,11 @@ def test_invalid_arguments_are_refused():
     for target in (0, 4):
         with pytest.raises(InputError, match="target"):
             TemplateAttention(target, make_attention(), GRID)
-    with pytest.raises(InputError, match="attention"):
-        TemplateAttention(1, make_attention()[:5], GRID)
+    for attention in (make_attention()[:5], make_attention()[..., :5]):
+        with pytest.raises(InputError, match=r"^attention:"):
+            TemplateAttention(1, attention, GRID)
+    with pytest.raises(InputError, match=r"^fovea:"):
+        TemplateAttention(1, make_attention(), GRID, 0.0)
 
 
 def test_looks_are_weighted_in_the_precision_of_the_attention():
@@ -126,10 +122,3 @@ def test_looks_are_weighted_in_the_precision_of_the_attention():
     values = TemplateAttention(1, attention, grid, 0.2)
     got = values(DirichletBelief(torch.ones(1, 600, 2, dtype=torch.float64)), torch.ones(1, 600, dtype=torch.bool))
     torch.testing.assert_close(got[0], attention[0, 0], rtol=1e-13, atol=0)
-
-
-def test_attention_of_another_grid_and_a_fovea_of_zero_width_are_refused():
-    with pytest.raises(InputError, match=r"^attention:"):
-        TemplateAttention(1, make_attention()[..., :5], GRID)
-    with pytest.raises(InputError, match=r"^fovea:"):
-        TemplateAttention(1, make_attention(), GRID, 0.0)

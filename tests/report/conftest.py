@@ -17,6 +17,7 @@ from semfov.report import Pool, write_page, zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice, Objects
 from semfov.zoom.glances import Glance, on_lattice
+from tests import small
 
 
 @pytest.fixture
@@ -30,20 +31,16 @@ def hostile() -> str:
 def scanpath(hostile: str) -> Scanpath:
     """Three fixations on a 4 × 3 grid, with different beliefs and detections."""
     generator = torch.Generator().manual_seed(0)
-    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     scores = torch.rand(3, 2, 4, generator=generator).softmax(-1)
     corner = torch.rand(3, 2, 2, generator=generator) * 40
-    boxes = torch.cat([corner, corner + 18], -1)
-    looks = Detections(boxes, scores, torch.ones(3, 2, dtype=torch.bool))
-    return Scanpath(
-        grid=grid,
-        classes=("background", "cat", hostile, "cup"),
+    looks = Detections(torch.cat([corner, corner + 18], -1), scores, torch.ones(3, 2, dtype=torch.bool))
+    return small.scanpath(
+        Grid(4, 3, (80, 60)),
+        torch.tensor([0, 6, 11]),
+        ("background", "cat", hostile, "cup"),
         target=2,
-        cells=cells,
-        fixations=grid.centres[cells],
         detections=tuple(looks[number : number + 1] for number in range(3)),
         probabilities=torch.rand(3, 12, 4, generator=generator).add(0.1).softmax(-1),
-        values=torch.rand(3, 12, generator=generator),
         found=True,
         posterior=torch.rand(3, 12, generator=generator),
     )

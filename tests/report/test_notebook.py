@@ -8,11 +8,12 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from semfov import Detections, Grid, Scanpath
+from semfov import Grid
 from semfov.detection import Placement
 from semfov.paths import Stimulus
 from semfov.paths.stimulus import in_bytes
 from semfov.report import notebook
+from tests import small
 from tests.report.pages import data_of
 
 
@@ -64,18 +65,8 @@ def test_without_a_photograph_there_are_no_pictures(scanpath):
 
 def scanpath_of(looks, columns, classes):
     grid = Grid(columns, columns, (80, 60))
-    cells = torch.arange(looks) % len(grid)
-    return Scanpath(
-        grid=grid,
-        classes=("background", *(f"class {number}" for number in range(classes))),
-        target=1,
-        cells=cells,
-        fixations=grid.centres[cells],
-        detections=(Detections.empty(1, classes),) * looks,
-        probabilities=torch.rand(1, len(grid), classes + 1).expand(looks, -1, -1),
-        values=torch.rand(1, len(grid)).expand(looks, -1),
-        found=False,
-    )
+    names = ("background", *(f"class {number}" for number in range(classes)))
+    return small.scanpath(grid, torch.arange(looks) % len(grid), names, target=1)
 
 
 @pytest.mark.parametrize(

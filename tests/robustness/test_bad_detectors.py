@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov.detection import Candidates
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from tests.small import Fixed
 
 
@@ -35,12 +35,3 @@ def test_invalid_detections_are_refused(changes, message):
     assert Fixed(candidates=candidates())(image).count.tolist() == [2]
     with pytest.raises(InputError, match=message):
         Fixed(candidates=candidates(**changes))(image)
-
-
-def test_a_network_with_a_huge_kernel_is_refused():
-    from semfov.detection.darknet import Darknet
-    from semfov.detection.darknet_config import parse_cfg
-
-    text = "[net]\nwidth=32\nheight=32\n[convolutional]\nfilters=21\nsize=99999\n[yolo]\nmask=0\nanchors=4,6\nclasses=2"
-    with pytest.raises(DataError, match="parameters"):
-        Darknet(parse_cfg(text))

@@ -70,10 +70,13 @@ def test_sources_have_no_unsafe_calls():
 
 
 def test_every_download_is_pinned():
+    assert isinstance(WEIGHTS["yolov3-tiny"].sources[0], SourceDistribution)
+    assert len({entry.file for entry in WEIGHTS.values()}) == len(WEIGHTS)
     for name, entry in WEIGHTS.items():
         assert len(bytes.fromhex(entry.sha256)) == 32, name
         assert entry.size > 0
         assert entry.licence
+        assert entry.sources
         for source in entry.sources:
             assert isinstance(source, Address | SourceDistribution)
             if isinstance(source, Address):

@@ -347,14 +347,8 @@ def test_bad_input(arguments, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"sigma": 0.0}, "sigma"),
-        ({"growth": 0.0}, "growth"),
-        ({"levels": -1}, "levels"),
-        ({"convention": "korina"}, "convention"),
-    ],
+    "setting", [{"sigma": 0.0}, {"growth": 0.0}, {"levels": -1}, {"convention": "korina"}], ids=str
 )
-def test_bad_settings(arguments, message):
-    with pytest.raises(InputError, match=message):
-        Foveation(**{"sigma": 3.0} | arguments)
+def test_bad_settings(setting):
+    with pytest.raises(InputError, match=next(iter(setting))):
+        Foveation(**{"sigma": 3.0} | setting)

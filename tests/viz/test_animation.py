@@ -12,30 +12,26 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import Detections, Grid, InputError, Scanpath
+from semfov import Detections, Grid, InputError
 from semfov.viz import animate, plot_fixation
 from semfov.viz.animation import episode_frames, in_one_palette, render, save_animation
 from semfov.viz.fixation import FixationFigure
+from tests import small
 
 
 @pytest.fixture(params=["search", "exploration"])
 def searched(request):
     """A scanpath of three fixations, the photograph, and a view for each fixation."""
     generator = torch.Generator().manual_seed(0)
-    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     scores = torch.tensor([[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]])
     corner = torch.rand(3, 2, 2, generator=generator) * 40
     boxes = torch.cat([corner, corner + 18], -1)
-    scanpath = Scanpath(
-        grid=grid,
-        classes=("background", "cat", "cup"),
+    scanpath = small.scanpath(
+        Grid(4, 3, (80, 60)),
+        torch.tensor([0, 6, 11]),
         target=2 if request.param == "search" else None,
-        cells=cells,
-        fixations=grid.centres[cells],
         detections=tuple(Detections(each[None], scores[None], torch.ones(1, 2, dtype=torch.bool)) for each in boxes),
         probabilities=torch.rand(3, 12, 3, generator=generator).pow(3),
-        values=torch.rand(3, 12, generator=generator),
-        found=False,
     )
     image = torch.rand(3, 60, 80, generator=generator)
     return scanpath, image, [image * share for share in (0.3, 0.6, 0.9)]

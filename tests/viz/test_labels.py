@@ -1,11 +1,12 @@
-"""Labels of boxes do not cover each other, nor areas that must stay free."""
+"""Labels of boxes and numbers of fixations do not cover each other, nor areas that must stay free."""
 
 from itertools import combinations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.viz.labels import place_labels
+from semfov.viz.labels import place_labels, place_numbers, place_within
 
 number = st.floats(0, 100, allow_nan=False)
 boxes = st.lists(st.tuples(number, number, number, number), max_size=12)
@@ -31,3 +32,30 @@ def test_a_single_label_is_placed_in_the_corner_of_its_box():
 
 def test_a_label_stays_in_the_frame():
     assert place_labels([(95, 98, 100, 100)], [(20, 6)], (100, 100)) == [(80, 94, 100, 100)]
+
+
+@given(st.lists(st.tuples(number, number), min_size=1, max_size=14))
+def test_placed_numbers_do_not_overlap_and_stay_in_the_frame(points):
+    placed = place_numbers(points, [(9, 6)] * len(points), (100, 100), 30)
+    assert len(placed) == len(points)
+    assert placed[0] is not None
+    kept = [box for box in placed if box is not None]
+    assert all(apart(a, b) for a, b in combinations(kept, 2))
+    for point, box in zip(points, placed, strict=True):
+        if box is not None:
+            assert box[0] >= 0
+            assert box[1] >= 0
+            assert box[2] <= 100 + 1e-9
+            assert box[3] <= 100 + 1e-9
+            others = [other for other in points if other != point]
+            assert not any(box[0] < x < box[2] and box[1] < y < box[3] for x, y in others)
+
+
+@given(st.lists(st.lists(st.tuples(number, number), min_size=1, max_size=4), max_size=9))
+def test_labels_with_several_candidate_positions_do_not_overlap(candidates):
+    placed = place_within(candidates, [(20, 6)] * len(candidates), (100, 100))
+    assert all(apart(a, b) for a, b in combinations(placed, 2))
+    if candidates:
+        x, y = candidates[0][0]
+        middle = (placed[0][0] + placed[0][2]) / 2, (placed[0][1] + placed[0][3]) / 2
+        assert middle == pytest.approx((min(max(x, 10), 90), min(max(y, 3), 97)))

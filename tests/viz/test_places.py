@@ -11,33 +11,23 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import Detections, Grid, InputError, Scanpath, viz
+from semfov import Detections, Grid, InputError, viz
 from semfov.errors import DataError
 from semfov.metrics.calibration import BinarySums
+from tests import small
 
 CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
 
 
 @pytest.fixture
 def scanpath():
-    generator = torch.Generator().manual_seed(0)
-    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     seen = Detections(
         torch.tensor([[[10.0, 10, 30, 30], [50, 40, 70, 55]]]),
         torch.tensor([[[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]]]),
         torch.ones(1, 2, dtype=torch.bool),
     )
-    return Scanpath(
-        grid=grid,
-        classes=("background", "cat", "cup"),
-        target=2,
-        cells=cells,
-        fixations=grid.centres[cells],
-        detections=(seen,) * 3,
-        probabilities=torch.rand(3, 12, 3, generator=generator),
-        values=torch.rand(3, 12, generator=generator),
-        found=True,
-    )
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
+    return small.scanpath(grid, cells, target=2, detections=(seen,) * 3, found=True)
 
 
 def calls(scanpath):

@@ -9,30 +9,19 @@ import scipy.ndimage
 import torch
 
 from eval import demo
-from semfov import Detections, Grid, Scanpath
+from semfov import Grid
 from semfov.viz import entropy, plot_semantic_map
 from semfov.viz.semantic import borders, named_regions, regions
+from tests import small
 
 CLASSES = ("background", "cat", "cup", "dog")
 
 
 def scanpath_of(probabilities, columns, classes=CLASSES):
     """The scanpath of an exploration with maps `(n, X·Y, K+1)`."""
-    looks, cells = probabilities.shape[:2]
-    grid = Grid(columns, cells // columns, (10 * columns, 10 * (cells // columns)))
-    order = torch.arange(looks)
-    return Scanpath(
-        grid=grid,
-        classes=classes,
-        target=None,
-        cells=order,
-        fixations=grid.centres[order],
-        detections=(Detections.empty(1, len(classes) - 1),) * looks,
-        probabilities=probabilities,
-        values=torch.rand(looks, cells),
-        found=False,
-        seconds=({"detect": 0.001},) * looks,
-    )
+    looks, rows = len(probabilities), probabilities.shape[1] // columns
+    grid, seconds = Grid(columns, rows, (10 * columns, 10 * rows)), ({"detect": 0.001},) * looks
+    return small.scanpath(grid, torch.arange(looks), classes, probabilities=probabilities, seconds=seconds)
 
 
 def labelled(table):

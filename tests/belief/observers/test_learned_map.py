@@ -14,6 +14,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Semantic, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import KLDivergence
+from tests import small
 
 GRID = Grid(6, 4, (90, 60))
 FIXATED = [0, 9, 20, 5]
@@ -221,23 +222,9 @@ def test_belief_does_not_depend_on_the_order_of_looks_at_different_cells(random_
     torch.testing.assert_close(one.nearest[..., clear], other.nearest[..., clear])
 
 
-def score_model():
-    """A model whose evidence is the clipped score of each class, and nothing else."""
-    model = MapEvidence(4, 4, components=4).requires_grad_(False).eval()
-    for parameter in model.parameters():
-        parameter.zero_()
-    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
-    model.look[0].weight[0, 1] = 100
-    model.look[0].bias[0] = -60
-    model.look[2].weight[0, 0] = 1
-    model.look[4].weight[0, 0] = 0.25
-    model.look[4].bias[0] = -4
-    return model
-
-
 def test_several_classes_share_a_cell():
     """A cup on a table: the cell holds both, and neither lowers the probability of the other."""
-    observer, cell = LearnedMap(score_model()), 9
+    observer, cell = LearnedMap(small.score_evidence(MapEvidence)), 9
     x, y = GRID.centres[cell].tolist()
     boxes = torch.tensor([[[x - 7, y - 7, x + 7, y + 7], [x - 7, y - 7, x + 37, y + 7]]])
     scores = torch.tensor([[[0.02, 0.94, 0.02, 0.02], [0.02, 0.02, 0.94, 0.02]]])

@@ -103,16 +103,6 @@ def test_misses_move_cells_without_detections_towards_background():
     assert (background > 0.25).all()
 
 
-def test_calling_the_observer_equals_weigh_and_update(looks):
-    observer = Semantic(4, tempering=0.5, memory="closest", footprint="soft")
-    belief = observer.start(1, GRID, torch.empty(0, dtype=torch.float64))
-    for look in range(3):
-        belief = observer(belief, looks[look : look + 1], FIXATIONS[look : look + 1], GRID)
-    expected = watch(observer, looks)
-    assert torch.equal(belief.beta, expected.beta)
-    assert torch.equal(belief.closest, expected.closest)
-
-
 @pytest.mark.parametrize("options", [{}, {"footprint": "soft"}, {"misses": MISSES}], ids=["hard", "soft", "misses"])
 def test_a_batch_of_looks_equals_each_look_alone(looks, options):
     """Weighed together, selected one by one or joined again, looks give the same belief bit for bit."""

@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pandas
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov import Grid
 from semfov.data.fixations import (
     Fixations,
     by_picture,
@@ -22,6 +24,7 @@ from semfov.data.fixations import (
     write_table,
 )
 from semfov.errors import DataError, InputError
+from tests import small
 
 numbers = st.floats(-50, 900, allow_nan=False)
 
@@ -214,23 +217,8 @@ def test_fixation_trains_of_pysaliency_are_converted_both_ways(monkeypatch):
 
 @pytest.mark.parametrize("target", [None, 1])
 def test_the_scanpath_of_a_model_is_converted_to_a_record(tmp_path, target):
-    import torch
-
-    from semfov import Grid, Scanpath
-
-    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 5, 11])
-    nothing = torch.zeros(3, 12)
-    path = Scanpath(
-        grid=grid,
-        classes=("background", "cup"),
-        target=target,
-        cells=cells,
-        fixations=grid.centres[cells],
-        detections=(),
-        probabilities=nothing[..., None],
-        values=nothing,
-        found=True,
-    )
+    cells = torch.tensor([0, 5, 11])
+    path = small.scanpath(Grid(4, 3, (80, 60)), cells, ("background", "cup"), target=target, found=True)
     fixations = path.as_fixations("a.jpg")
     np.testing.assert_allclose(fixations.points, [[9.5, 9.5], [29.5, 29.5], [69.5, 49.5]])
     assert (fixations.size, fixations.subject) == ((80, 60), "semfov")

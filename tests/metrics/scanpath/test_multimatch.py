@@ -46,6 +46,8 @@ def test_fewer_than_three_fixations_have_no_similarity():
 
 
 def test_invalid_arguments_are_refused_by_name():
+    with pytest.raises(InputError, match=r"^ours:"):
+        multimatch([0, 1, 2], [[0, 0]] * 3, (10, 10))
     with pytest.raises(InputError, match=r"^theirs:"):
         multimatch([[0, 0]] * 3, [0, 1, 2], (10, 10))
     with pytest.raises(InputError, match=r"^durations: expected 3 and 4 numbers, one for each fixation, got \(3, 2\)"):
@@ -59,8 +61,3 @@ def test_byte_coordinates_do_not_overflow_and_zero_durations_are_equal():
     expected = multimatch(path.tolist(), other.tolist(), (256, 256), tuple(each.tolist() for each in times))
     assert multimatch(path, other, (256, 256), times) == expected
     assert multimatch(path, path, (256, 256), ([0] * 4, [0] * 4)).duration == 1
-
-
-def test_an_invalid_first_scanpath_is_refused_by_name():
-    with pytest.raises(InputError, match=r"^ours:"):
-        multimatch([0, 1, 2], [[0, 0]] * 3, (10, 10))

@@ -71,6 +71,7 @@ def test_a_straight_scanpath_has_ratio_one_and_a_detour_less():
         (lambda: performance_area([0.5]), "curve"),
         (lambda: probability_mismatch([0.5], [0.5, 0.6]), "reference"),
         (lambda: found_at([1, 2], (0, 0, 1, 1)), "points"),
+        (lambda: found_at(np.zeros((0, 2)), (0, 0, 1, 1)), "points"),
     ],
 )
 def test_invalid_arguments_are_refused_by_name(call, argument):
@@ -84,11 +85,6 @@ def test_all_four_edges_are_on_the_target():
         assert found_at([point], box) == 0
     for point in ([9.9, 30], [30.1, 30], [20, 19.9], [20, 40.1]):
         assert found_at([point], box) == -1
-
-
-def test_a_scanpath_without_fixations_is_refused():
-    with pytest.raises(InputError, match=r"^points:"):
-        found_at(np.zeros((0, 2)), (0, 0, 1, 1))
 
 
 def test_the_scanpath_ratio_starts_at_the_first_fixation():

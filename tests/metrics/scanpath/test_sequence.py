@@ -77,21 +77,8 @@ def test_consecutive_fixations_closer_than_half_a_window_are_merged():
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [1.0, 30.0]], (10, 10)), [[0, 0], [1, 30]])
 
 
-@pytest.mark.parametrize(
-    ("call", "argument"),
-    [
-        (lambda: sequence_score([], [1]), "ours"),
-        (lambda: edit_distance([1], []), "theirs"),
-        (lambda: cell_labels([[100, 0]], 2, 2, (100, 100)), "points"),
-    ],
-)
-def test_invalid_arguments_are_refused_by_name(call, argument):
-    with pytest.raises(InputError, match=f"^{argument}:"):
-        call()
-
-
 def test_an_error_says_how_many_points_are_outside_the_picture():
-    with pytest.raises(InputError, match=r"got 2 outside it"):
+    with pytest.raises(InputError, match=r"^points: .*got 2 outside it"):
         cell_labels([[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
 
 
