@@ -18,10 +18,10 @@ from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
+from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything, look_for
-from semfov.zoom.tally import Tally
 
 LIMIT = 1_000_000
 """Limit of passes and batches, more than any picture has windows."""
@@ -248,33 +248,33 @@ def search(
         verifier = Verifier(model, places, close_up, at, closer)
     else:
         thresholds = thresholds.changed(confirm)
-    tally: Tally | None = None
+    facts: SearchFacts | None = None
     ended, presence = 0, None
     for turn in look_for(glances, evidence, target, confirm=float("inf")):
         glance, ahead = turn.glance, turn.ahead
-        tally = tally or Tally(turn.belief)
-        tally.add(glance)
+        facts = facts or SearchFacts(turn.belief)
+        facts.add(glance)
         seen.append(glance)
         values.append(turn.worth)
         presence = None
-        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
-            presence = tally.presence(ahead)
+        if facts.detected or ahead < thresholds.give_up:  # otherwise no probability ends the search
+            presence = facts.presence(ahead)
             if verifier is None:
-                state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
+                state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([ahead])
                 ended = int(settle(*state, thresholds))
             else:
-                room, look = passes - len(seen), WindowLook(glance.detections, len(seen), presence, tally.best, ahead)
+                room, look = passes - len(seen), WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
                 verifier.see(look, last=ahead == 0 or room <= 1)
                 values += [place.probability for place in verifier.look_closely(room)]
                 ended = verifier.outcome()
         if ended or len(seen) == passes:
             break
-    assert tally is not None
+    assert facts is not None
     if verifier is not None and verifier.looks:
         decision = verifier.decision(over=ended > 0)
     else:
-        presence = tally.presence(ahead) if presence is None else presence
-        decision = Decision(OUTCOMES[ended], presence, None, tally.box if OUTCOMES[ended] == "found" else None)
+        presence = facts.presence(ahead) if presence is None else presence
+        decision = Decision(OUTCOMES[ended], presence, None, facts.box if OUTCOMES[ended] == "found" else None)
     decided = ended > 0 or decision.outcome == "found"
     ending: Ending = "decision" if decided else "passes" if len(seen) == passes else "windows"
     return ZoomPath(

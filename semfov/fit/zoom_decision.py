@@ -23,8 +23,8 @@ from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import Turn
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.facts import SearchFacts
 from semfov.zoom.search import look_for
-from semfov.zoom.tally import Tally
 
 JUDGED = (1, 4, 8, 16)
 """Numbers of looks after which the probability of presence is evaluated."""
@@ -36,8 +36,8 @@ class Searches:
 
     Attributes:
         best: `(E, n)`, highest score of the target so far, after each look.
-        case: `(E, n, 10)`, features of the search so far (`Tally.case`).
-        looked: `(E, n)`, whether a detection has shown the target (`Tally.looked`).
+        case: `(E, n, 10)`, features of the search so far (`SearchFacts.case`).
+        looked: `(E, n)`, whether a detection has shown the target (`SearchFacts.detected`).
         left: `(E, n)`, value of the best remaining look.
         there: `(E,)`, whether the target is in the picture.
     """
@@ -64,7 +64,7 @@ def searches_of(
     passes: int,
     seed: int,
     title: str,
-) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], Tally]]]]:
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], SearchFacts]]]]:
     """Search every mosaic for some present classes and for as many absent ones, without decisions.
 
     Args:
@@ -84,17 +84,17 @@ def searches_of(
         annotation = mosaics.annotation(index)
         for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
             turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)
-            yield index, annotation, target, _tallied(turns)
+            yield index, annotation, target, _with_facts(turns)
         looks.save()
 
 
-def _tallied(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBelief], Tally]]:
+def _with_facts(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBelief], SearchFacts]]:
     """The turns of a search, each with the facts about the search after it."""
-    tally: Tally | None = None
+    facts: SearchFacts | None = None
     for turn in turns:
-        tally = tally or Tally(turn.belief)
-        tally.add(turn.glance)
-        yield turn, tally
+        facts = facts or SearchFacts(turn.belief)
+        facts.add(turn.glance)
+        yield turn, facts
 
 
 @torch.inference_mode()
@@ -116,7 +116,7 @@ def search_mosaics(
     rows: list[list[Tensor]] = []
     searches = searches_of(model, mosaics, opened, classes=classes, passes=passes, seed=seed, title=title)
     for _, annotation, target, turns in searches:
-        steps = [(tally.best, tally.case(turn.ahead), tally.looked, turn.ahead) for turn, tally in turns]
+        steps = [(facts.best, facts.case(turn.ahead), facts.detected, turn.ahead) for turn, facts in turns]
         steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))
         best, case, looked, left = zip(*steps, strict=True)
         there = torch.tensor(bool((annotation.labels == target).any()))

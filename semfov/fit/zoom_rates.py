@@ -5,7 +5,6 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,6 +13,7 @@ from semfov.runs.window_looking import SHOWN
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.gist import Gist
+from semfov.zoom.networks import STEPS
 
 E = TypeVar("E")
 
@@ -119,8 +119,7 @@ def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
     cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     rows, columns = (n * look.scale for n in look.scores.shape[:2])
     part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
-    source = np.zeros(part.shape[-2:], np.int64)
-    return torch.stack([before_of(one.numpy(), source, look) for one in part])
+    return torch.stack([before_of(one.numpy(), look) for one in part[:, min(look.level, STEPS - 1)]])
 
 
 def _likelihood_loss(

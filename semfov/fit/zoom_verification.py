@@ -150,11 +150,11 @@ def mosaic_searches(
         glances: list[Glance] = []
         states: list[WindowLook] = []
         boxes: list[Tensor | None] = []
-        for number, (turn, tally) in enumerate(turns, 1):
-            seen, presence = turn.glance.detections, tally.presence(turn.ahead)
+        for number, (turn, facts) in enumerate(turns, 1):
+            seen, presence = turn.glance.detections, facts.presence(turn.ahead)
             glances.append(turn.glance)
-            states.append(WindowLook(seen, number, presence, tally.best, turn.ahead))
-            boxes.append(tally.box if tally.looked else None)
+            states.append(WindowLook(seen, number, presence, facts.best, turn.ahead))
+            boxes.append(facts.box if facts.detected else None)
         objects = annotation.boxes[annotation.labels == target]
         likely = model.thresholds.confirm
         yield MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)

@@ -1,6 +1,7 @@
 """Belief about a large picture: what looks at it predict for closer looks."""
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
-from semfov.zoom.sums import Box, Cells, WindowSums, extent
+from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
 
 
 class Rates(Protocol):
@@ -35,15 +36,20 @@ class Rates(Protocol):
 
 
 class ZoomBelief:
-    """What looks at any window of a picture are expected to show, for one class.
+    r"""What looks at any window of a picture are expected to show, for one class.
 
-    Each cell is predicted from the closest look at it. The belief keeps six numbers for a cell: the level of that look,
-    the share of the cell that is left to see, the number of objects centred in the cell that looks one, two and three
-    octaves closer are expected to find, and the level that these are from: they are predicted when they are asked for.
-    With two zeros for levels without a prediction these are 33 bytes.
-    Hints of all classes are kept for the windows that were looked at, at most 32 × 32 cells of each. A picture of
-    20,000 × 15,000 px has 49,152 cells: 1.6 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep
-    the hints of each look that are left to see and what they predict for its windows, at most 0.41 MB.
+    Each cell x is predicted from the closest look at it, of level s(x), whose rates are :math:`\lambda_1`,
+    :math:`\lambda_2` and :math:`\lambda_3` for looks one, two and three octaves closer. A look of level k is expected
+    to find this number of objects centred in the cell, where u(x) is 0 once nothing is left to see in it, and 1 before:
+
+    .. math:: n_k(x) = u(x) \, \lambda_{k - s(x)}(x), \qquad \lambda_i = 0 \text{ for other } i
+
+    For a picture with L levels the belief keeps L + 3 numbers for a cell. Hints of all classes are kept for the windows
+    that were looked at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells and six levels:
+    1.8 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep the hints of each look that are left to
+    see and what they predict for its windows, at most 0.41 MB.
+
+    Sums over windows (`WindowSums`) and log odds (`WindowOdds`) are kept, and computed anew where cells have changed.
 
     Args:
         lattice: lattice of the picture.
@@ -62,21 +68,16 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
         shape = lattice.rows, lattice.columns
-        # Rates of cells that a level is not one to three octaves closer to are 0: the first plane and the last one.
-        self._planes = np.zeros((STEPS + 2, *shape), np.float32)
-        # The level that the rates of a cell are from. Searches for one object ask for none.
+        self._rate = np.zeros((lattice.levels, *shape), np.float32)
+        # The level that the rates of a cell are from. Rates are predicted when they are asked for.
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0
         self.source = torch.full(shape, -1)
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
-        self._changes: list[Box] = [(0, 0, lattice.columns, lattice.rows)]
-        self._summed: dict[tuple[int, int], int] = {}
-        self._expected: dict[int, Cells] = {}
         self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds: WindowOdds | None = None
-        self._judged = 0
-        self._told: dict[Window, float] = {}
+        self._odds_of: dict[Window, float] = {}
 
     @property
     def evidence(self) -> GlimpseEvidence:
@@ -99,9 +100,7 @@ class ZoomBelief:
         differs = before != now
         if differs.any():
             np.copyto(now, before)
-            box = extent(differs)
-            self._renew(box)
-            self._changes.append(box)
+            self._mark(extent(differs))
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
@@ -110,10 +109,10 @@ class ZoomBelief:
             return
         look, source = glance.gist, self.source.numpy()
         self.gists.append(look)
-        self._told.clear()
+        self._odds_of.clear()
         x1, y1, x2, y2 = box = self._box(look)
         np.maximum(source[y1:y2, x1:x2], look.level, out=source[y1:y2, x1:x2])
-        self._changes.append(box)
+        self._mark(box, left=False)
 
     def discount(self, window: Window) -> None:
         """Expect nothing more inside a window, because it was looked at as closely as possible, or is about to be.
@@ -124,15 +123,15 @@ class ZoomBelief:
         x1, y1, x2, y2 = window.cells
         x1, y1, x2, y2 = max(x1, 0), max(y1, 0), min(x2, self.lattice.columns), min(y2, self.lattice.rows)
         if x1 < x2 and y1 < y2:
-            for cells in (self.left.numpy(), *self._expected.values()):
-                cells[y1:y2, x1:x2] = 0
-            self._changes.append((x1, y1, x2, y2))
+            self.left.numpy()[y1:y2, x1:x2] = 0
+            self._mark((x1, y1, x2, y2))
 
-    @property
-    def rate(self) -> Tensor:
-        """Expected objects centred in each cell, for looks one to three octaves closer, `(3, rows, columns)`."""
-        self._predict()
-        return torch.from_numpy(self._planes[1:-1])
+    def _mark(self, changed: Box, *, left: bool = True) -> None:
+        """Have everything that is kept about windows computed anew where cells, or what is left of them, changed."""
+        for sums in self._sums.values():
+            sums.mark(changed)
+        if left and self._odds is not None:
+            self._odds.mark(changed)
 
     def _box(self, look: Gist) -> Box:
         """The cells that a look shows."""
@@ -144,40 +143,37 @@ class ZoomBelief:
         """Write the rates of new looks to the cells that were not looked at as closely before."""
         new, self._predicted = self.gists[self._predicted :], len(self.gists)
         for look in new:
-            x1, y1, x2, y2 = box = self._box(look)
+            x1, y1, x2, y2 = self._box(look)
             at = slice(y1, y2), slice(x1, x2)
-            rate, rated = self._planes[1:-1, *at], self._rated[at]
-            before = before_of(rate, rated, look)[None] if look.level > 0 else None
+            rate, rated = self._rate[:, *at], self._rated[at]
+            before = None
+            if look.level > 0:
+                # Rates of looks that are coarser by more than three octaves are those for three.
+                level = rated + 1 + (look.level - rated).clip(0, STEPS - 1)
+                before = before_of(np.choose(level, rate), look)[None]
             cells = self._rates.rates(look, self._targets, before)[0].exp().numpy()
             if look.scale > 1:
                 cells = cells.repeat(look.scale, -1).repeat(look.scale, -2)[:, : y2 - y1, : x2 - x1] / look.scale**2
             newer = rated < look.level
-            np.copyto(rate, cells, where=newer)
+            for level, values in enumerate(rate):
+                step = level - look.level - 1
+                np.copyto(values, cells[step] if 0 <= step < STEPS else 0, where=newer)
             rated[newer] = look.level
-            self._renew(box)
 
     def expected(self, level: int) -> Tensor:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
-        return torch.from_numpy(self._expect(level).copy())
+        return torch.from_numpy(self._expected(level))
 
-    def _expect(self, level: int) -> Cells:
-        """`expected`, not to be written to."""
-        self._predict()
-        if level not in self._expected:
-            self._expected[level] = self._compute(level, (slice(None), slice(None)))
-        return self._expected[level]
-
-    def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
+    def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""
-        told: Cells = np.choose(level - self._rated[at], self._planes[:, *at], mode="clip")
-        return told * self.left.numpy()[at]
+        self._predict()
+        expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
+        return expected
 
-    def _renew(self, changed: Box) -> None:
-        """Compute what is expected anew in cells that have changed."""
-        x1, y1, x2, y2 = changed
-        at = slice(y1, y2), slice(x1, x2)
-        for level, cells in self._expected.items():
-            cells[at] = self._compute(level, at)
+    def _unseen(self, level: int, at: Place) -> NDArray[np.bool_]:
+        """Whether no look has shown a cell at a level or closer, in some rows and columns."""
+        unseen: NDArray[np.bool_] = self.source.numpy()[at] < level
+        return unseen
 
     def finds(self, level: int) -> Tensor:
         """Number of objects that a look at each window of a level is expected to find, `(down, across)`."""
@@ -216,23 +212,19 @@ class ZoomBelief:
             `(down, across)`, not to be written to.
         """
         if (level, octaves) not in self._sums:
+            cells: Callable[[Place], Cells] = (
+                lambda at: self.left.numpy()[at] * self._unseen(level, at),
+                lambda at: self._expected(level, at),
+                lambda at: self._expected(level + 1, at) * self._unseen(level, at),
+            )[octaves]
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)
-            self._sums[level, octaves] = WindowSums(weight, (self.lattice.rows, self.lattice.columns))
-        sums, changes = self._sums[level, octaves], self._changes[self._summed.get((level, octaves), 0) :]
-        if not changes:
-            return sums.sums
-        self._summed[level, octaves] = len(self._changes)
-        x1, y1, x2, y2 = zip(*changes, strict=True)
-        changed = min(x1), min(y1), max(x2), max(y2)
-        if octaves == 1:
-            return sums.update(self._expect(level), changed)
-        cells = self.left.numpy() if octaves == 0 else self._expect(level + 1)
-        return sums.update(cells * (self.source.numpy() < level), changed)
+            self._sums[level, octaves] = WindowSums(weight, (self.lattice.rows, self.lattice.columns), cells)
+        return self._sums[level, octaves].update()
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
-        return torch.from_numpy(self._shown().odds(level).copy())
+        return torch.from_numpy(self._known(level).copy())
 
     def chances(self, level: int) -> Cells:
         r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
@@ -249,20 +241,18 @@ class ZoomBelief:
         Returns:
             `(down, across)`.
         """
-        return self._shown().chances(level) * self.unseen(level)
+        probability: Cells = torch.from_numpy(self._known(level)).sigmoid().numpy()
+        return probability * self.unseen(level)
 
-    def _shown(self) -> WindowOdds:
+    def _known(self, level: int) -> Cells:
         if self._odds is None:
-            self._odds = WindowOdds(self.lattice, self.evidence, self.target)
-        if self._judged < len(self._changes):
-            self._odds.update(self.gists, self.left.numpy())
-            self._judged = len(self._changes)
-        return self._odds
+            self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.gists, self.left.numpy())
+        return self._odds.update()[level]
 
     def odds_of(self, window: Window) -> float:
         """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
-        if window in self._told:
-            return self._told[window]
+        if window in self._odds_of:
+            return self._odds_of[window]
         value: Tensor | None = None
         for look in sorted(self.gists, key=lambda gist: gist.level):
             steps = window.level - look.level
@@ -282,25 +272,23 @@ class ZoomBelief:
             with torch.no_grad():
                 known = None if value is None or look.level == 0 else value
                 value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, known)
-        self._told[window] = float("-inf") if value is None else float(value)
-        return self._told[window]
+        self._odds_of[window] = float("-inf") if value is None else float(value)
+        return self._odds_of[window]
 
 
-def before_of(rate: Cells, source: NDArray[np.integer[Any]], look: Gist) -> Tensor:
+def before_of(rate: Cells, look: Gist) -> Tensor:
     """Logarithms of the rates that earlier looks gave, in the cells of a look, for looks one octave closer than it.
 
     Args:
-        rate: `(3, rows, columns)`, rates of the lattice cells that the look shows.
-        source: `(rows, columns)`, level of the look that gave the rates of each cell.
+        rate: `(rows, columns)`, the rates in the lattice cells that the look shows.
         look: the new look.
 
     Returns:
         `(rows, columns)` of the gist.
     """
-    # NumPy, because a call of torch takes longer than the work.
-    told = torch.from_numpy(np.choose(look.level - source, rate, mode="clip"))
+    before = torch.from_numpy(rate)
     rows, columns = look.scores.shape[:2]
     if look.scale > 1:
-        told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))
-        told = F.avg_pool2d(told[None], look.scale)[0] * look.scale**2
-    return (told + 1e-6).log()
+        before = F.pad(before, (0, columns * look.scale - before.shape[1], 0, rows * look.scale - before.shape[0]))
+        before = F.avg_pool2d(before[None], look.scale)[0] * look.scale**2
+    return (before + 1e-6).log()

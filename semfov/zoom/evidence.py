@@ -34,7 +34,7 @@ _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
 CASE, _JUDGE_WIDTH = 10, 16
-"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.tally`)."""
+"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.facts`)."""
 _LARGEST = 1e6
 
 
@@ -56,7 +56,7 @@ class GlimpseEvidence(Pretrained):
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
     - Does the picture hold t at all, after the looks of a search? The highest score of t in any look, :math:`s^*`, is
-      corrected by further facts about the search, its case c (`semfov.zoom.tally`):
+      corrected by further facts about the search, its case c (`semfov.zoom.facts`):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
@@ -245,7 +245,7 @@ class GlimpseEvidence(Pretrained):
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            case: `(..., 10)`, further facts about the search (`semfov.zoom.tally.Tally.case`).
+            case: `(..., 10)`, further facts about the search (`semfov.zoom.facts.SearchFacts.case`).
 
         Returns:
             Log odds, `(...)`.

@@ -1,7 +1,8 @@
 """Log odds that windows show a class, from all looks at a picture, computed anew only where something has changed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +13,7 @@ from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
-from semfov.zoom.sums import Box, Cells, extent
-
-Place = tuple[slice, slice]
-"""Rows and columns of an array."""
+from semfov.zoom.sums import Box, Cells, Place, extent, union
 
 _UNKNOWN = -4.0
 """Log odds that are used where no earlier look gave any."""
@@ -47,6 +45,24 @@ class _Table:
         return slice(max(y1 - reach, 0), min(y2, self.shape[0])), slice(max(x1 - reach, 0), min(x2, self.shape[1]))
 
 
+class _Pooled(NamedTuple):
+    """Pooled hints of windows of one level in a look.
+
+    Attributes:
+        step: octaves between the look and the windows.
+        scores: `(n, K)`, from `pool_all`.
+        summary: `(n, 3)`, from `pool_all`.
+        facts: their place in the facts of the look.
+        stale: their place in `stale` of the look.
+    """
+
+    step: int
+    scores: Tensor
+    summary: Tensor
+    facts: NDArray[np.generic]
+    stale: NDArray[np.generic]
+
+
 class _Look:
     """A look and its predictions for N windows: those of up to three closer levels that lie in it.
 
@@ -55,11 +71,9 @@ class _Look:
         lattice: lattice of the picture.
 
     Attributes:
+        box: the cells of the lattice that it shows, `(x1, y1, x2, y2)`.
         fresh: whether nothing was predicted from it yet.
-        hinted: `(rows, columns)`, whether a cell has hints.
-        scores: `(rows, columns, K)`, those of the gist.
         left: `(rows, columns)`, share of each cell that is left to see.
-        shown: `(rows, columns, K)`, scores of the hints times that share.
         tables: the windows of each level.
         facts: `(N, 6)`, `GlimpseEvidence.hint_facts`.
         before: `(N,)`, log odds from coarser looks.
@@ -69,172 +83,142 @@ class _Look:
 
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
         self.gist = gist
+        (x, y), scale, (rows, columns) = gist.first, gist.scale, gist.scores.shape[:2]
+        self.box: Box = (x, y, x + columns * scale, y + rows * scale)
         self.fresh = True
-        self.hinted = gist.best.numpy() > 0
-        self.left = np.ones(self.hinted.shape, np.float32)
-        self.shown = self.scores = gist.scores.numpy()
+        self.left = np.ones((rows, columns), np.float32)
         self.tables: dict[int, _Table] = {}
         count = 0
         for level in range(gist.level + 1, min(gist.level + STEPS, lattice.levels - 1) + 1):
-            if span := lattice.span(level) // gist.scale:
-                down, across = (max(n - span, 0) + 1 for n in self.hinted.shape)
+            if span := lattice.span(level) // scale:
+                down, across = (max(n - span, 0) + 1 for n in (rows, columns))
                 # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
                 ends = lattice.places(level)
-                x, y = (
-                    np.minimum(low + gist.scale * np.arange(n), end - 1)
-                    for low, n, end in zip(gist.first, (across, down), ends, strict=True)
+                column, row = (
+                    np.minimum(low + scale * np.arange(n), end - 1)
+                    for low, n, end in zip((x, y), (across, down), ends, strict=True)
                 )
-                places = (y[:, None] * ends[0] + x).ravel()
+                places = (row[:, None] * ends[0] + column).ravel()
                 self.tables[level] = _Table(span, (down, across), slice(count, count + len(places)), places)
                 count += len(places)
         self.facts = np.zeros((count, 6), np.float32)
         self.before, self.odds = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
         self.stale = np.ones(count, np.bool_)
 
-    def cover(self, left: Cells) -> Box | None:
-        """Take over the share of each cell that is left to see; return the box about hints that this changes."""
-        differs = self.hinted & (left != self.left)
-        self.left = left
-        if not differs.any():
-            return None
-        x1, y1, x2, y2 = changed = extent(differs)
-        if self.shown is self.scores:
-            self.shown = self.scores.copy()
-        here = slice(y1, y2), slice(x1, x2)
-        np.multiply(self.scores[here], left[here][..., None], out=self.shown[here])
-        return changed
+    def pool(self, left: Cells) -> Iterator[_Pooled]:
+        """Pool the hints that are left to see, in the windows where they have changed.
 
-    @property
-    def box(self) -> Box:
-        """The cells of the lattice that it shows, `(x1, y1, x2, y2)`."""
-        (x, y), scale, (rows, columns) = self.gist.first, self.gist.scale, self.hinted.shape
-        return x, y, x + columns * scale, y + rows * scale
+        Args:
+            left: share of each cell of the lattice that is left to see.
 
+        Yields:
+            The hints of the windows of each level, the coarsest first.
+        """
+        scores, before = self.gist.scores.numpy(), self.left
+        self.left = self._left_of(left)
+        if self.fresh:
+            changed, self.fresh = (0, 0, scores.shape[1], scores.shape[0]), False
+        else:
+            differs = (self.gist.best.numpy() > 0) & (self.left != before)
+            if not differs.any():
+                return
+            changed = extent(differs)
+        if not self.tables:
+            return
+        places = [table.holding(changed) for table in self.tables.values()]
+        # The largest windows, which come first, reach over the cells of all others.
+        (below, beside), reach = places[0], next(iter(self.tables.values())).span - 1
+        part = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
+        share = self.left[part]
+        visible = torch.from_numpy(scores[part] if (share == 1).all() else scores[part] * share[..., None])
+        pools = pool_spans(visible, [table.span for table in self.tables.values()])
+        for (level, table), (down, across), maps in zip(self.tables.items(), places, pools, strict=True):
+            at = _shifted(down, below.start), _shifted(across, beside.start)
+            top, summary = (values[at].flatten(0, 1) for values in maps)
+            facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
+            yield _Pooled(level - self.gist.level, top, summary, facts, stale)
 
-@dataclass
-class _Pooled:
-    """Pooled hints of N windows of a look: their level, their place in its table, and the results of `pool_all`."""
-
-    look: _Look
-    level: int
-    place: Place
-    scores: Tensor
-    summary: Tensor
+    def _left_of(self, left: Cells) -> Cells:
+        """Share of each cell of the gist that is left to see, `(rows, columns)`."""
+        (x1, y1, x2, y2), scale = self.box, self.gist.scale
+        part = left[y1:y2, x1:x2]
+        if part.shape != (y2 - y1, x2 - x1):
+            part = np.pad(part, ((0, y2 - y1 - part.shape[0]), (0, x2 - x1 - part.shape[1])), constant_values=1)
+        rows, columns = self.left.shape
+        return part.copy() if scale == 1 else part.reshape(rows, scale, columns, scale).mean((1, 3))
 
 
 class WindowOdds:
-    """Log odds that a look at a window shows a class, for the windows of all levels.
+    r"""Log odds that a look at a window shows a class, for the windows of all levels.
 
     Looks contribute from the coarsest to the closest. A closer look replaces the predictions of coarser ones for the
-    windows inside it, and takes them as an input.
+    windows inside it, and takes them as an input (`GlimpseEvidence.presence`). With the looks that hold the window w,
+    numbered in this order:
+
+    .. math:: o_i(w) = f(u s_i, w, o_{i-1}(w))
+
+    The hints s of each look count for the share u of their cell that is left to see.
 
     Args:
         lattice: lattice of the picture.
         evidence: learned evidence.
         target: class 1..K.
+        gists: gists of all looks so far, in their order; more may be appended.
+        left: `(rows, columns)`, u of the cells of the lattice, which may change.
     """
 
-    def __init__(self, lattice: Lattice, evidence: GlimpseEvidence, target: int) -> None:
+    def __init__(
+        self, lattice: Lattice, evidence: GlimpseEvidence, target: int, gists: Sequence[Gist], left: Cells
+    ) -> None:
         self._lattice, self._evidence, self._target = lattice, evidence, target
+        self._gists, self._left = gists, left
         self._looks: list[_Look] = []
-        self._left = np.ones((lattice.rows, lattice.columns), np.float32)
         self._odds: dict[int, Cells] = {
             level: np.full(lattice.places(level)[::-1], -np.inf, np.float32) for level in range(1, lattice.levels)
         }
-        self._chances: dict[int, Cells] = {}
+        self._changed: Box | None = None
 
-    def odds(self, level: int) -> Cells:
-        """Log odds of the windows of a level, `(down, across)`; -inf where nothing is known."""
-        return self._odds[level]
-
-    def chances(self, level: int) -> Cells:
-        """Probabilities of the windows of a level, `(down, across)`."""
-        if level not in self._chances:
-            self._chances[level] = torch.from_numpy(self._odds[level]).sigmoid().numpy()
-        return self._chances[level]
+    def mark(self, changed: Box) -> None:
+        """Have the log odds computed anew where less or more is left to see."""
+        self._changed = union(changed, self._changed)
 
     @torch.no_grad()
-    def update(self, gists: Sequence[Gist], left: Cells) -> None:
-        """Update the log odds after further looks.
-
-        Args:
-            gists: gists of all looks so far, in their order.
-            left: `(rows, columns)` of the lattice, share of each cell that is left to see.
-        """
-        fresh = [_Look(gist, self._lattice) for gist in gists[len(self._looks) :]]
+    def update(self) -> Mapping[int, Cells]:
+        """Log odds of the windows of each level, `(down, across)`; -inf where unknown. The next call changes them."""
+        fresh = [_Look(gist, self._lattice) for gist in self._gists[len(self._looks) :]]
         # A look changes what closer ones start from, and a change in what is left to see concerns looks of all levels.
         changed = [(look.box, look.gist.level) for look in fresh]
-        differs = left != self._left
-        if differs.any():
-            changed.append((extent(differs), -1))
-            self._left = left.copy()
-        if not changed:
-            return
-        self._looks = sorted(self._looks + fresh, key=lambda look: look.gist.level)
-        affected = [
-            look.fresh or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
-            for look in self._looks
-        ]
-        first = affected.index(True)
-        if not all(look.fresh for look in self._looks[first:]):
-            first = 0
-            self._chances.clear()
+        if self._changed is not None:
+            changed.append((self._changed, -1))
+            self._changed = None
+        if changed:
+            self._looks = sorted(self._looks + fresh, key=lambda look: look.gist.level)
+            concerned = [
+                look
+                for look in self._looks
+                if look.fresh or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
+            ]
+            self._read(concerned)
             for odds in self._odds.values():
                 odds.fill(-np.inf)
-        self._read([look for look, concerned in zip(self._looks, affected, strict=True) if concerned])
-        for look, concerned in zip(self._looks[first:], affected[first:], strict=True):
-            if concerned:
-                self._judge(look)
-            self._write(look)
-
-    def _write(self, look: _Look) -> None:
-        """Write the predictions of a look over those of coarser ones."""
-        (x, y), scale = look.gist.first, look.gist.scale
-        for level, table in look.tables.items():
-            odds = table.of(look.odds)
-            if scale > 1:
-                # A gist of large cells has no windows that start inside a cell: they get the odds of the one before.
-                odds = odds.repeat(scale, 0).repeat(scale, 1)
-            place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
-            place[:] = odds[: place.shape[0], : place.shape[1]]
-            self._chances.pop(level, None)
+            for look in self._looks:
+                if look in concerned:
+                    self._judge(look)
+                self._write(look)
+        return self._odds
 
     def _read(self, looks: Sequence[_Look]) -> None:
         """Compute the facts of the windows whose hints have changed, of all looks in one call of the network."""
-        parts = [part for look in looks for part in self._pool(look)]
+        parts = [part for look in looks for part in look.pool(self._left)]
         if not parts:
             return
         counts = [len(part.scores) for part in parts]
         scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
-        steps = torch.from_numpy(np.repeat([part.level - part.look.gist.level for part in parts], counts))
-        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
-        told, start = facts.numpy(), 0
-        for part, count in zip(parts, counts, strict=True):
-            table = part.look.tables[part.level]
-            place = table.of(part.look.facts)[part.place]
-            place[:] = told[start : start + count].reshape(place.shape)
-            table.of(part.look.stale)[part.place] = True
-            start += count
-
-    def _pool(self, look: _Look) -> list[_Pooled]:
-        """Pool the hints that are left to see in a look, in the windows where they have changed."""
-        changed = look.cover(self._left_of(look.gist))
-        if look.fresh:
-            rows, columns = look.hinted.shape
-            changed, look.fresh = (0, 0, columns, rows), False
-        if changed is None:
-            return []
-        places = {level: table.holding(changed) for level, table in look.tables.items()}
-        # The largest windows, which come first, reach over the cells of all others.
-        first = look.gist.level + 1
-        (below, beside), reach = places[first], look.tables[first].span - 1
-        shown = look.shown[below.start : below.stop + reach, beside.start : beside.stop + reach]
-        pools = pool_spans(torch.from_numpy(shown), [table.span for table in look.tables.values()])
-        parts = []
-        for (level, (down, across)), maps in zip(places.items(), pools, strict=True):
-            at = _shifted(down, below.start), _shifted(across, beside.start)
-            parts.append(_Pooled(look, level, (down, across), *(values[at].flatten(0, 1) for values in maps)))
-        return parts
+        steps = torch.from_numpy(np.repeat([part.step for part in parts], counts))
+        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0].numpy()
+        for part, values in zip(parts, np.split(facts, np.cumsum(counts)[:-1]), strict=True):
+            part.facts[:] = values.reshape(part.facts.shape)
+            part.stale[:] = True
 
     def _judge(self, look: _Look) -> None:
         """Compute the log odds of the windows of a look for which the facts or the log odds before have changed."""
@@ -250,15 +234,16 @@ class WindowOdds:
             look.odds[rows] = self._evidence.odds(torch.from_numpy(look.facts[rows]), before).numpy()
             look.stale[:] = False
 
-    def _left_of(self, gist: Gist) -> Cells:
-        """Share of each cell of a gist that is left to see, `(rows, columns)`."""
-        rows, columns = gist.scores.shape[:2]
-        high, wide = rows * gist.scale, columns * gist.scale
-        (x, y), scale = gist.first, gist.scale
-        part = self._left[y : y + high, x : x + wide]
-        if part.shape != (high, wide):
-            part = np.pad(part, ((0, high - part.shape[0]), (0, wide - part.shape[1])), constant_values=1)
-        return part.copy() if scale == 1 else part.reshape(rows, scale, columns, scale).mean((1, 3))
+    def _write(self, look: _Look) -> None:
+        """Write the predictions of a look over those of coarser ones."""
+        (x, y), scale = look.gist.first, look.gist.scale
+        for level, table in look.tables.items():
+            odds = table.of(look.odds)
+            if scale > 1:
+                # A gist of large cells has no windows that start inside a cell: they get the odds of the one before.
+                odds = odds.repeat(scale, 0).repeat(scale, 1)
+            place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
+            place[:] = odds[: place.shape[0], : place.shape[1]]
 
 
 def _overlap(box: Box, other: Box) -> bool:

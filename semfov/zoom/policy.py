@@ -1,6 +1,6 @@
 """Policies of where to look next, and how closely: the value of a look at each window."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 
 import numpy as np
@@ -53,19 +53,19 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
         The window and its value; None if no window can show the target.
     """
     lattice, patience = belief.lattice, belief.evidence.patience
+    chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
     best: Choice | None = None
-    for level in range(1, lattice.levels):
+    for level, values in chances.items():
         last = level == lattice.levels - 1
-        values = belief.chances(level)
         if closest and not last:
             values = np.zeros_like(values)
         if not last:
-            values = np.maximum(values, _sums(belief, level) / np.float32(patience))
+            values = np.maximum(values, _sums(belief, chances, level) / np.float32(patience))
         best = _better(best, values, level, lattice, done)
     return best
 
 
-def _sums(belief: ZoomBelief, level: int) -> Cells:
+def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
     """Sum the chances of closer windows, side by side, in each window of a level.
 
     Closer windows whose middle was looked at from this level already count as 0.
@@ -77,14 +77,14 @@ def _sums(belief: ZoomBelief, level: int) -> Cells:
     down, across = lattice.places(level)[::-1]
     total = np.zeros((down, across), np.float32)
     for deeper in range(level + 1, lattice.levels):
-        chances = belief.chances(deeper)
+        closer = chances[deeper]
         span, times = lattice.span(deeper), 1 << (deeper - level)
         half = span // 2
-        middle = source[half : half + chances.shape[0], half : half + chances.shape[1]]
+        middle = source[half : half + closer.shape[0], half : half + closer.shape[1]]
         rows, columns = middle.shape
         # Windows of the level can reach beyond the picture, where there are no closer windows: zeros.
         table = np.zeros([max((times - 1) * span + n, m) for n, m in ((down, rows), (across, columns))], np.float32)
-        np.multiply(chances[:rows, :columns], middle < level, out=table[:rows, :columns])
+        np.multiply(closer[:rows, :columns], middle < level, out=table[:rows, :columns])
         lines = reduce(np.add, (table[span * n : span * n + down] for n in range(times)))
         total = np.maximum(total, reduce(np.add, (lines[:, span * n : span * n + across] for n in range(times))))
     return total

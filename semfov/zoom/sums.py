@@ -1,5 +1,7 @@
 """Sums over all windows of a level, computed anew only where cells have changed."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,56 +11,70 @@ Cells = NDArray[np.float32]
 Box = tuple[int, int, int, int]
 """Cells `(x1, y1, x2, y2)` of a lattice."""
 
+Place = tuple[slice, slice]
+"""Rows and columns of an array."""
+
+EVERYWHERE: Place = (slice(None), slice(None))
+
 
 class WindowSums:
     r"""Weighted sums of the cells of every window.
 
     .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
 
-    A sum along an axis is a product with a banded matrix. Sums are kept between calls. A call sums again the windows
-    that hold a cell which has changed.
+    A sum along an axis is a product with a banded matrix. Only the windows that hold a cell which has changed are
+    summed again. A window that reaches beyond the cells sums those that it holds.
 
     Args:
         weight: `(span,)`, r, weights of the cells along a side of a window.
         shape: `(rows, columns)` of the cells.
+        cells: returns x in some rows and columns.
 
-    Attributes:
-        sums: `(down, across)`, S of the last call.
-
-    >>> sums = WindowSums(np.ones(2, np.float32), (3, 3))
-    >>> sums.update(np.arange(9, dtype=np.float32).reshape(3, 3), (0, 0, 3, 3))
+    >>> x = np.arange(9, dtype=np.float32).reshape(3, 3)
+    >>> sums = WindowSums(np.ones(2, np.float32), (3, 3), x.__getitem__)
+    >>> sums.update()
     array([[ 8., 12.],
+           [20., 24.]], dtype=float32)
+    >>> x[0, 0] = 5
+    >>> sums.mark((0, 0, 1, 1))
+    >>> sums.update()
+    array([[13., 12.],
            [20., 24.]], dtype=float32)
     """
 
-    def __init__(self, weight: Cells, shape: tuple[int, int]) -> None:
-        self._span = len(weight)
-        self._places = tuple(max(n - self._span, 0) + 1 for n in shape)
-        places = np.arange(max(self._places))
+    def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[Place], Cells]) -> None:
+        self._span, self._cells = len(weight), cells
+        places = np.arange(max(max(n - self._span, 0) + 1 for n in shape))
         self._band = np.zeros((len(places) + self._span - 1, len(places)), np.float32)
         self._band[places + np.arange(self._span)[:, None], places] = weight[:, None]
-        self.sums = np.zeros(self._places, np.float32)
+        self._sums = np.zeros([max(n - self._span, 0) + 1 for n in shape], np.float32)
+        self._changed: Box | None = (0, 0, shape[1], shape[0])
 
-    def update(self, cells: Cells, changed: Box) -> Cells:
-        """Sum the cells of every window.
+    def mark(self, changed: Box) -> None:
+        """Have the windows summed again that hold one of some cells."""
+        self._changed = union(changed, self._changed)
 
-        Args:
-            cells: `(rows, columns)`, x. A window that reaches beyond the cells sums those that it holds.
-            changed: the cells that may have changed since the last call, at the first call all of them.
-
-        Returns:
-            `(down, across)`; the next call changes it.
-        """
-        x1, y1, x2, y2 = changed
+    def update(self) -> Cells:
+        """Sum the cells of every window, `(down, across)`; the next call changes the result."""
+        if self._changed is None:
+            return self._sums
+        (x1, y1, x2, y2), self._changed = self._changed, None
         reach = self._span - 1
         top, left = max(y1 - reach, 0), max(x1 - reach, 0)
-        bottom, right = min(y2, self._places[0]), min(x2, self._places[1])
-        part = cells[top : bottom + reach, left : right + reach]
+        bottom, right = min(y2, self._sums.shape[0]), min(x2, self._sums.shape[1])
+        part = self._cells((slice(top, bottom + reach), slice(left, right + reach)))
         down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
         # NumPy would start threads for large pictures, and they would wait at full load for the next product.
         lines = torch.from_numpy(part) @ torch.from_numpy(across)
-        self.sums[top:bottom, left:right] = (torch.from_numpy(down).mT @ lines).numpy()
-        return self.sums
+        self._sums[top:bottom, left:right] = (torch.from_numpy(down).mT @ lines).numpy()
+        return self._sums
+
+
+def union(box: Box, other: Box | None) -> Box:
+    """The box about two boxes, or about one."""
+    if other is None:
+        return box
+    return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
 
 
 def extent(marked: NDArray[np.bool_]) -> Box:

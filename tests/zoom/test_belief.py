@@ -6,14 +6,14 @@ import torch
 
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.belief import ZoomBelief, before_of
+from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import pool, pool_all, pool_spans
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
 from semfov.zoom.search import look_for
 from semfov.zoom.sums import WindowSums
+from tests.zoom import plain
 
 
 @pytest.fixture
@@ -51,15 +51,15 @@ def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
-        kept, changed = WindowSums(weight, shape), (0, 0, shape[1], shape[0])
+        kept = WindowSums(weight, shape, cells.__getitem__)
         for _ in range(6):
             padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
             windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
             expected = np.einsum("ijkl,k,l->ij", windows.astype(np.float64), weight, weight)
-            np.testing.assert_allclose(kept.update(cells, changed), expected, rtol=1e-5)
+            np.testing.assert_allclose(kept.update(), expected, rtol=1e-5)
             row, column = int(generator.integers(shape[0])), int(generator.integers(shape[1]))
-            changed = column, row, min(column + 3, shape[1]), min(row + 2, shape[0])
             cells[row : row + 2, column : column + 3] = generator.random()
+            kept.mark((column, row, min(column + 3, shape[1]), min(row + 2, shape[0])))
 
 
 @pytest.mark.parametrize("size", [(4096, 200), (4096, 530), (300, 4096)])
@@ -96,18 +96,38 @@ def test_pooling_of_several_sizes_at_once_equals_pooling_of_each_window():
                 torch.testing.assert_close(summary[row, column], one_summary)
 
 
-def test_rates_of_earlier_looks_are_those_for_the_next_level():
-    """Cell by cell; beyond three octaves the rate for three counts, and before any look there is none."""
-    generator = torch.Generator().manual_seed(0)
-    rate = torch.rand(3, 4, 6, generator=generator)
-    source = torch.randint(0, 5, (4, 6), generator=generator)
-    look = Gist(4, (0, 0), 1, torch.zeros(4, 6, 3), torch.zeros(4, 6), torch.zeros(4, 6, 3).bool())
-    told = before_of(rate.numpy(), source.numpy(), look)
-    for row in range(4):
-        for column in range(6):
-            octaves = min(max(look.level + 1 - int(source[row, column]), 1), 3)
-            expected = float(rate[octaves - 1, row, column] + 1e-6)
-            assert told[row, column] == pytest.approx(np.log(expected), abs=1e-6)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence, seed):
+    """After every look of an episode of looks of all levels in any order, with plans that were dropped in between."""
+    generator = torch.Generator().manual_seed(seed)
+    eye = WindowEye(detector)
+    glances = LiveGlances(eye, eye.open(torch.rand(3, 300, 560, generator=generator) * 0.7))
+    lattice, target = glances.lattice, 1 + seed
+    belief, seen = ZoomBelief(lattice, evidence, target), []
+    actions = [[0, 0, 0], *lattice.actions[torch.randint(len(lattice), (7,), generator=generator)].tolist()]
+    for turn, action in enumerate(actions):
+        seen += glances.see([on_lattice(lattice, tuple(action))])
+        belief.add(seen[-1])
+        jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + turn % 3)
+        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + turn % 2)
+        left, closest = plain.left(lattice, seen), plain.closest(lattice, seen)
+        expected = plain.expected(lattice, evidence, target, seen)
+        np.testing.assert_array_equal(belief.left, left)
+        np.testing.assert_array_equal(belief.source, closest)
+        for level in range(1, lattice.levels):
+            np.testing.assert_allclose(belief.expected(level), expected[level], rtol=1e-4, atol=1e-7)
+            taper, ones = evidence.taper(lattice.span(level)).numpy(), np.ones(lattice.span(level))
+            finds = plain.sums(lattice, expected[level], level, taper)
+            np.testing.assert_allclose(belief.finds(level), finds, rtol=1e-3, atol=1e-6)
+            if level + 1 < lattice.levels:
+                finds += 0.5 * plain.sums(lattice, expected[level + 1] * (closest < level), level, ones)
+            np.testing.assert_allclose(belief.value(level, 0.5), finds, rtol=1e-3, atol=1e-6)
+            whole = min(lattice.span(level), lattice.rows) * min(lattice.span(level), lattice.columns)
+            unseen = plain.sums(lattice, left * (closest < level), level, ones) / whole
+            np.testing.assert_allclose(belief.unseen(level), unseen, atol=1e-6)
+            odds = plain.odds(lattice, evidence, target, seen, level)
+            np.testing.assert_allclose(belief.odds(level), odds, rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(belief.chances(level), unseen / (1 + np.exp(-odds)), atol=1e-4)
 
 
 def test_changes_in_cells_without_hints_change_no_odds(belief):
@@ -298,7 +318,6 @@ def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
             belief.add(glance)
         for level in levels:
             asked.finds(level)
-    torch.testing.assert_close(waiting.rate, asked.rate, rtol=0, atol=0)
     for level in levels:
         torch.testing.assert_close(waiting.expected(level), asked.expected(level), rtol=0, atol=0)
         torch.testing.assert_close(waiting.finds(level), asked.finds(level))

@@ -16,10 +16,10 @@ from semfov.fit.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import CASE, features
+from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.search import look_for
-from semfov.zoom.tally import Tally
 
 SHARE = st.floats(0, 1, width=32)
 
@@ -52,9 +52,9 @@ def turns(eye, picture, target, most=6):
 def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     """Every feature, computed in another way from the looks."""
     target, seen = 1, turns(eye, picture, 1)
-    tally = Tally(seen[0].belief)
+    facts = SearchFacts(seen[0].belief)
     for turn in seen:
-        tally.add(turn.glance)
+        facts.add(turn.glance)
     scores = [float(turn.glance.show[target - 1]) for turn in seen]
     closest = [s for s, turn in zip(scores, seen, strict=True) if turn.glance.gist is None]
     named = [
@@ -64,7 +64,7 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
         if int(d.scores[0, n].argmax()) == target
     ]
     ordered = sorted(scores, reverse=True)
-    case = tally.case(0.25)
+    case = facts.case(0.25)
     raw = torch.tensor([ordered[0], ordered[1], max([0.0, *closest]), scores[0], max([0.0, *named]), 0.25])
     torch.testing.assert_close(case[:6], features(raw))
     belief = seen[0].belief
@@ -77,15 +77,15 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     assert case.shape == (CASE,)
     boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
     confidence = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
-    assert tally.box.tolist() == boxes[confidence.argmax()].tolist()
+    assert facts.box.tolist() == boxes[confidence.argmax()].tolist()
 
 
 def test_before_fitting_the_probability_is_the_best_score(eye, picture):
     seen = turns(eye, picture, 1)
-    tally = Tally(seen[0].belief)
+    facts = SearchFacts(seen[0].belief)
     for turn in seen:
-        tally.add(turn.glance)
-        assert tally.presence(turn.ahead) == pytest.approx(min(max(tally.best, 1e-4), 1 - 1e-4), abs=1e-5)
+        facts.add(turn.glance)
+        assert facts.presence(turn.ahead) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
 
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
@@ -121,13 +121,13 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
     most, thresholds = 6, Thresholds(confirm, give_up)
     torch.manual_seed(0)
     evidence, glances = GlimpseEvidence(3, 8).eval(), LiveGlances(eye, eye.open(picture))
-    tally, passes, ended = None, 0, 0
+    facts, passes, ended = None, 0, 0
     with torch.inference_mode():
         for turn in look_for(glances, evidence, target, confirm=math.inf):
-            tally = tally or Tally(turn.belief)
-            tally.add(turn.glance)
-            presence, passes = tally.presence(turn.ahead), passes + 1
-            state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([turn.ahead])
+            facts = facts or SearchFacts(turn.belief)
+            facts.add(turn.glance)
+            presence, passes = facts.presence(turn.ahead), passes + 1
+            state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([turn.ahead])
             ended = int(settle(*state, thresholds))
             if ended or passes == most:
                 break
