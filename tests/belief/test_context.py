@@ -36,12 +36,8 @@ def prior():
 
 
 @pytest.fixture
-def looks():
-    generator = torch.Generator().manual_seed(2)
-    corner = torch.rand(3, 4, 2, generator=generator) * 40
-    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
-    mask = torch.tensor([[True, True, True, False], [True, True, False, False], [False] * 4])
-    return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), mask)
+def looks(random_looks):
+    return random_looks(GRID, looks=3, most=4, components=4)
 
 
 def highest_presence_within(presence, cell, edge):

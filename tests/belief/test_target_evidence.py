@@ -20,12 +20,8 @@ GRID = Grid(6, 4, (90, 60))
 
 
 @pytest.fixture
-def looks():
-    torch.manual_seed(0)
-    corner = torch.rand(3, 5, 2) * 50
-    boxes = torch.cat([corner, corner + 3 + torch.rand(3, 5, 2) * 30], -1)
-    mask = torch.tensor([[True] * 5, [True] * 2 + [False] * 3, [False] * 5])
-    return Detections(boxes, torch.rand(3, 5, 4).softmax(-1), mask)
+def looks(random_looks):
+    return random_looks(GRID, looks=3, components=4)
 
 
 @pytest.fixture

@@ -25,8 +25,12 @@ BOXES = [
 ALL = {"min_instances": 0, "max_target_area": None}
 
 
-def test_boxes_labels_and_ids(photographs, make_coco):
-    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+@pytest.fixture
+def scenes(photographs, make_coco):
+    return CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+
+
+def test_boxes_labels_and_ids(scenes, photographs):
     assert scenes.ids == [10, 20, 30]
     assert len(scenes) == 3
     first = scenes[0]
@@ -40,8 +44,7 @@ def test_boxes_labels_and_ids(photographs, make_coco):
     assert not scenes.repairs
 
 
-def test_annotation_without_pixels(photographs, make_coco):
-    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+def test_annotation_without_pixels(scenes):
     for index in range(3):
         annotation, scene = scenes.annotation(index), scenes[index]
         assert torch.equal(annotation.boxes, scene.boxes)
@@ -51,8 +54,7 @@ def test_annotation_without_pixels(photographs, make_coco):
     assert scenes.annotation(0).boxes.any()
 
 
-def test_iteration_and_index_errors(photographs, make_coco):
-    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+def test_iteration_and_index_errors(scenes):
     assert [scene.id for scene in scenes] == [10, 20, 30]
     assert scenes[-1].id == 30
     with pytest.raises(IndexError):
@@ -170,8 +172,7 @@ def test_fingerprint_changes_with_annotations_and_settings(photographs, make_coc
     assert len({scenes.digest(i) for i in range(3)}) == 3
 
 
-def test_scenes_can_be_pickled(photographs, make_coco):
-    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+def test_scenes_can_be_pickled(scenes):
     unpickled = pickle.loads(pickle.dumps(scenes))
     assert unpickled.fingerprint == scenes.fingerprint
     assert torch.equal(unpickled[0].boxes, scenes[0].boxes)

@@ -48,9 +48,7 @@ SHOWN = {
 @pytest.mark.parametrize("kind", ["png", "jpg", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photographs_are_rotated_by_exif_orientation(tmp_path, orientation, kind):
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    path = tmp_path / f"a.{kind}"
+    exif, path = oriented(orientation), tmp_path / f"a.{kind}"
     lossless = {"lossless": True} if kind == "webp" else {"quality": 100, "subsampling": 0} if kind == "jpg" else {}
     Image.fromarray(PICTURE).save(path, exif=exif, **lossless)
     shown = bits(read_image(path)).astype(int)
@@ -61,28 +59,39 @@ def test_photographs_are_rotated_by_exif_orientation(tmp_path, orientation, kind
         assert abs(bits(read_image(path, oriented=False)).astype(int) - PICTURE).max() <= 12
 
 
-@pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_an_unknown_orientation_is_ignored(tmp_path, orientation):
+def oriented(number):
     exif = Image.Exif()
-    exif[0x0112] = orientation
+    exif[0x0112] = number
+    return exif
+
+
+@pytest.mark.parametrize(
+    "exif",
+    [oriented(0), oriented(9), oriented(65535), b"Exif\0\0MM\0*\xff\xff\xff\xff\0\1\2"],
+    ids=["0", "9", "65535", "damaged"],
+)
+def test_unknown_orientations_and_damaged_exif_data_are_ignored(tmp_path, exif):
     Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=exif)
     assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
 
-def test_damaged_exif_data_are_ignored(tmp_path):
-    Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff\0\1\2")
-    assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
+GREY = np.arange(256, dtype=np.uint8).reshape(16, 16)
+CHECKS = np.array([[0, 255], [255, 0]], np.uint8)
 
 
-def test_grey_has_three_equal_channels(tmp_path):
-    Image.fromarray(np.arange(256, dtype=np.uint8).reshape(16, 16)).save(tmp_path / "a.png")
-    image = bits(read_image(tmp_path / "a.png"))
-    assert np.array_equal(image, np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, -1))
-
-
-def test_bilevel_images_are_read(tmp_path):
-    Image.fromarray(np.array([[0, 255], [255, 0]], np.uint8)).convert("1").save(tmp_path / "a.png")
-    assert read_image(tmp_path / "a.png")[1].tolist() == [[0, 1], [1, 0]]
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (Image.fromarray(GREY), GREY[..., None].repeat(3, -1)),
+        (Image.fromarray(CHECKS).convert("1"), CHECKS[..., None].repeat(3, -1)),
+        (Image.fromarray(PICTURE).quantize(4), PICTURE),
+    ],
+    ids=["grey", "bilevel", "palette"],
+)
+def test_images_of_other_modes_are_exact_in_three_channels(tmp_path, image, expected):
+    image.save(tmp_path / "a.png")
+    shown = read_image(tmp_path / "a.png").permute(1, 2, 0).numpy()
+    assert np.array_equal(shown, expected.astype(np.float32) / 255)
 
 
 def test_cmyk_jpeg(tmp_path):
@@ -90,11 +99,6 @@ def test_cmyk_jpeg(tmp_path):
     assert abs(bits(read_image(tmp_path / "red.jpg")).astype(int) - (255, 0, 0)).max() <= 3
     Image.new("CMYK", (8, 8), (0, 0, 0, 255)).save(tmp_path / "black.tif")
     assert read_image(tmp_path / "black.tif").max() == 0
-
-
-def test_palette_images_are_read(tmp_path):
-    Image.fromarray(PICTURE).quantize(4).save(tmp_path / "a.png")
-    assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
 
 def test_transparent_pixels_are_blended_with_white(tmp_path):

@@ -140,6 +140,12 @@ def write_weights(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def small_weights(write_weights: Callable[..., Path]) -> Path:
+    """Random weights for `small_cfg`."""
+    return write_weights()
+
+
+@pytest.fixture
 def threads() -> Iterator[Callable[[], Iterator[int]]]:
     """Yield 1 and 2 after setting that number of threads, and restore the number at the end."""
     before = torch.get_num_threads()

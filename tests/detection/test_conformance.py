@@ -163,11 +163,6 @@ def with_values(argument, *values):
 of_each_family = pytest.mark.parametrize("adapter", FAMILIES, indirect=True)
 
 
-@pytest.fixture
-def small_weights(write_weights):
-    return write_weights()
-
-
 @pytest.fixture(params=ADAPTERS)
 def adapter(request: pytest.FixtureRequest) -> Adapter:
     return ADAPTERS[request.param]

@@ -17,11 +17,6 @@ CLASSES = ("cat", "dog")
 
 
 @pytest.fixture
-def small_weights(write_weights):
-    return write_weights()
-
-
-@pytest.fixture
 def small(small_cfg, small_weights):
     """A function that loads a network with every kind of layer."""
     return lambda **options: load_yolo(

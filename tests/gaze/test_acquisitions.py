@@ -9,13 +9,10 @@ from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, ac
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
 from tests import small
+from tests.small import draw as rand
 
 GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
-
-
-def rand(*shape, seed=0):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def model():

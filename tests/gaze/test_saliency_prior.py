@@ -15,12 +15,9 @@ from semfov.gaze.acquisition import (
     TargetPosterior,
     TwoPeaks,
 )
+from tests.small import draw as rand
 
 GRID = Grid(4, 3, (80, 60))
-
-
-def rand(*shape, seed=0):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 BELIEF = DirichletBelief(0.3 + 4 * rand(3, 12, 5) ** 2)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from semfov import Detections, Grid
+from semfov import Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import AnyOf, Landing, Semantic, Target
 from semfov.belief.observers.any_of import weights_by_class
@@ -25,11 +25,8 @@ def inner(request):
 
 
 @pytest.fixture
-def looks():
-    generator = torch.Generator().manual_seed(2)
-    corner = torch.rand(3, 4, 2, generator=generator) * 40
-    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
-    return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), torch.ones(3, 4, dtype=torch.bool))
+def looks(random_looks):
+    return random_looks(GRID, looks=3, most=4, components=4)
 
 
 def believed(observer, looks, target):

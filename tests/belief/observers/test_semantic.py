@@ -13,13 +13,8 @@ FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
 
 
 @pytest.fixture
-def looks():
-    """Three looks with a few random detections each."""
-    torch.manual_seed(0)
-    corner = torch.rand(3, 4, 2) * 60
-    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2) * 30], -1)
-    mask = torch.tensor([[True, True, True, False], [True, True, False, False], [True, True, True, True]])
-    return Detections(boxes, torch.rand(3, 4, 4).softmax(-1), mask)
+def looks(random_looks):
+    return random_looks(GRID, looks=3, most=4, components=4)
 
 
 class Misses:

@@ -167,15 +167,6 @@ def test_any_size_and_uniform_images(size: tuple[int, int], dtype: torch.dtype, 
         assert itti_koch_saliency(uniform).abs().max() == 0
 
 
-def test_a_batch_equals_a_loop_over_images(dtype: torch.dtype, device: torch.device) -> None:
-    images = torch.rand(3, 3, 80, 101, dtype=dtype, device=device)
-    images[1] *= 0.2
-    loop = torch.cat([itti_koch_saliency(image[None]) for image in images])
-    # In single precision a peak may appear or vanish.
-    atol = 1e-6 if dtype == torch.float64 else 5e-4
-    torch.testing.assert_close(itti_koch_saliency(images), loop, atol=atol, rtol=0)
-
-
 def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     row, column = divmod(int(itti_koch_saliency(pop_out).argmax()), 320)
     # One pixel of the map is 16 pixels of the image wide.
@@ -183,10 +174,9 @@ def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     assert 172 <= column < 204
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-def test_gradients(normalise: bool) -> None:
+def test_gradients_without_normalising() -> None:
     image = torch.rand(1, 3, 20, 26, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(IttiKoch(normalise=normalise), image, fast_mode=True)
+    assert torch.autograd.gradcheck(IttiKoch(normalise=False), image, fast_mode=True)
 
 
 def test_gradients_of_a_uniform_image_are_finite() -> None:
