@@ -27,7 +27,7 @@ from semfov.detection.detector import Detector
 from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
-from semfov.runs.zoom_orders import raster, slices
+from semfov.runs.zoom_orders import in_order, slices
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.objects import merge
@@ -157,7 +157,7 @@ def compare(config: ZoomConfig) -> None:
             for name, how in merging.items():
                 boxes, labels, passes = sliced(run, index, **how)
                 outcomes[name].add(boxes, labels, annotation, passes)
-            same = look_by_look(glances, raster(slices(glances.lattice, config.slice, config.overlap)), None)
+            same = look_by_look(glances, in_order(slices(glances.lattice, config.slice, config.overlap)), None)
             chosen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
             ways = {names[0]: [turn.glance for turn in same], names[1]: chosen, names[2]: chosen[: passes // 2]}
             for name, looks in ways.items():

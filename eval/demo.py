@@ -28,14 +28,14 @@ import torch
 from torch import Tensor
 
 import semfov
-from eval.demo_text import columns, plain_name, told
+from eval.demo_text import columns, path_table, plain_name
 from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
 from semfov.agents import ZoomAgent
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, embedded_picture, is_video, open_pictures, open_stream
 from semfov.data.word_vectors import WordVectors, spread
-from semfov.decision import MOST
+from semfov.decision import MOST_CLOSER
 from semfov.detection.load import check_detector
 from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
@@ -50,7 +50,7 @@ from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
 from semfov.zoom import GlimpseEvidence, WindowEye
 
-Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
+_Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 
 LIVE = ("rate", "start", "seed", "confirm", "give_up", "closer")
 """Settings that a video or camera takes, too."""
@@ -113,13 +113,13 @@ class DemoConfig(Settings):
     shifts: Shifts | None = None
     confirm: Share | None = None
     give_up: Share | None = None
-    closer: Annotated[int, Range(0, 100)] = MOST
+    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     until: Weight | None = None
     seed: Seed = 0
     frames: Annotated[int, Range(1, 10**9)] | None = None
     rate: Annotated[float, Range(0, 100)] = RATE
     report: Path | None = None
-    draw: tuple[Drawn, ...] = ("scanpath", "views", "belief", "animation")
+    draw: tuple[_Drawing, ...] = ("scanpath", "views", "belief", "animation")
     out: Path = Path("runs/demo")
 
 
@@ -140,7 +140,7 @@ def demo(config: DemoConfig) -> None:
         wanted = meant(config, classes)
         config = replace(config, target=next(iter(wanted)))
     stream = open_live(config)
-    watched = opened(pictures(config, classes)) if stream is None else iter(())
+    watched = with_first_read(pictures(config, classes)) if stream is None else iter(())
     agent = make_agent(config) if agent is None else agent
     if stream is not None:
         only_likeliest(wanted)
@@ -164,9 +164,9 @@ def demo(config: DemoConfig) -> None:
                 episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, settings=settings))
             continue
         scanpath = look_at(agent, picture, config, wanted)
-        print(told(picture.name, scanpath))
+        print(path_table(picture.name, scanpath))
         folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
-        views = shown(scanpath, config)
+        views = views_to_draw(scanpath, config)
         written += draw(folder, scanpath, picture, views, config.draw)
         if config.report is not None:
             episodes.append(episode_data(scanpath, scanpath.image, views, pool, name=picture.name, boxes=picture.boxes))
@@ -269,7 +269,7 @@ def pictures(config: DemoConfig, classes: Sequence[str]) -> Iterator[Picture]:
         yield from open_pictures(config.photo)
 
 
-def opened(pictures: Iterator[Picture]) -> Iterator[Picture]:
+def with_first_read(pictures: Iterator[Picture]) -> Iterator[Picture]:
     """The same pictures; the first is read immediately, so that errors appear early."""
     first = next(pictures)
     return chain([first], pictures)
@@ -323,14 +323,14 @@ def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) ->
     return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
 
 
-def shown(scanpath: Scanpath, config: DemoConfig) -> list[Tensor]:
+def views_to_draw(scanpath: Scanpath, config: DemoConfig) -> list[Tensor]:
     """The foveated view at each fixation; empty if no wanted figure needs it."""
     needed = config.report is not None or {"views", "animation"} & set(config.draw)
     return scanpath.views() if needed else []
 
 
 def draw(
-    folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor], wanted: Sequence[Drawn]
+    folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor], wanted: Sequence[_Drawing]
 ) -> list[Path]:
     """Write the wanted figures and animation of an episode."""
     boxes, searched = picture.boxes, scanpath.target is not None

@@ -7,7 +7,7 @@ from semfov import Scanpath, viz
 from semfov.paths import detections_in_words
 
 
-def told(name: str, scanpath: Scanpath) -> str:
+def path_table(name: str, scanpath: Scanpath) -> str:
     """The episode, fixation by fixation, as a table."""
     if scanpath.target is None:
         values, what = viz.entropy(scanpath), "entropy (bits)"
@@ -26,7 +26,7 @@ def told(name: str, scanpath: Scanpath) -> str:
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     if scanpath.target is None:
-        lines += ["", "what is where:", *named(scanpath)]
+        lines += ["", "what is where:", *regions_table(scanpath)]
     for number, look in enumerate(scanpath.closer, 1):
         assert look.cell is not None
         chance = f"p {look.place:.3f} there, {look.presence:.3f} anywhere"
@@ -34,7 +34,7 @@ def told(name: str, scanpath: Scanpath) -> str:
     return "\n".join([f"{name}: {scanpath.summary()}", *lines, ""])
 
 
-def named(scanpath: Scanpath) -> list[str]:
+def regions_table(scanpath: Scanpath) -> list[str]:
     """A line for each class that the final map names: number of cells, highest probability, and its cell."""
     parts: dict[str, list[int]] = {}
     for label, cells, _ in viz.named_regions(scanpath):

@@ -31,7 +31,7 @@ def make_picture(path: Path) -> None:
         scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
     seen = plot_foveated_strip(scanpath, most=3)
     believed = plot_belief_strip(scanpath, most=3)
-    write(stacked(render([seen, believed], dpi=105)), path)
+    write_picture(stacked(render([seen, believed], dpi=105)), path)
 
 
 def make_zoom_picture(path: Path, weights: str | None) -> None:
@@ -40,10 +40,10 @@ def make_zoom_picture(path: Path, weights: str | None) -> None:
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     mosaic = Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image
     figure = plot_zoom_path(agent.find_all(mosaic, "person", passes=10), mosaic)
-    write(render([figure], dpi=110)[0], path)
+    write_picture(render([figure], dpi=110)[0], path)
 
 
-def write(frame: Frame, path: Path) -> None:
+def write_picture(frame: Frame, path: Path) -> None:
     """Write a picture as a small PNG, atomically."""
     with replacing(path) as temporary:
         in_palette(frame, refine=3).save(temporary, format="PNG", optimize=True)

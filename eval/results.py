@@ -36,8 +36,8 @@ from eval.page.tables import (
     paired_maps,
     photographs,
     readings,
+    run_summary,
     study_table,
-    summary,
     told_table,
 )
 from eval.search import search
@@ -59,7 +59,7 @@ def results(config: ResultsConfig) -> None:
     pages = {config.page: config.template, config.tables: config.tables_template}
     texts = {page: read_template(template) for page, template in pages.items()}
     for page, template in texts.items():
-        write_text(page, fill(template, runs))
+        write_text(page, fill_page(template, runs))
     for path in [*pages, *draw_figures(config.pictures, runs)]:
         print(f"written: {path}")
 
@@ -72,7 +72,7 @@ def read_template(path: Path) -> str:
         raise DataError(f"template: {path} cannot be read ({error.strerror}); check the path") from None
 
 
-def fill(template: str, runs: Runs) -> str:
+def fill_page(template: str, runs: Runs) -> str:
     """Replace every line `@@ …` of the template by the table that it names."""
     lines: list[str] = []
     for line in template.splitlines():
@@ -112,9 +112,9 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
 """Functions that run an experiment, by the class of its settings."""
 
 TABLES: dict[str, Callable[[Path], list[str]]] = {
-    "all": summary,
-    "first": partial(summary, section=0),
-    "second": partial(summary, section=1),
+    "all": run_summary,
+    "first": partial(run_summary, section=0),
+    "second": partial(run_summary, section=1),
     "agreement": agreement,
     "first-fixations": first_fixations,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),

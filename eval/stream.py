@@ -37,7 +37,7 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
                 looking += sum(moment.seconds.values())
                 lately.append(time.perf_counter())
                 speed = f"{(len(lately) - 1) / (lately[-1] - lately[0]):.1f} frames/s"
-                print(f"  {told(moment)}  {speed}", flush=True)
+                print(f"  {moment_line(moment)}  {speed}", flush=True)
                 add(draw_moment(picture.image, moment, f"{moment.describe()}   {speed}"))
         except KeyboardInterrupt:
             print("  stopped")
@@ -47,7 +47,7 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
     return path
 
 
-def told(moment: Moment) -> str:
+def moment_line(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)

@@ -16,7 +16,7 @@ from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
 from semfov.decision import (
-    MOST,
+    MOST_CLOSER,
     OUTCOMES,
     CandidateCells,
     Verifier,
@@ -205,7 +205,7 @@ class ActivePerception(nn.Module):
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST,
+        closer: int = MOST_CLOSER,
     ) -> Scanpath:
         """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
 
@@ -322,7 +322,7 @@ class ActivePerception(nn.Module):
         seed: int = 0,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST,
+        closer: int = MOST_CLOSER,
     ) -> LivePerception:
         """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
 

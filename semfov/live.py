@@ -12,7 +12,7 @@ from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import MOST, CandidateCells, CloserLook, Decision, Verifier, conclude, decide
+from semfov.decision import MOST_CLOSER, CandidateCells, CloseUp, Decision, Verifier, conclude, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import check
@@ -78,7 +78,7 @@ class LivePerception:
         seed: int = 0,
         thresholds: Thresholds | None = None,
         verification: Verification | None = None,
-        closer: int = MOST,
+        closer: int = MOST_CLOSER,
     ) -> None:
         self.eye, self.observer, self.policy = eye, observer, policy
         self.classes, self.cells, self.target = classes, cells, target
@@ -195,7 +195,7 @@ class LivePerception:
         cell: int,
         detections: Detections,
         seconds: dict[str, float],
-        closer: CloserLook | None = None,
+        closer: CloseUp | None = None,
     ) -> Moment:
         return Moment(
             classes=self.classes,

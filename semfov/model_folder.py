@@ -27,9 +27,9 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.base import Sensor
 from semfov.sensor.named import SENSORS
 
-Model = FovealObservationModel | TargetEvidence | Verification | MapEvidence
+FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence
 
-KINDS: dict[str, type[Model]] = {
+KINDS: dict[str, type[FolderModel]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
     "verification": Verification,
@@ -166,7 +166,7 @@ class ModelFolder:
         return eye
 
     @cached_property
-    def _models(self) -> dict[str, Model]:
+    def _models(self) -> dict[str, FolderModel]:
         """The models that the agent uses."""
         files = {part: self.file(part) for part in KINDS if self.used(part)}
         return {part: KINDS[part].from_pretrained(file) for part, file in files.items() if file is not None}

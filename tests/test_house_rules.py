@@ -1,10 +1,11 @@
-"""Rules for the source code: short files, no private names of other packages, and valid `__all__` lists.
+"""Rules for the source code: short files, one meaning of each name, no private names of others, valid `__all__` lists.
 
 The import order of subpackages is checked in `test_package.py`, code execution in `robustness/test_security.py`.
 """
 
 import ast
 import importlib
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -86,3 +87,35 @@ def test_names_in_all_exist_once_and_are_public(module):
     assert len(set(names)) == len(names)
     assert [name for name in names if not hasattr(importlib.import_module(module), name)] == []
     assert not [name for name in names if _is_private(name)]
+
+
+REPEATED = {
+    "main": "the command line of each program",
+    "Choice": "a rule of the next fixation (`semfov.gaze`), and a window with its value (`semfov.zoom.policy`)",
+    "entropy": "of a Dirichlet distribution, and drawn: functions of `semfov.viz` are named after what they draw",
+}
+"""Public names that several modules define, each with the reason."""
+
+
+def public_names(source: str) -> set[str]:
+    """Public classes, functions and constants that a module defines at its top level."""
+    found = set()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return {name for name in found if not name.startswith("_")}
+
+
+def test_the_scan_finds_public_names():
+    source = "A = 1\nB: int = 2\n_C = 3\ndef f(): g = 1\nclass D:\n    e = 1\nasync def h(): ..."
+    assert public_names(source) == {"A", "B", "f", "D", "h"}
+
+
+def test_a_public_name_means_one_thing():
+    files = LIBRARY + sorted(file for folder in ("eval", "train") for file in (ROOT / folder).rglob("*.py"))
+    counts = Counter(name for file in files for name in public_names(file.read_text(encoding="utf-8")))
+    assert len(counts) > 1000
+    assert {name for name, count in counts.items() if count > 1} == set(REPEATED)

@@ -8,7 +8,7 @@ import torch
 
 import semfov
 from semfov.belief import ContextPrior
-from semfov.io.compatibility import learned_for, recommended
+from semfov.io.compatibility import learned_for, recommended_model
 from semfov.presets import PUBLISHED_SENSORS
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
@@ -175,7 +175,7 @@ def test_every_detector_has_all_kinds_of_models():
 @pytest.mark.parametrize("growth", [1.0, 2.0])
 @pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
 def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
-    model = semfov.FovealObservationModel.from_pretrained(recommended(detector, growth))
+    model = semfov.FovealObservationModel.from_pretrained(recommended_model(detector, growth))
     assert model.metadata["sensor"]["growth"] == growth
     assert model.metadata["detector"]["name"] == detector
     assert model.metadata["method"] == "discriminative"

@@ -50,7 +50,7 @@ def model_fields(data: st.DataObject) -> str:
             must = key != "thresholds"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "model.safetensors")
-        storage.write(path, tensors, record)
+        storage.write_file(path, tensors, record)
         if damage == "unsigned":
             from safetensors.torch import save_file
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks.fuzz.models import changed
 from benchmarks.fuzz.runner import choose, draw_rng
 from semfov.io import storage
-from semfov.runs.results import Parts
+from semfov.runs.results import SceneResults
 from semfov.runs.store import cell_store
 
 RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]
@@ -27,7 +27,7 @@ def part_files(data: st.DataObject) -> str:
     """`Parts.load`: exactly the stored outcomes, or None."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
-        parts = Parts(Path(folder), "1-2", lambda index: "digest")
+        parts = SceneResults(Path(folder), "1-2", lambda index: "digest")
         parts.save(0, RECORDS, SECONDS)
         path = parts.path(0)
         damage = choose(
@@ -94,7 +94,7 @@ def look_files(data: st.DataObject) -> str:
         if damage in ("bytes", "bit", "cut"):
             path.write_bytes(changed(path.read_bytes(), damage, rng))
         elif damage != "none":
-            storage.write(path, tensors, record)
+            storage.write_file(path, tensors, record)
         found = store.load("a" * 64)
     if not found:
         assert damage != "none"

@@ -15,10 +15,10 @@ and learned evidence. Detections from every cell are stored and shared with `pyt
 from collections.abc import Sequence
 
 from eval.calibration.config import CalibrationConfig
-from eval.calibration.evaluation import judge
+from eval.calibration.evaluation import judge_calibration
 from semfov.runs.command import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    return run_command(judge, CalibrationConfig, __doc__, arguments)
+    return run_command(judge_calibration, CalibrationConfig, __doc__, arguments)

@@ -28,12 +28,12 @@ from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_map_evidence, make_target_evidence
 
-LOOKS = (1, 5, 15)
+COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""
 
 BANDS = (0.14, 0.24, 0.34)
@@ -44,7 +44,7 @@ not decide which band a cell belongs to.
 """
 
 FIXATED, FARTHEST = "fixated", f"{BANDS[-1]:.2f} - …"
-CELLS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
+CELL_GROUPS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
 """Groups of cells: the fixated cells, then all others by their distance from the closest fixation."""
 
 ALL_CLASSES = {
@@ -56,7 +56,7 @@ ALL_CLASSES = {
 
 LEARNED, MAP = "learned", "learned map"
 
-Model = TypeVar("Model")
+_Model = TypeVar("_Model")
 
 
 class BeliefCalibrationRun(Run):
@@ -91,7 +91,7 @@ class BeliefCalibrationRun(Run):
         if evidence_map is not None:
             self.observers[MAP] = LearnedMap(evidence_map)
 
-    def _if_shipped(self, name: str, make: Callable[[str | None, Eye], Model], model: str | None) -> Model | None:
+    def _if_shipped(self, name: str, make: Callable[[str | None, Eye], _Model], model: str | None) -> _Model | None:
         """Load the model that the settings name, or else the shipped model; None where none is shipped."""
         try:
             return make(model, self.eye)
@@ -103,14 +103,14 @@ class BeliefCalibrationRun(Run):
 
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, and how calibration is measured."""
-        return {**super().depends_on(), "belief calibration": [LOOKS, BANDS, BinarySums.EDGES.tolist()]}
+        return {**super().depends_on(), "belief calibration": [COUNTS, BANDS, BinarySums.EDGES.tolist()]}
 
     @property
     def guide(self) -> str:
         """Name of the belief that guides the gaze."""
         return LEARNED if LEARNED in self.observers else "tempered"
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run both searches of a scene; returns their records, and the seconds that each stage took."""
         protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
@@ -121,7 +121,7 @@ class BeliefCalibrationRun(Run):
         covered = grid.footprint(annotation.boxes)
         detections = self.detections(index)
         watch.lap("look")
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         for target in classes:
             scene = self.scenes.ids[index]
             start = torch.randint(len(grid), (1,), generator=generator_for("start", protocol.seed, scene, target))
@@ -133,18 +133,18 @@ class BeliefCalibrationRun(Run):
         watch.lap("believe")
         return records, watch.seconds
 
-    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: KnownLooks) -> Record:
-        most = min(self.config.protocol.shifts + 1, LOOKS[-1])
+    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: KnownLooks) -> ResultRecord:
+        most = min(self.config.protocol.shifts + 1, COUNTS[-1])
 
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
             return list(rollout(looks, self.observers[name], acquisition, start, choice, most=most))
 
         led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(noise)))
         path = torch.cat([step.cell for step in led])
-        beliefs: dict[str, Record] = {}
+        beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:
             steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
-            judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in LOOKS if n <= len(steps)}
+            judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
             beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
         return {"seen": seen_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
 
@@ -168,7 +168,7 @@ class KnownLooks(Looks):
         return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
 
 
-def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
+def judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
     """Sums over the cells of a search after a step, by group of cells.
 
     Args:
@@ -177,7 +177,7 @@ def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
         goal: `(X·Y,)` boolean, the cells that the target overlaps.
 
     Returns:
-        `BinarySums.record` of every group of `CELLS` that is not empty.
+        `BinarySums.record` of every group of `CELL_GROUPS` that is not empty.
     """
     belief = step.belief
     band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))
@@ -185,6 +185,6 @@ def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
     probability = belief.probability(target)[0]
     return {
         name: BinarySums.of(probability[group == number], goal[group == number]).record()
-        for number, name in enumerate(CELLS)
+        for number, name in enumerate(CELL_GROUPS)
         if (group == number).any()
     }

@@ -12,13 +12,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from eval.calibration.beliefs import BANDS, CELLS, MAP, BeliefCalibrationRun
+from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
 from eval.comparison.summary import sensing
 from eval.decide.run import LANDINGS, LANDINGS_TOLD, landing_cells
 from semfov.errors import DataError
 from semfov.io.files import write_text
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
 from semfov.runs.tables import table
 from semfov.viz import plot_cell_reliability
@@ -27,7 +27,7 @@ from semfov.viz.style import save_figure
 Sums = dict[tuple[str, int, str], BinarySums]
 """Sums over predictions by belief, number of looks, and group of cells."""
 
-HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
+_HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
 
 
 def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
@@ -46,7 +46,7 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise target_area")
     sums = add_up(records)
-    text = summary(records, sums, run)
+    text = beliefs_summary(records, sums, run)
     files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
     for name, content in files.items():
         write_text(run.config.out / name, content)
@@ -57,7 +57,7 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     return text, [*(run.config.out / name for name in files), figure]
 
 
-def add_up(records: Iterable[Record]) -> Sums:
+def add_up(records: Iterable[ResultRecord]) -> Sums:
     """Add up the sums of all searches."""
     sums: Sums = defaultdict(BinarySums.nothing)
     for record in records:
@@ -70,22 +70,24 @@ def add_up(records: Iterable[Record]) -> Sums:
 
 def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
     """Sums over all cells, whatever their group."""
-    return sum((sums[belief, looks, group] for group in CELLS if (belief, looks, group) in sums), BinarySums.nothing())
+    return sum(
+        (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), BinarySums.nothing()
+    )
 
 
-def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) -> str:
+def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCalibrationRun) -> str:
     """The tables, as Markdown."""
     beliefs = list(run.observers)
     there = sum(record["present"] for record in records)
-    by_looks = [["looks", "belief", "cells", *HEAD]]
+    by_looks = [["looks", "belief", "cells", *_HEAD]]
     for looks in judged_after(sums):
         rows = [(belief, pooled(sums, belief, looks)) for belief in beliefs]
-        by_looks += [[str(looks), belief, str(each.count), *figures(each)] for belief, each in rows]
+        by_looks += [[str(looks), belief, str(each.count), *measures_row(each)] for belief, each in rows]
     last = judged_after(sums)[-1]
-    by_distance = [["distance", "belief", "cells", *HEAD]]
-    for group in CELLS:
+    by_distance = [["distance", "belief", "cells", *_HEAD]]
+    for group in CELL_GROUPS:
         told = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
-        by_distance += [[group, belief, str(each.count), *figures(each)] for belief, each in told]
+        by_distance += [[group, belief, str(each.count), *measures_row(each)] for belief, each in told]
     notes = [
         f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
     ]
@@ -112,7 +114,7 @@ def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) ->
             "",
             LANDINGS_TOLD,
             "",
-            *table([["belief", *LANDINGS], *landings(records)]),
+            *table([["belief", *LANDINGS], *landing_table(records)]),
             "",
             *[line for note in notes for line in (note, "")],
         ]
@@ -124,12 +126,12 @@ def judged_after(sums: Sums) -> list[int]:
     return sorted({looks for _, looks, _ in sums})
 
 
-def figures(sums: BinarySums) -> list[str]:
+def measures_row(sums: BinarySums) -> list[str]:
     """The measures as cells of a table row."""
     return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
 
 
-def landings(records: Sequence[Record]) -> list[list[str]]:
+def landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
     """Rows of the table about the first look on the target (`landing`)."""
     landed = [record for record in records if record["seen"] is not None]
     return [
@@ -143,7 +145,7 @@ def beliefs_csv(sums: Sums) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"])
-    for belief, looks, group, each in named(sums):
+    for belief, looks, group, each in sums_by_name(sums):
         values = each.nll, each.brier, each.ece, each.probability, each.rate
         rows.writerow([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
     return text.getvalue()
@@ -153,16 +155,16 @@ def beliefs_json(sums: Sums) -> str:
     """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
     told = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
-        for belief, looks, group, each in named(sums)
+        for belief, looks, group, each in sums_by_name(sums)
     ]
     return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": told}) + "\n"
 
 
-def named(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+def sums_by_name(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
     """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
         yield belief, looks, "all", pooled(sums, belief, looks)
-        for group in CELLS:
+        for group in CELL_GROUPS:
             if (belief, looks, group) in sums:
                 yield belief, looks, group, sums[belief, looks, group]
 
@@ -186,7 +188,7 @@ def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str
     }
     last = numbers[-1]
     errors = {
-        belief: {group: sums[belief, last, group].ece for group in CELLS if (belief, last, group) in sums}
+        belief: {group: sums[belief, last, group].ece for group in CELL_GROUPS if (belief, last, group) in sums}
         for belief in beliefs
     }
     return panels, errors

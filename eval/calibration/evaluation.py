@@ -6,7 +6,7 @@ import torch
 import yaml
 
 import semfov
-from eval.calibration.beliefs import LOOKS, BeliefCalibrationRun
+from eval.calibration.beliefs import COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import write_belief_report
 from eval.calibration.config import CalibrationConfig
 from eval.comparison.summary import announce
@@ -14,7 +14,7 @@ from eval.search.config import SearchConfig
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, ProtocolConfig
-from semfov.runs.samples import Samples, SampleSettings, collect
+from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import make_observation, plain, published_model
 from semfov.runs.tables import table
@@ -23,7 +23,7 @@ from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 
 
-def judge(config: CalibrationConfig) -> None:
+def judge_calibration(config: CalibrationConfig) -> None:
     """Evaluate scores, then beliefs."""
     judge_scores(config)
     if config.beliefs:
@@ -33,7 +33,7 @@ def judge(config: CalibrationConfig) -> None:
 def judge_scores(config: CalibrationConfig) -> None:
     """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
     settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
-    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
     model = make_observation(config.model, sampler.foveal_eye)
@@ -60,7 +60,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
             target_model=config.target_model,
             map_model=config.map_model,
         ),
-        protocol=ProtocolConfig(shifts=LOOKS[-1] - 1, seed=config.seed),
+        protocol=ProtocolConfig(shifts=COUNTS[-1] - 1, seed=config.seed),
         out=config.out,
         cache=config.cache,
         workers=config.workers,
@@ -83,11 +83,11 @@ def calibration_table(
         chosen = torch.ones_like(level, dtype=torch.bool) if everything else level == number
         label = "all" if everything else f"{edges[number]} - {edges[number + 1]}"
         for name, probabilities in predictions.items():
-            rows.append([label, name, *figures(calibration(probabilities[chosen], samples.labels[chosen]))])
+            rows.append([label, name, *calibration_row(calibration(probabilities[chosen], samples.labels[chosen]))])
     return table(rows)
 
 
-def figures(result: Calibration) -> list[str]:
+def calibration_row(result: Calibration) -> list[str]:
     """The measures as cells of a table row."""
     return [
         str(result.count),

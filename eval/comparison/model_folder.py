@@ -9,12 +9,12 @@ from semfov.gaze.policies import POLICIES
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DetectorConfig, PolicyConfig, RunConfig, SensorConfig
 from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
-from semfov.runs.presets import Choice, resolve
+from semfov.runs.presets import PolicyChoice, resolve
 
-Config = TypeVar("Config", bound=RunConfig)
+_Config = TypeVar("_Config", bound=RunConfig)
 
 
-def with_models(config: Config) -> Config:
+def with_models(config: _Config) -> _Config:
     """Complete settings with the detector, sensor, grid and models of the folder that `models` names.
 
     If the settings also give a detector or weights, these are the new locations of the folder's files. The preset
@@ -44,7 +44,7 @@ def with_models(config: Config) -> Config:
     belief = replace(config.belief, columns=columns, rows=rows, **told)  # type: ignore[arg-type]
     detector = detector_of(folder, config.detector)
     named = type(config)().policies != config.policies
-    policies = tuple(recommended(folder, config) if each == "recommended" else each for each in config.policies)
+    policies = tuple(recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
     chosen = []
     for policy in policies:
         missing = next((part for part in needs(policy, config) if files[part] is None), None)
@@ -55,7 +55,7 @@ def with_models(config: Config) -> Config:
             raise InputError(
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
-    config = replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
+    config = replace(config, detector=detector, sensor=sensor_config(folder), belief=belief, policies=tuple(chosen))
     return config.complete(folder)
 
 
@@ -72,12 +72,12 @@ def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
     return DetectorConfig(name=source, **{"background": None, **options})
 
 
-def sensor_of(folder: ModelFolder) -> SensorConfig:
+def sensor_config(folder: ModelFolder) -> SensorConfig:
     """The settings of a folder's sensor."""
     return SensorConfig.of(folder.manifest.sensor)
 
 
-def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
+def recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
     """The policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
@@ -91,7 +91,7 @@ def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
     )
 
 
-def needs(choice: Choice, config: RunConfig) -> list[str]:
+def needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:

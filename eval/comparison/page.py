@@ -13,30 +13,31 @@ import yaml
 
 from eval.comparison.replay import replay
 from eval.comparison.run import Run
-from eval.comparison.summary import LAST_COLUMN, Array, Curve, curve_rows
+from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
+from semfov.metrics.averages import FloatArray
 from semfov.report.curves import curves_html, table_html
 from semfov.report.episode import Data, Pool, episode_data
 from semfov.report.page import write_page
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.setup import plain
 from semfov.viz.views import foveated_views
 
 WHERE = ("out", "cache", "workers")
 """Settings of folders and processes, which do not change the results and are left out of the page."""
 
-LIMIT = 4_500_000
+MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""
 
 
 def write_run_report(
     run: Run,
-    records: list[Record],
+    records: list[ResultRecord],
     curves: Mapping[str, dict[str, Curve]],
     *,
     titles: Mapping[str, str],
     label: str,
     shifts: Sequence[int],
-    others: Mapping[str, Array] | None = None,
+    others: Mapping[str, FloatArray] | None = None,
     episodes: int = 18,
 ) -> Path:
     """Write `report.html` to the folder of a run.
@@ -76,7 +77,7 @@ def write_run_report(
     return write_page(run.config.out / "report.html", title, data, pool, sections="\n".join(sections))
 
 
-def choose_episodes(records: list[Record], policies: Sequence[str], count: int) -> list[Record]:
+def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count: int) -> list[ResultRecord]:
     """Choose records to show: in each scene the same episode with all policies side by side.
 
     The episode of a scene is the one from the first start, in searches for the commonest target.
@@ -90,11 +91,11 @@ def choose_episodes(records: list[Record], policies: Sequence[str], count: int) 
         The chosen records.
     """
     order = {policy: number for number, policy in enumerate(policies)}
-    groups: dict[Any, list[Record]] = defaultdict(list)
+    groups: dict[Any, list[ResultRecord]] = defaultdict(list)
     for record in records:
         if record["repetition"] == 0 and record.get("commonest", True) and record["policy"] in order:
             groups[record["scene"]].append(record)
-    chosen: list[Record] = []
+    chosen: list[ResultRecord] = []
     for group in groups.values():
         if len(chosen) >= count:
             break
@@ -102,10 +103,10 @@ def choose_episodes(records: list[Record], policies: Sequence[str], count: int) 
     return chosen
 
 
-def _episodes(run: Run, records: Sequence[Record], pool: Pool) -> list[Data]:
+def _episodes(run: Run, records: Sequence[ResultRecord], pool: Pool) -> list[Data]:
     data, size, settings = [], 0, run.eye.settings()
     for record in records:
-        if len(pool) + size > LIMIT:
+        if len(pool) + size > MOST_BYTES:
             break
         index = list(run.scenes.ids).index(record["scene"])
         scene, scanpath = run.scenes[index], replay(run, index, record)

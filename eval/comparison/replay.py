@@ -10,11 +10,11 @@ from semfov.episode import StoredLooks, rollout
 from semfov.errors import InputError
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_map_evidence
 
 
-def replay(run: Run, index: int, record: Record) -> Scanpath:
+def replay(run: Run, index: int, record: ResultRecord) -> Scanpath:
     """Replay a recorded episode.
 
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:

@@ -9,7 +9,7 @@ from typing import Any
 from semfov.gaze.policies import POLICIES
 from semfov.io.code import class_digest
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import digest_of
 
 
@@ -39,5 +39,5 @@ class Run(PolicyLooking):
         }
 
     @abstractmethod
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all episodes of a scene with all policies; returns records, and the seconds that each stage took."""

@@ -14,35 +14,32 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from numpy.typing import NDArray
 
 from eval.comparison.run import Run
 from semfov.io.code import commit
-from semfov.io.compatibility import recommended
+from semfov.io.compatibility import recommended_model
 from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
-from semfov.metrics.averages import standard_error
-from semfov.runs.results import Record
+from semfov.metrics.averages import FloatArray, standard_error
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
 from semfov.runs.setup import growth_of, plain
 from semfov.runs.tables import percent
 from semfov.version import __version__
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Curve:
     """A measure after 0, 1, … gaze shifts: its mean, and its standard errors over images and over repetitions."""
 
-    mean: Array
-    over_images: Array
-    over_repetitions: Array
+    mean: FloatArray
+    over_images: FloatArray
+    over_repetitions: FloatArray
     images: int
     episodes: int
 
 
-def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> Curve:
+def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], FloatArray]) -> Curve:
     """Average episodes: first over the episodes of each image, then over images.
 
     Args:
@@ -52,14 +49,14 @@ def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> C
     Returns:
         The mean curve with its standard errors.
     """
-    images: dict[Any, list[Array]] = defaultdict(list)
-    repetitions: dict[int, dict[Any, list[Array]]] = defaultdict(lambda: defaultdict(list))
+    images: dict[Any, list[FloatArray]] = defaultdict(list)
+    repetitions: dict[int, dict[Any, list[FloatArray]]] = defaultdict(lambda: defaultdict(list))
     for record in records:
         curve = measure(record)
         images[record["scene"]].append(curve)
         repetitions[record["repetition"]][record["scene"]].append(curve)
 
-    def per_image(groups: dict[Any, list[Array]]) -> Array:
+    def per_image(groups: dict[Any, list[FloatArray]]) -> FloatArray:
         return np.stack([np.mean(group, axis=0) for group in groups.values()])
 
     means = per_image(images)
@@ -72,7 +69,7 @@ def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> C
     )
 
 
-def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
+def collect_records(run: Run) -> tuple[list[ResultRecord], dict[str, float]]:
     """Records of all scenes, sorted by policy, and the seconds that each stage took."""
     records, seconds = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
@@ -98,7 +95,7 @@ def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
     return {scene: float(np.mean(group)) for scene, group in scenes.items()}
 
 
-def write_summary(out: Path, name: str, text: str, records: list[Record]) -> list[Path]:
+def write_summary(out: Path, name: str, text: str, records: list[ResultRecord]) -> list[Path]:
     """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
     files = {f"{name}.md": text, "records.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for file, content in files.items():
@@ -110,7 +107,7 @@ def write_files(
     run: Run,
     program: str,
     tables: dict[str, str],
-    records: list[Record],
+    records: list[ResultRecord],
     seconds: dict[str, float],
 ) -> list[Path]:
     """Write tables (text by file name), records, settings and manifest; returns the paths of all files."""
@@ -202,5 +199,5 @@ def sensing(run: Run) -> str:
     what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"
     if run.models.observation is None:
         return what
-    own = model or recommended(run.eye.detector.name, growth_of(run.eye))
+    own = model or recommended_model(run.eye.detector.name, growth_of(run.eye))
     return f"{what}, observation model {Path(own).stem}"

@@ -16,7 +16,7 @@ from dataclasses import fields
 from eval.comparison.model_folder import with_models
 from eval.comparison.summary import announce, sensing
 from eval.decide.config import DecideConfig, DecisionConfig
-from eval.decide.report import probabilities, summary
+from eval.decide.report import decision_summary, probabilities
 from eval.decide.run import DecisionRun
 from semfov.errors import DataError
 from semfov.io.files import write_text
@@ -37,7 +37,7 @@ def search_and_decide(config: DecideConfig) -> None:
     records, _ = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
-    text = summary(records, sensing(run))
+    text = decision_summary(records, sensing(run))
     files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for name, content in files.items():
         write_text(config.out / name, content)

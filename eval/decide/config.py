@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Self
 
 from eval.search.config import SearchConfig
-from semfov.decision import MOST
+from semfov.decision import MOST_CLOSER
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import PolicyConfig, ProtocolConfig, ScenesConfig
 from semfov.runs.settings import Range, Share
@@ -42,7 +42,7 @@ class DecideConfig(ScenesConfig):
     confirm: Share | None = None
     give_up: Share | None = None
     place: Share | None = None
-    closer: Annotated[int, Range(0, 100)] = MOST
+    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     verification: str | None = None
     out: Path = Path("runs/decide")
     models: Path | None = None

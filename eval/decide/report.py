@@ -8,8 +8,8 @@ from torch import Tensor
 from eval.decide.run import AGENT, LANDINGS, LANDINGS_TOLD, UNVERIFIED, landing_cells
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc, hits_at
-from semfov.runs.results import Record
-from semfov.runs.tables import mean, share, table
+from semfov.runs.results import ResultRecord
+from semfov.runs.tables import mean_or_dash, share, table
 
 SHARES = (0.01, 0.02, 0.05)
 """False alarm rates at which the tables give the hit rate."""
@@ -33,7 +33,7 @@ def telling(told: Mapping[str, Tensor], there: Tensor) -> list[list[str]]:
     ]
 
 
-def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Probability or score `(M,)` of presence by way to search, and whether the target is present, `(M,)`."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
@@ -44,7 +44,7 @@ def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], t
     return told, torch.tensor([record["present"] for record in first])
 
 
-def summary(records: Sequence[Record], sensed: str) -> str:
+def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     """The tables, as Markdown."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
@@ -67,17 +67,17 @@ def summary(records: Sequence[Record], sensed: str) -> str:
                 share(len(found), len(present)),
                 share(sum(record["outcome"] == "found" for record in absent), len(absent)),
                 share(sum(record["outcome"] == "undecided" for record in group), len(group)),
-                mean([record["looks"] for record in present]),
-                mean([record["looks"] for record in absent]),
+                mean_or_dash([record["looks"] for record in present]),
+                mean_or_dash([record["looks"] for record in absent]),
                 share(sum(places), len(places)),
-                mean(expected),
-                mean([record["overlap"] for record in found if record["overlap"] is not None], 2),
+                mean_or_dash(expected),
+                mean_or_dash([record["overlap"] for record in found if record["overlap"] is not None], 2),
             ]
         )
     decided.append(sharp_decisions(groups[names[0]]))
     closely = ""
     if UNVERIFIED in groups:
-        each = mean([record["closer"] for record in groups[AGENT]], 2)
+        each = mean_or_dash([record["closer"] for record in groups[AGENT]], 2)
         closely = f" Closer looks count as looks; {AGENT} makes {each} of them in a search."
     return "\n".join(
         [
@@ -97,13 +97,13 @@ def summary(records: Sequence[Record], sensed: str) -> str:
             "",
             LANDINGS_TOLD,
             "",
-            *table([["", *LANDINGS], *landings(groups)]),
+            *table([["", *LANDINGS], *landing_rows(groups)]),
             "",
         ]
     )
 
 
-def sharp_decisions(records: Sequence[Record]) -> list[str]:
+def sharp_decisions(records: Sequence[ResultRecord]) -> list[str]:
     """Row of one sharp look, with the threshold of its score chosen for as many hits as these searches have."""
     present = [record for record in records if record["present"]]
     hits = sum(record["outcome"] == "found" for record in present)
@@ -119,11 +119,11 @@ def sharp_decisions(records: Sequence[Record]) -> list[str]:
         "1.0",
         share(sum(record["sharp_place"]["right"] for record in told), len(told)),
         "-",
-        mean(there, 2),
+        mean_or_dash(there, 2),
     ]
 
 
-def landings(groups: dict[str, list[Record]]) -> list[list[str]]:
+def landing_rows(groups: dict[str, list[ResultRecord]]) -> list[list[str]]:
     """Rows of the table about the first look on the target (`landing`)."""
     landed = {name: [each for each in group if each["landing"] is not None] for name, group in groups.items()}
     return [

@@ -24,15 +24,15 @@ from semfov.errors import InputError, check
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
-from semfov.runs.looks import Box, photograph_looks
+from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.remembered import RememberedLooks
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import choose_classes, search_steps
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_observation, make_verification, published_model
 from semfov.strategy import Strategy
 
-Rule = Callable[[Step, int, Grid], Tensor]
+_Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
 AGENT, UNVERIFIED, RANDOM, PUBLISHED, AT_THE_GAZE = (
@@ -79,7 +79,7 @@ class DecisionRun(Run):
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
-        self.compared: dict[str, tuple[Strategy, Rule]] = {
+        self.compared: dict[str, tuple[Strategy, _Rule]] = {
             AGENT: (learned, self._by_thresholds),
             **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
             RANDOM: (random, self._by_thresholds),
@@ -93,7 +93,7 @@ class DecisionRun(Run):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(self, closer: Callable[[Box], Detections], grid: Grid, target: int) -> Verifier[Step]:
+    def _verifier(self, closer: Callable[[BoxKey], Detections], grid: Grid, target: int) -> Verifier[Step]:
         """The closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
@@ -120,14 +120,14 @@ class DecisionRun(Run):
         given = [config.confirm, config.give_up, config.place, config.closer]
         return {**super().depends_on(), "decisions": given, "verification": self.verification}
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
         protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
         classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
         covered = grid.footprint(annotation.boxes)
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         if not classes:
             return records, watch.seconds
         detections = self.detections(index)
@@ -136,7 +136,7 @@ class DecisionRun(Run):
             sharp = self.eye.detector(image)
             tiles = [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
-        closer: RememberedLooks[int | Box, Detections] = RememberedLooks(
+        closer: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid)
         )
         for target in classes:
@@ -155,7 +155,7 @@ class DecisionRun(Run):
             looks = StoredLooks(detections, grid, torch.tensor([target]))
             for name, (strategy, judge) in self.compared.items():
 
-                def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
+                def rule(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
                 verifier = self._verifier(closer, grid, target) if name in self.verified else None
@@ -194,7 +194,7 @@ def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
     return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
 
 
-def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> Record | None:
+def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> ResultRecord | None:
     """Whether the centre of the target's most confident detection lies on the target, and how well its box fits.
 
     Args:

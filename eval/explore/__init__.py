@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from eval.comparison.model_folder import with_models
 from eval.explore.config import ExploreConfig
-from eval.explore.report import report
+from eval.explore.report import exploration_report
 from eval.explore.run import ExploreRun
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
@@ -24,7 +24,7 @@ def explore(config: ExploreConfig) -> None:
     run = ExploreRun(with_models(config))
     finish(run, "exploring")
     if rank() == 0:
-        report(run)
+        exploration_report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

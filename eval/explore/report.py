@@ -7,10 +7,9 @@ from pathlib import Path
 from eval.comparison.page import write_run_report
 from eval.comparison.summary import (
     LAST_COLUMN,
-    Array,
     Curve,
     announce,
-    collect,
+    collect_records,
     curve_of,
     curve_rows,
     curves_csv,
@@ -19,12 +18,13 @@ from eval.comparison.summary import (
 )
 from eval.explore.run import ExploreRun
 from semfov.errors import DataError
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.exploration import success_rate
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+_SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""
 
 ANSWERS = {
@@ -35,18 +35,18 @@ ANSWERS = {
 """Ways to count answers: the field of the records, and a description."""
 
 
-def report(run: ExploreRun) -> None:
+def exploration_report(run: ExploreRun) -> None:
     """Write all output of a finished run, and print the tables."""
-    records, seconds = collect(run)
+    records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
     # The reference of one sharp look comes after the policies.
     names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
     curves = {answer: success(records, list(names), answer) for answer in ANSWERS}
-    summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
+    summary = exploration_summary(curves, run.config.protocol.shifts, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
     written = write_files(run, "eval.explore", tables, records, seconds)
-    written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
+    written += [draw_exploration_curves(run, curves[answer], answer) for answer in ANSWERS]
     written.append(
         write_run_report(
             run,
@@ -54,25 +54,25 @@ def report(run: ExploreRun) -> None:
             curves,
             titles={name: title for name, (_, title) in ANSWERS.items()},
             label="cells with the right class (%)",
-            shifts=SHIFTS,
+            shifts=_SHIFTS,
         )
     )
     announce(summary, written)
 
 
-def success(records: list[Record], policies: Sequence[str], answer: str) -> dict[str, Curve]:
+def success(records: list[ResultRecord], policies: Sequence[str], answer: str) -> dict[str, Curve]:
     """Success rate of each policy after each gaze shift."""
     measure = partial(_rate, field=ANSWERS[answer][0])
     return {policy: curve_of((r for r in records if r["policy"] == policy), measure) for policy in policies}
 
 
-def _rate(record: Record, field: str) -> Array:
+def _rate(record: ResultRecord, field: str) -> FloatArray:
     return success_rate(record[field], record["grid_cells" if field == "right_everywhere" else "object_cells"])
 
 
-def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
+def exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
     """The tables that the run prints: success rates with standard errors over images."""
-    shifts = [n for n in SHIFTS if n <= last]
+    shifts = [n for n in _SHIFTS if n <= last]
     head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
     lines = []
     for answer, policies in curves.items():
@@ -88,7 +88,7 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: st
     return "\n".join(lines)
 
 
-def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
+def draw_exploration_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     """Draw the success rate against gaze shifts."""
     from semfov.viz import plot_success_rate
 

@@ -19,7 +19,7 @@ from semfov.runs.exploration_protocol import (
     explore_noise,
     run_explorations,
 )
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 
 
 class ExploreRun(Run):
@@ -28,11 +28,11 @@ class ExploreRun(Run):
     task: Task = "exploration"
     config: ExploreConfig
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all explorations of a scene with all policies; returns records, and the seconds that each stage took."""
         protocol = self.config.protocol
         watch = Stopwatch()
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         grid = self.grid(index)
         answers = answers_of(self.scenes.annotation(index), grid, len(self.scenes.classes) + 1)
         if not answers.any():
@@ -58,7 +58,7 @@ class ExploreRun(Run):
         watch.lap("sharp look")
         return records, watch.seconds
 
-    def _record(self, policy: str, answers: Tensor, episode: Exploration, progress: Progress) -> Record:
+    def _record(self, policy: str, answers: Tensor, episode: Exploration, progress: Progress) -> ResultRecord:
         return {
             "policy": policy,
             "scene": self.scenes.ids[episode.scene],

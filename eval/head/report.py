@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import complete
 from semfov.runs.tables import percent, table
 from semfov.viz.style import line_style, save_figure
 
-Array = NDArray[np.float64]
-Measure = Callable[[Record], float]
+_Array = NDArray[np.float64]
+_Measure = Callable[[ResultRecord], float]
 
 
 def head(config: HeadConfig) -> None:
@@ -28,16 +28,18 @@ def head(config: HeadConfig) -> None:
     records = complete(run, "looking around")
     if records is None:
         return
-    text = summary(records, config)
+    text = head_summary(records, config)
     announce(text, [*write_summary(config.out, "head", text, records), *_curves(records, config)])
 
 
-def measured(records: list[Record], measure: Measure) -> dict[Any, float]:
+def measured(records: list[ResultRecord], measure: _Measure) -> dict[Any, float]:
     """Mean of a measure over the records of each scene."""
     return by_scene((record["scene"], measure(record)) for record in records)
 
 
-def compared(records: list[Record], others: list[Record], measure: Measure) -> tuple[float, float, float, float]:
+def compared(
+    records: list[ResultRecord], others: list[ResultRecord], measure: _Measure
+) -> tuple[float, float, float, float]:
     """Mean over scenes with its standard error, then mean difference from `others`, paired by scene, with its error."""
     mine, theirs = measured(records, measure), measured(others, measure)
     values = np.array([*mine.values()])
@@ -46,7 +48,7 @@ def compared(records: list[Record], others: list[Record], measure: Measure) -> t
     return float(values.mean()), next(errors), float(apart.mean()), next(errors)
 
 
-def at(record: Record, seconds: float, what: str) -> float:
+def value_by(record: ResultRecord, seconds: float, what: str) -> float:
     """The measure `what` of an exploration after the last look that has ended by `seconds`; 0 before the first."""
     done = sum(second <= seconds for second in record["seconds"])
     return float(record[what][done - 1]) if done else 0.0
@@ -57,9 +59,9 @@ def budgets(config: HeadConfig) -> list[float]:
     return sorted({second for second in (2.0, 5.0, 10.0) if second < config.seconds} | {config.seconds})
 
 
-def summary(records: list[Record], config: HeadConfig) -> str:
+def head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
     """Tables as Markdown."""
-    groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[ResultRecord]] = defaultdict(list)
     for record in records:
         groups[record["task"], record["way"]].append(record)
     what = {"panorama": "panoramas", "mosaic": "mosaics"}[config.scene]
@@ -73,7 +75,7 @@ def summary(records: list[Record], config: HeadConfig) -> str:
     return "\n".join(lines)
 
 
-def _searching(searches: dict[str, list[Record]], config: HeadConfig, what: str) -> list[str]:
+def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
     limit, ours = config.seconds, searches[OURS]
     times = budgets(config)
     rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", "less ours", "passes", "less ours"]]
@@ -100,7 +102,7 @@ def _searching(searches: dict[str, list[Record]], config: HeadConfig, what: str)
     ]
 
 
-def _exploring(explorations: dict[str, list[Record]], config: HeadConfig, what: str) -> list[str]:
+def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
     ours, times = explorations[OURS], budgets(config)
     last = times[-1]
     rows = [
@@ -109,10 +111,10 @@ def _exploring(explorations: dict[str, list[Record]], config: HeadConfig, what: 
     for way, group in explorations.items():
         row = [way]
         for second in times:
-            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: at(r, s, "success"))  # type: ignore[misc]
+            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: value_by(r, s, "success"))  # type: ignore[misc]
             row.append(percent(mean, error))
         row.append("" if way == OURS else f"{100 * apart:.1f} ± {100 * error_apart:.1f}")
-        mean, error, *_ = compared(group, ours, lambda r: at(r, last, "objects"))
+        mean, error, *_ = compared(group, ours, lambda r: value_by(r, last, "objects"))
         looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
         rows.append([*row, percent(mean, error), f"{looks:.1f}"])
     return [
@@ -125,13 +127,13 @@ def _exploring(explorations: dict[str, list[Record]], config: HeadConfig, what: 
     ]
 
 
-def _curves(records: list[Record], config: HeadConfig):  # type: ignore[no-untyped-def]
+def _curves(records: list[ResultRecord], config: HeadConfig):  # type: ignore[no-untyped-def]
     from matplotlib.figure import Figure
 
     seconds = np.linspace(0, config.seconds, 101)
     wanted: dict[str, tuple[str, Callable[..., float]]] = {
         "search": ("share of targets found", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
-        "exploration": ("share of cells named right", lambda r, s: at(r, s, "success")),
+        "exploration": ("share of cells named right", lambda r, s: value_by(r, s, "success")),
     }
     written = []
     for task, (title, measure) in wanted.items():

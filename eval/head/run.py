@@ -21,17 +21,17 @@ from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
-from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, Gain, PerPrice, Scan, SearchGain
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, LookGain, PerPrice, Scan, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 from semfov.head.world import Boxes, Flat, Panorama, Places, World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
-from semfov.runs.looks import SOURCES, tight
+from semfov.runs.looks import LOOK_SOURCES, tight
 from semfov.runs.remembered import RememberedLooks
-from semfov.runs.results import Record
-from semfov.runs.scene_run import SceneRun, cache_folder
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
 from semfov.runs.store import DetectionStore
@@ -42,7 +42,7 @@ OURS = "ours"
 MOSAIC = 240.0
 """Width in degrees of a mosaic of 4 × 4 photographs."""
 
-LOOKS = (*SOURCES, "semfov.head.views", "semfov.head.panoramas", "semfov.data.mosaics", "semfov.head.episode")
+_LOOKS = (*LOOK_SOURCES, "semfov.head.views", "semfov.head.panoramas", "semfov.data.mosaics", "semfov.head.episode")
 """Modules that turn a scene into looks; all modules that they import count, too."""
 
 Degrees = Annotated[float, Range(1, 170)]
@@ -128,7 +128,7 @@ class HeadRun(SceneRun):
             )
         )
         looks, components = {"eye": self.eye.settings(), "fields": config.fields}, len(self.eye.detector.classes) + 1
-        self.store = DetectionStore(cache_folder(config.cache) / "head", looks, LOOKS, components)
+        self.store = DetectionStore(store_folder(config.cache) / "head", looks, _LOOKS, components)
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, its models and the settings."""
@@ -145,7 +145,7 @@ class HeadRun(SceneRun):
         scenes = self.scenes
         return scenes.regions(index) if isinstance(scenes, Panoramas) else Boxes(scenes.annotation(index).boxes)
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run the searches and the exploration of a scene with every way of moving eye and head; returns records."""
         watch, config = Stopwatch(), self.config
         views = Views(self.world(index), config.fields, fovea=self.fovea)
@@ -168,11 +168,11 @@ class HeadRun(SceneRun):
             looks.save()  # even when the run is stopped
         return records, watch.seconds
 
-    def ways(self, gain: Gain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
+    def ways(self, gain: LookGain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
         """Every way of moving eye and head, by its name in the tables: its acquisition function after an action."""
         views, config = gain.views, self.config
         pose = start // views.cells
-        order = raster(views, pose)
+        order = tiling_order(views, pose)
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
             OURS: lambda action: PerPrice(gain, config.speeds, action),
@@ -196,8 +196,8 @@ class HeadRun(SceneRun):
         legal = self.scenes.targets(index)
         return sorted(generator.permutation(legal)[: self.config.targets].tolist())
 
-    def _searches(self, index: int, views: Views, looks: Detect) -> list[Record]:
-        config, records = self.config, list[Record]()
+    def _searches(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
+        config, records = self.config, list[ResultRecord]()
         places, labels = self.places(index), self.scenes.annotation(index).labels
         gain = SearchGain(views, config.foresight)
         observer = SceneObserver(Target(self.target_evidence), views, prior=config.prior)
@@ -234,14 +234,16 @@ class HeadRun(SceneRun):
             seconds=config.seconds, seed=[config.seed, index, target or 0],
         )  # fmt: skip
 
-    def _explorations(self, index: int, views: Views, looks: Detect) -> list[Record]:
-        answers = answers_of(views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes))
+    def _explorations(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
+        answers = scene_answers(
+            views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes)
+        )
         area, config = views.world.area * answers.any(-1), self.config
         gain, observer = (
             ExploreGain(views, self.map_evidence, config.unseen),
             SceneObserver(LearnedMap(self.map_evidence), views),
         )
-        start, records = self.start(index, views, 0), list[Record]()
+        start, records = self.start(index, views, 0), list[ResultRecord]()
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
             for step in self._steps(views, looks, observer, acquire, start, None, index):
@@ -273,7 +275,7 @@ def turns(steps: list[HeadStep], views: Views) -> int:
     return sum(one != other for one, other in pairwise(poses))
 
 
-def raster(views: Views, pose: int) -> list[int]:
+def tiling_order(views: Views, pose: int) -> list[int]:
     """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
     rows = next(rows for rows in views.tiling if any(pose in row for row in rows))
     snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(rows)))]
@@ -281,7 +283,7 @@ def raster(views: Views, pose: int) -> list[int]:
     return snake[at:] + snake[:at]
 
 
-def answers_of(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
+def scene_answers(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
     """Which classes are right for each cell of the scene, those of the objects that overlap it.
 
     A cell and an object overlap if the object contains the cell's centre, or the cell contains one of the points

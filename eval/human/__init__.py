@@ -18,7 +18,7 @@ from typing import Any
 from eval.human.searching.compare import compare
 from eval.human.searching.config import PeopleSearchConfig
 from eval.human.viewing.config import ViewingConfig
-from eval.human.viewing.report import report
+from eval.human.viewing.report import viewing_report
 from eval.human.viewing.run import ViewingRun
 from eval.human.viewing.scores import halves, score_all
 from eval.human.viewing.sequences import score_sequences
@@ -34,7 +34,7 @@ def viewing(config: ViewingConfig) -> None:
     if rank() == 0:
         fitted, reported = halves(run)
         scored = score_all(run, fitted, reported)
-        report(run, scored, score_sequences(scored, reported), reported)
+        viewing_report(run, scored, score_sequences(scored, reported), reported)
 
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {

@@ -7,22 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from semfov.metrics.averages import Array, standard_error
+from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 
 OBJECTS = "right_without_background"
 
 
 @cache
-def read_records(folder: Path) -> tuple[Record, ...]:
+def read_records(folder: Path) -> tuple[ResultRecord, ...]:
     """Read the records of all episodes of a run."""
     lines = (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
     return tuple(json.loads(line) for line in lines)
 
 
-def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[Record]:
+def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[ResultRecord]:
     """Records of a policy; with `commonest`, only searches for each image's commonest target, as in the paper."""
     return [r for r in read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
 
@@ -32,36 +32,36 @@ def policies_of(folder: Path) -> list[str]:
     return list(dict.fromkeys(record["policy"] for record in read_records(folder)))
 
 
-def curve_of_record(record: Record, last: int, field: str = "right") -> Array:
+def curve_of_record(record: ResultRecord, last: int, field: str = "right") -> FloatArray:
     """Measure of an episode after 0..`last` gaze shifts; in explorations, `field` says which answers are counted."""
     if "found_at" in record:
         return cumulative_performance(np.array([record["found_at"]]), last)
     return success_rate(record[field], record["object_cells"])[: last + 1]
 
 
-def per_image(records: list[Record], last: int, field: str = "right") -> Array:
+def per_image(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
     """Measure of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
-    images: dict[str, list[Array]] = defaultdict(list)
+    images: dict[str, list[FloatArray]] = defaultdict(list)
     for record in records:
         images[str(record["scene"])].append(curve_of_record(record, last, field))
     return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
 
 
-def repetition_error(records: list[Record], last: int, field: str = "right") -> Array:
+def repetition_error(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
     """Standard error of the mean over the repetitions, as published, `(last+1,)`."""
-    repetitions: dict[int, list[Record]] = defaultdict(list)
+    repetitions: dict[int, list[ResultRecord]] = defaultdict(list)
     for record in records:
         repetitions[record["repetition"]].append(record)
     return standard_error(np.stack([per_image(group, last, field).mean(0) for group in repetitions.values()]))
 
 
-def difference(one: Array, other: Array) -> tuple[Array, Array]:
+def difference(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean difference, paired over images, and its standard error, each `(last+1,)`."""
     paired = one - other
     return paired.mean(0), standard_error(paired)
 
 
-def behind(mean: Array, error: Array) -> list[int]:
+def behind(mean: FloatArray, error: FloatArray) -> list[int]:
     """Gaze shifts, from 1, at which a paired difference is below zero by more than two standard errors.
 
     Args:

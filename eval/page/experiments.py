@@ -19,7 +19,7 @@ from semfov.runs.config import (
     RunConfig,
     SensorConfig,
 )
-from semfov.runs.presets import Choice
+from semfov.runs.presets import PolicyChoice
 from semfov.runs.settings import Count, Settings, Workers
 from semfov.sensor.named import SensorName
 
@@ -119,14 +119,14 @@ SENSITIVITY: dict[str, Changes] = {
 }
 """Variations of non-predictive search with raw scores; each changes one setting."""
 
-SENSORS: dict[str, Changes] = {
+_SENSORS: dict[str, Changes] = {
     f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
     for sigma in (50, 100, 200)
     for growth in (1, 2)
 }
 """Variations of the sensor."""
 
-WEIGHTS: dict[str, Changes] = {
+_WEIGHTS: dict[str, Changes] = {
     f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
 }
 """Variations of the weight of a saliency map as a prior."""
@@ -151,7 +151,7 @@ class Study:
     """
 
     settings: dict[str, Changes]
-    policies: tuple[Choice, ...]
+    policies: tuple[PolicyChoice, ...]
     explores: bool = False
     shifts: tuple[int, ...] = (1, 5, 10, 15, 30)
     model: str | None = None
@@ -159,10 +159,10 @@ class Study:
 
 STUDIES = {
     "sensitivity": Study(SENSITIVITY, ("non-predictive-raw",)),
-    "sensor": Study(SENSORS, ("random", "non-predictive-raw", CENTRAL)),
-    "explore-sensor": Study(SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
+    "sensor": Study(_SENSORS, ("random", "non-predictive-raw", CENTRAL)),
+    "explore-sensor": Study(_SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
     "saliency": Study(VIEWS, ("random", "vocus2", "itti-koch")),
-    "weights": Study(WEIGHTS, GUIDED, model="published"),
+    "weights": Study(_WEIGHTS, GUIDED, model="published"),
 }
 
 

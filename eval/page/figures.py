@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from eval.comparison.summary import Array
 from eval.page.curves import per_image, records_of, repetition_error
 from eval.page.findings import LAST
-from eval.page.tables import Runs, columns
+from eval.page.tables import Runs, published_columns
+from semfov.metrics.averages import FloatArray
 from semfov.viz.style import save_figure
 
 
@@ -23,7 +23,7 @@ class PaperFigure:
     policies: tuple[str, ...]
 
 
-FIGURES = {
+PAGE_FIGURES = {
     "prediction_and_calibration": PaperFigure(
         "search", ("predictive-raw", "predictive-calibrated", "non-predictive-raw", "non-predictive-calibrated")
     ),
@@ -47,8 +47,8 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     from semfov.viz import plot_curve_panels
 
     written = []
-    for name, figure in FIGURES.items():
-        folders = columns(figure.kind, runs)
+    for name, figure in PAGE_FIGURES.items():
+        folders = published_columns(figure.kind, runs)
         if any(run is None for run in folders.values()):
             continue
         panels = {title: panel(run, figure) for title, run in folders.items() if run is not None}
@@ -57,7 +57,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     return written
 
 
-def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, Array], dict[str, Array]]:
+def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     records = {policy: records_of(folder, policy, commonest=figure.kind == "search") for policy in figure.policies}

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from eval.page.curves import behind, difference, per_image, records_of, spans
-from eval.page.tables import Runs, columns
-from semfov.metrics.averages import Array
+from eval.page.tables import Runs, published_columns
+from semfov.metrics.averages import FloatArray
 from semfov.runs.tables import table
 
 LAST = {"search": 30, "explore": 20}
@@ -50,7 +50,7 @@ def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: 
     """
 
     def answer(folder: Path) -> str:
-        mean, error = compare(folder, one, other, kind)
+        mean, error = paired_difference(folder, one, other, kind)
         figures = " / ".join(f"{100 * mean[n]:+.1f}" for n in shifts)
         signs = {int(np.sign(mean[n])) if abs(mean[n]) > 2 * error[n] else 0 for n in shifts}
         return f"{figures}: {verdict(signs, expected)}"
@@ -88,7 +88,7 @@ def overtaken(policy: str, baseline: str, kind: str) -> Answer:
     """Test whether a policy first leads its baseline and is then overtaken, each by more than two standard errors."""
 
     def answer(folder: Path) -> str:
-        mean, error = compare(folder, policy, baseline, kind)
+        mean, error = paired_difference(folder, policy, baseline, kind)
         leads, trails = behind(-mean, error), behind(mean, error)
         first = bool(leads) and (not trails or leads[0] < trails[0])
         told = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
@@ -97,7 +97,7 @@ def overtaken(policy: str, baseline: str, kind: str) -> Answer:
     return answer
 
 
-def compare(folder: Path, one: str, other: str, kind: str) -> tuple[Array, Array]:
+def paired_difference(folder: Path, one: str, other: str, kind: str) -> tuple[FloatArray, FloatArray]:
     """Paired difference of two policies of a run; for searches over all legal targets, of which there are most."""
     curves = [per_image(records_of(folder, policy), LAST[kind]) for policy in (one, other)]
     return difference(*curves)
@@ -191,7 +191,7 @@ FINDINGS = (
 
 def findings(runs: Runs) -> list[str]:
     """The table of all findings."""
-    folders = {kind: columns(kind, runs) for kind in LAST}
+    folders = {kind: published_columns(kind, runs) for kind in LAST}
     rows = [["the paper finds", "shown", *folders["search"]]]
     for finding in FINDINGS:
         answers = (

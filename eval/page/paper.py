@@ -1,6 +1,6 @@
 """Results printed by Luzio, Bernardino and Moreno (2024): YOLOv3 on 300 photographs of their own choice."""
 
-SHIFTS = (5, 15, 30)
+TABLE_SHIFTS = (5, 15, 30)
 """Gaze shifts at which tables I and II give the cumulative performance."""
 
 TABLE_I: dict[str, tuple[float, float, float, float]] = {
@@ -9,7 +9,7 @@ TABLE_I: dict[str, tuple[float, float, float, float]] = {
     "non-predictive-raw": (42.63, 70.53, 87.23, 0.845),
     "non-predictive-calibrated": (53.80, 80.90, 93.03, 0.718),
 }
-"""Cumulative performance at `SHIFTS` and the largest standard error of the mean, in percent."""
+"""Cumulative performance at `TABLE_SHIFTS` and the largest standard error of the mean, in percent."""
 
 TABLE_II: dict[str, tuple[float, float, float, float]] = {
     "random": (45.20, 84.80, 97.13, 1.059),

@@ -35,7 +35,7 @@ def finished(run: Experiment | None) -> bool:
     return run is not None and any((run.out / name).exists() for name in TOLD)
 
 
-def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
+def published_columns(kind: str, runs: Runs) -> dict[str, Path | None]:
     """Folders of the published experiments of a kind, by column heading; None for an experiment that has not run."""
     found = {}
     for name, title in DETECTORS.items():
@@ -47,18 +47,18 @@ def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
 
 def beside_paper(published: Mapping[str, tuple[float, ...]], runs: Runs) -> list[str]:
     """A table of the paper beside our results; the target is the commonest class of each image."""
-    folders = columns("search", runs)
+    folders = published_columns("search", runs)
     rows = [["policy", "", "paper", *folders]]
     for policy, figures in published.items():
-        for place, n in enumerate(paper.SHIFTS):
-            ours = [performance(folder, policy, n) for folder in folders.values()]
+        for place, n in enumerate(paper.TABLE_SHIFTS):
+            ours = [performance_cell(folder, policy, n) for folder in folders.values()]
             rows.append([policy if place == 0 else "", f"CP@{n}", f"{figures[place]:.2f}", *ours])
         ours = [largest_error(folder, policy) for folder in folders.values()]
         rows.append(["", "max. SEM", f"{figures[-1]:.3f}", *ours])
     return table(rows)
 
 
-def performance(folder: Path | None, policy: str, shifts: int) -> str:
+def performance_cell(folder: Path | None, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
     if folder is None:
         return "not run yet"
@@ -70,19 +70,21 @@ def largest_error(folder: Path | None, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
     if folder is None:
         return "not run yet"
-    return f"{100 * repetition_error(records_of(folder, policy, commonest=True), max(paper.SHIFTS)).max():.3f}"
+    return f"{100 * repetition_error(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS)).max():.3f}"
 
 
 def readings(runs: Runs) -> list[str]:
     """Expected performance of random gaze for the commonest class, for both readings of n in the paper."""
-    folder = next((folder for folder in columns("search", runs).values() if folder is not None), None)
-    rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.SHIFTS)]]
+    folder = next((folder for folder in published_columns("search", runs).values() if folder is not None), None)
+    rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.TABLE_SHIFTS)]]
     rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
     if folder is not None:
         goals = [len(r["goal"]) for r in records_of(folder, "random", commonest=True) if r["repetition"] == 0]
-        curve = np.mean([random_search(count, max(paper.SHIFTS)) for count in goals], axis=0)
-        rows.append(["n gaze shifts (the reading of this page)", *(f"{100 * curve[n]:.1f}" for n in paper.SHIFTS)])
-        rows.append(["n fixations, the first among them", *(f"{100 * curve[n - 1]:.1f}" for n in paper.SHIFTS)])
+        curve = np.mean([random_search(count, max(paper.TABLE_SHIFTS)) for count in goals], axis=0)
+        rows.append(
+            ["n gaze shifts (the reading of this page)", *(f"{100 * curve[n]:.1f}" for n in paper.TABLE_SHIFTS)]
+        )
+        rows.append(["n fixations, the first among them", *(f"{100 * curve[n - 1]:.1f}" for n in paper.TABLE_SHIFTS)])
     return table(rows)
 
 
@@ -106,7 +108,7 @@ def study_table(title: str, runs: Runs) -> list[str]:
     return table(rows)
 
 
-def summary(folder: Path, section: int | None = None) -> list[str]:
+def run_summary(folder: Path, section: int | None = None) -> list[str]:
     """All tables that a run printed, or one of them."""
     text = (folder / "summary.md").read_text(encoding="utf-8").strip()
     parts = ["**" + part.strip() for part in text.split("\n**")]

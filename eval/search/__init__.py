@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from eval.comparison.model_folder import with_models
 from eval.search.config import SearchConfig
-from eval.search.report import report
+from eval.search.report import search_report
 from eval.search.run import SearchRun
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
@@ -25,7 +25,7 @@ def search(config: SearchConfig) -> None:
     run = SearchRun(with_models(config))
     finish(run, "searching")
     if rank() == 0:
-        report(run)
+        search_report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,10 +12,9 @@ from eval.comparison.page import write_run_report
 from eval.comparison.replay import replay
 from eval.comparison.summary import (
     LAST_COLUMN,
-    Array,
     Curve,
     announce,
-    collect,
+    collect_records,
     curve_of,
     curve_rows,
     curves_csv,
@@ -25,13 +24,14 @@ from eval.comparison.summary import (
 from eval.search.run import SearchRun
 from semfov.errors import DataError
 from semfov.io.files import clean, inside
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance, random_search
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 from semfov.viz.views import foveated_views
 
-SHIFTS = (1, 5, 10, 15, 30)
+_SHIFTS = (1, 5, 10, 15, 30)
 """Gaze shifts at which tables show the cumulative performance."""
 
 AVERAGES = {
@@ -40,18 +40,18 @@ AVERAGES = {
 }
 
 
-def report(run: SearchRun) -> None:
+def search_report(run: SearchRun) -> None:
     """Write all output of a finished run, and print the tables."""
-    records, seconds = collect(run)
+    records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     shifts = run.config.protocol.shifts
     curves = {average: performance(records, list(run.policies), shifts, average) for average in AVERAGES}
     expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
-    summary = summary_markdown(curves, expected, sensing(run))
+    summary = search_summary(curves, expected, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
     written = write_files(run, "eval.search", tables, records, seconds)
-    written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
+    written += [draw_search_curves(run, curves["all targets"], expected), *draw_searches(run, records)]
     written.append(
         write_run_report(
             run,
@@ -59,25 +59,25 @@ def report(run: SearchRun) -> None:
             curves,
             titles=AVERAGES,
             label="targets found (%)",
-            shifts=SHIFTS,
+            shifts=_SHIFTS,
             others={"random, by formula": expected},
         )
     )
     announce(summary, written)
 
 
-def performance(records: list[Record], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
+def performance(records: list[ResultRecord], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
     """Cumulative performance of each policy, over all targets or over the commonest target of each image."""
     measure = partial(_found, shifts=shifts)
     counted = [record for record in records if record["commonest"] or average == "all targets"]
     return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
 
 
-def _found(record: Record, shifts: int) -> Array:
+def _found(record: ResultRecord, shifts: int) -> FloatArray:
     return cumulative_performance(np.array([record["found_at"]]), shifts)
 
 
-def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
+def expected_random(records: list[ResultRecord], shifts: int, cells: int) -> FloatArray:
     """Expected performance of random search for these targets (hypergeometric formula), mean over images."""
     targets: dict[Any, dict[int, int]] = defaultdict(dict)
     for record in records:
@@ -88,9 +88,9 @@ def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
     return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
 
 
-def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensing: str) -> str:
+def search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, sensing: str) -> str:
     """The tables that the run prints: cumulative performance with standard errors over images."""
-    shifts = [n for n in SHIFTS if n < len(expected)]
+    shifts = [n for n in _SHIFTS if n < len(expected)]
     head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
     lines = []
     for average, policies in curves.items():
@@ -108,7 +108,7 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensi
     return "\n".join(lines)
 
 
-def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Path:
+def draw_search_curves(run: SearchRun, curves: dict[str, Curve], expected: FloatArray) -> Path:
     """Draw the cumulative performance against gaze shifts."""
     from semfov.viz import plot_cumulative_performance
 
@@ -120,7 +120,7 @@ def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Pa
     return save_figure(figure, run.config.out / "cumulative_performance.png")
 
 
-def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
+def draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
     """Draw a few episodes of the last policy in different scenes, preferring finds after two to six gaze shifts."""
     from semfov.viz import plot_episode
 

@@ -10,8 +10,8 @@ from eval.comparison.run import Run
 from eval.search.config import SearchConfig
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
-from semfov.runs.results import Record
-from semfov.runs.search_protocol import Episode, Outcome, episodes_of, run_episodes, tie_noise
+from semfov.runs.results import ResultRecord
+from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, run_episodes, tie_noise
 
 
 class SearchRun(Run):
@@ -20,12 +20,12 @@ class SearchRun(Run):
     task: Task = "search"
     config: SearchConfig
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene with all policies; returns records, and the seconds that each stage took."""
         config, protocol = self.config, self.config.protocol
         episodes = episodes_of(self.scenes, index, config.belief.columns, config.belief.rows, protocol)
         watch = Stopwatch()
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         detections, grid = self.detections(index), self.grid(index)
         watch.lap("look")
         if not episodes:
@@ -42,7 +42,7 @@ class SearchRun(Run):
             records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
         return records, watch.seconds
 
-    def _record(self, policy: str, episode: Episode, outcome: Outcome) -> Record:
+    def _record(self, policy: str, episode: Episode, outcome: EpisodeOutcome) -> ResultRecord:
         fields = asdict(episode)
         scene = fields.pop("scene")
         return {

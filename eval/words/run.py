@@ -10,23 +10,24 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from eval.comparison.summary import Array, Curve, announce, collect, curve_of, manifest, sensing
+from eval.comparison.summary import Curve, announce, collect_records, curve_of, manifest, sensing
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.belief import ContextPrior
 from semfov.belief.look_features import highest_score
 from semfov.errors import DataError, check
 from semfov.io.files import clean, inside, write_text
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.config import Context, PolicyConfig, ProtocolConfig, ScenesConfig
-from semfov.runs.results import Record
+from semfov.runs.config import ContextKind, PolicyConfig, ProtocolConfig, ScenesConfig
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Seed, Share, Weight
 from semfov.runs.setup import plain
 from semfov.runs.tables import table
 from semfov.runs.workers import rank
 
-SHIFTS = (1, 3, 5, 10, 30)
+_SHIFTS = (1, 3, 5, 10, 30)
 """Gaze shifts at which the table gives the share of targets found."""
 
 
@@ -56,7 +57,7 @@ class WordsConfig(ScenesConfig):
 
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policy: str | PolicyConfig = "target-evidence"
-    context: Context = "both"
+    context: ContextKind = "both"
     counted: str = "coco"
     tables: tuple[Path, ...] = ()
     weights: tuple[Weight, Weight] | None = None
@@ -68,7 +69,7 @@ class WordsConfig(ScenesConfig):
 class WordsRun(SearchRun):
     """Searches that also record the target's highest score in the first look."""
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; each record also holds the target's highest score in the first look."""
         records, seconds = super().outcomes(index)
         if records:
@@ -87,13 +88,13 @@ def words(config: WordsConfig) -> None:
     finish(run, "searching")
     if rank() > 0:
         return
-    records, seconds = collect(run)
+    records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     named = dict(zip(run.policies, arms, strict=True))
     for record in records:
         record["arm"] = named[record.pop("policy")]
-    text = "\n".join([f"{sensing(run)}, context: {config.context}", "", *told(records, list(arms), config)])
+    text = "\n".join([f"{sensing(run)}, context: {config.context}", "", *outcome_tables(records, list(arms), config)])
     files = {
         "words.md": text,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
@@ -132,7 +133,7 @@ def _with(base: PolicyConfig, config: WordsConfig, context: str | ContextPrior) 
     return replace(base, context=config.context, context_model=context)
 
 
-def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) -> list[str]:
+def outcome_tables(records: Sequence[ResultRecord], arms: Sequence[str], config: WordsConfig) -> list[str]:
     """Tables of all searches, and of the searches whose first look misses the target, as lines of Markdown."""
     missed = [record for record in records if record["first_score"] < config.missed]
     lines = []
@@ -140,7 +141,7 @@ def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) ->
         if not group:
             lines += [f"{title}: none.", ""]
             continue
-        shifts = [n for n in SHIFTS if n <= config.protocol.shifts]
+        shifts = [n for n in _SHIFTS if n <= config.protocol.shifts]
         rows = [["context", *(f"CP@{n}" for n in shifts), *(f"gain @{n}" for n in shifts)]]
         images = 0
         for arm in arms:
@@ -164,18 +165,18 @@ def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) ->
     return lines
 
 
-def differences(records: Sequence[Record], arm: str, shifts: int) -> Curve:
+def differences(records: Sequence[ResultRecord], arm: str, shifts: int) -> Curve:
     """Share found with an arm minus share found without context, paired by search (`curve_of`)."""
     without = {_search(record): record for record in records if record["arm"] == "none"}
     chosen = [record for record in records if record["arm"] == arm]
     return curve_of(chosen, lambda record: found(record, shifts) - found(without[_search(record)], shifts))
 
 
-def _search(record: Record) -> tuple[object, ...]:
+def _search(record: ResultRecord) -> tuple[object, ...]:
     return record["scene"], record["target"], record["repetition"]
 
 
-def found(record: Record, shifts: int) -> Array:
+def found(record: ResultRecord, shifts: int) -> FloatArray:
     """Whether a search has found its target after 0, 1, … gaze shifts."""
     return cumulative_performance(np.array([record["found_at"]]), shifts)
 

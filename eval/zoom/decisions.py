@@ -9,12 +9,12 @@ import torch
 
 from eval.decide.report import SHARES, telling
 from eval.decide.run import overlap
-from semfov.agents.windows import search
+from semfov.agents.windows import search_windows
 from semfov.data.scene import Annotation
-from semfov.decision import MOST, OUTCOMES
+from semfov.decision import MOST_CLOSER, OUTCOMES
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.results import Record
-from semfov.runs.tables import mean, share, table
+from semfov.runs.results import ResultRecord
+from semfov.runs.tables import mean_or_dash, share, table
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
 
@@ -31,7 +31,7 @@ def decide_all(
     slices: Sequence[Window],
     *,
     passes: int,
-) -> list[Record]:
+) -> list[ResultRecord]:
     """Search a picture until a decision, for each target, with closer looks and without them.
 
     Args:
@@ -48,10 +48,10 @@ def decide_all(
         the overview and all slices. Evidence without fitted verification makes no closer looks.
     """
     shown = torch.stack([glance.show for glance in glances.see(slices)])
-    records: list[Record] = []
-    ways = {OURS: MOST} if evidence.verification is None else {OURS: MOST, UNVERIFIED: 0}
+    records: list[ResultRecord] = []
+    ways = {OURS: MOST_CLOSER} if evidence.verification is None else {OURS: MOST_CLOSER, UNVERIFIED: 0}
     for target, (way, closer) in product(targets, ways.items()):
-        path = search(glances, evidence, classes, target, passes=passes, closer=closer)
+        path = search_windows(glances, evidence, classes, target, passes=passes, closer=closer)
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]
@@ -74,15 +74,15 @@ def decide_all(
     return records
 
 
-def by_way(records: Sequence[Record]) -> dict[str, list[Record]]:
+def by_way(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
     """The records of each way of searching; all ways have the same searches in the same order."""
-    ways: dict[str, list[Record]] = {}
+    ways: dict[str, list[ResultRecord]] = {}
     for record in records:
         ways.setdefault(record["way"], []).append(record)
     return ways
 
 
-def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
     ways = by_way(records)
     told = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
@@ -92,14 +92,14 @@ def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], t
     return told, torch.tensor([record["present"] for record in searches])
 
 
-def decision_tables(records: Sequence[Record]) -> list[str]:
+def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
-    told, there = probabilities(records)
+    told, there = presence_scores(records)
     ways = by_way(records)
     searches = next(iter(ways.values()))
-    passes = {way: mean([record["passes"] for record in of]) for way, of in ways.items()}
+    passes = {way: mean_or_dash([record["passes"] for record in of]) for way, of in ways.items()}
     passes["the overview, highest score"] = "1"
-    passes["all slices, highest score"] = mean([record["count"] for record in searches])
+    passes["all slices, highest score"] = mean_or_dash([record["count"] for record in searches])
     rows = [["", "passes", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE", "Brier"]]
     for (name, score), figures in zip(told.items(), telling(told, there), strict=True):
         sums = BinarySums.of(score, there)
@@ -111,7 +111,10 @@ def decision_tables(records: Sequence[Record]) -> list[str]:
             counts = [share(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
             found = [r for r in group if r["outcome"] == "found"]
             right = share(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
-            looks, chance = mean([r["passes"] for r in group]), mean([r["probability"] for r in group], 2)
+            looks, chance = (
+                mean_or_dash([r["passes"] for r in group]),
+                mean_or_dash([r["probability"] for r in group], 2),
+            )
             name = f"it is {'there' if kind else 'not'}{way.removeprefix(OURS)}"
             decided.append([name, counts[0], right, *counts[1:], looks, chance])
     return [

@@ -6,9 +6,9 @@ from statistics import mean, median
 import torch
 
 from eval.comparison.summary import announce, write_summary
-from eval.zoom.decisions import decision_tables, probabilities
+from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.run import ZoomConfig, ZoomRun
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import complete
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
@@ -21,27 +21,27 @@ def zoom(config: ZoomConfig) -> None:
     records = complete(run, "zooming")
     if records is None:
         return
-    text = summary(records, run)
+    text = zoom_summary(records, run)
     written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:
         written.append(_curves(records, run))
     if decided := [record for record in records if record["measure"] == "decision"]:
-        told, there = probabilities(decided)
+        told, there = presence_scores(decided)
         sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in told.items()}
         written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
     announce(text, written)
 
 
-def curve(records: list[Record], passes: int) -> list[float]:
+def curve(records: list[ResultRecord], passes: int) -> list[float]:
     """Share of all objects found after each pass; if a way of looking ends early, its last share stays."""
     total = sum(record["objects"] for record in records)
     counts = [sum(r["found"][min(n, len(r["found"])) - 1] for r in records) for n in range(1, passes + 1)]
     return [count / max(total, 1) for count in counts]
 
 
-def summary(records: list[Record], run: ZoomRun) -> str:
+def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
     """Tables as Markdown."""
-    groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[ResultRecord]] = defaultdict(list)
     for record in records:
         groups[record["measure"], record["way"]].append(record)
     finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
@@ -66,7 +66,7 @@ def summary(records: list[Record], run: ZoomRun) -> str:
     return "\n".join(lines)
 
 
-def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
+def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
     """Table of recall for every way of looking."""
     passes = run.config.passes
     at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
@@ -87,7 +87,7 @@ def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
     ]
 
 
-def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]
+def _curves(records: list[ResultRecord], run: ZoomRun):  # type: ignore[no-untyped-def]
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 4), layout="constrained")

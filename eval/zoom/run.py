@@ -17,13 +17,13 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_zoom_observation
-from semfov.runs.window_looking import SHOWN, Tile, WindowLooking, WindowLookingConfig, found_in
-from semfov.runs.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
+from semfov.runs.window_looking import LEAST_CONFIDENCE, TileSize, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.zoom_orders import in_order, oracle, quad_tree, ranked, shuffled, slices
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -32,7 +32,7 @@ from semfov.zoom.objects import merge
 from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 
-Measure = Literal["recall", "hit", "decision"]
+_Measure = Literal["recall", "hit", "decision"]
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,10 @@ class ZoomConfig(WindowLookingConfig):
     """
 
     target: str | None = None
-    slice: Tile = 640
+    slice: TileSize = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
-    measures: tuple[Measure, ...] = ("recall", "hit", "decision")
+    measures: tuple[_Measure, ...] = ("recall", "hit", "decision")
     sought: Count = 4
     observation: str | None = None
     out: Path = Path("runs/zoom")
@@ -99,11 +99,11 @@ class ZoomRun(WindowLooking, SceneRun):
             return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
         return slices(lattice, self.config.slice, self.config.overlap)
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Measure all ways of looking at a scene; returns records, and the seconds that each stage took."""
         watch = Stopwatch()
         glances = self.glances(index)
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         measures = self.config.measures
         for name, turns in self._finding(index, glances) if "recall" in measures else ():
             seen = [turn.glance for turn in islice(turns, self.config.passes)]
@@ -125,7 +125,7 @@ class ZoomRun(WindowLooking, SceneRun):
         cut, lattice = self.slices(index, glances.lattice), glances.lattice
         annotation, target = self.annotation(index), self.target
         orders = {
-            "slices, raster": raster(cut),
+            "slices, raster": in_order(cut),
             "slices, random": shuffled(cut, [self.config.seed, index]),
             "slices, ranked by the overview": ranked(cut, target, most=False),
             "quad-tree, best first": quad_tree(lattice, target, most=False),
@@ -141,7 +141,7 @@ class ZoomRun(WindowLooking, SceneRun):
         every = [*half_steps(lattice)][1:]
         yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], found, self.config.passes), None)
 
-    def _decisions(self, index: int, glances: Glances) -> list[Record]:
+    def _decisions(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Search for classes that are present and for classes that are absent."""
         config, annotation = self.config, self.scenes.annotation(index)
         targets = (
@@ -162,7 +162,7 @@ class ZoomRun(WindowLooking, SceneRun):
         kept = annotation.labels == self.target
         return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
 
-    def _recall(self, name: str, index: int, seen: list[Glance]) -> Record:
+    def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
         counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
         boxes = len(merge(seen, self.target, score=FOUND))
@@ -176,16 +176,16 @@ class ZoomRun(WindowLooking, SceneRun):
             "windows": [list(glance.window.fixation) for glance in seen],
         }
 
-    def _first_hits(self, index: int, glances: Glances) -> list[Record]:
+    def _first_hits(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, glances.lattice)
-        shown = torch.stack([glance.show for glance in glances.see(cut)]) >= SHOWN
+        shown = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST_CONFIDENCE
         closest = min(window.level for window in cut)
         limit = len(cut) + 1
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
             orders = {
-                "slices, raster": raster(cut),
+                "slices, raster": in_order(cut),
                 "slices, random": shuffled(cut, [self.config.seed, index, target]),
                 "slices, ranked by the overview": ranked(cut, target, most=True),
                 "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
@@ -199,7 +199,7 @@ class ZoomRun(WindowLooking, SceneRun):
                 passes, hit = 0, False
                 for glance in (turn.glance for turn in islice(turns, limit)):
                     passes += 1
-                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= SHOWN
+                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= LEAST_CONFIDENCE
                     if hit:
                         break
                 records.append(

@@ -9,7 +9,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture
-from semfov.decision import MOST, OUTCOMES, Decision, Verifier, check_thresholds, settle
+from semfov.decision import MOST_CLOSER, OUTCOMES, Decision, Verifier, check_thresholds, settle
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
@@ -23,10 +23,10 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything, look_for
 
-LIMIT = 1_000_000
+_LIMIT = 1_000_000
 """Limit of passes and batches, more than any picture has windows."""
 
-Picture = LargePicture | ImageLike
+_Picture = LargePicture | ImageLike
 
 DEFAULTS = Thresholds(0.9, 0.005)
 """Thresholds of searches whose evidence has none."""
@@ -86,7 +86,7 @@ class ZoomAgent(nn.Module):
         """Names of the classes, background first."""
         return ("background", *self.eye.detector.classes)
 
-    def pays(self, picture: Picture) -> bool:
+    def pays(self, picture: _Picture) -> bool:
         """Tell whether a picture is large enough for windows to pay.
 
         Args:
@@ -100,15 +100,15 @@ class ZoomAgent(nn.Module):
 
     def search(
         self,
-        picture: Picture,
+        picture: _Picture,
         target: str | int,
         *,
         passes: int = 24,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST,
+        closer: int = MOST_CLOSER,
     ) -> ZoomPath:
-        """Search for one object of a class and decide whether the picture holds one (`semfov.agents.windows.search`).
+        """Search for one object of a class and decide whether the picture holds one (`search_windows`).
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
         (`semfov.zoom.closer`).
@@ -131,12 +131,12 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        check_whole(passes, "passes", 1, LIMIT)
+        check_whole(passes, "passes", 1, _LIMIT)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
-            return search(
+            return search_windows(
                 self._open(picture),
                 self.evidence,
                 self.classes,
@@ -148,7 +148,7 @@ class ZoomAgent(nn.Module):
             )
 
     def find_all(
-        self, picture: Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
+        self, picture: _Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
     ) -> ZoomPath:
         """Find all objects of a class (`semfov.agents.windows.find_all`).
 
@@ -168,7 +168,7 @@ class ZoomAgent(nn.Module):
         """
         return self._find(picture, class_index(target, self.classes[1:], "target"), passes, batch, worth)
 
-    def explore(self, picture: Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
+    def explore(self, picture: _Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
         """Find all objects of all classes.
 
         Args:
@@ -186,19 +186,19 @@ class ZoomAgent(nn.Module):
         """
         return self._find(picture, None, passes, batch, worth)
 
-    def _find(self, picture: Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:
-        check_whole(passes, "passes", 1, LIMIT)
-        check_whole(batch, "batch", 1, LIMIT)
+    def _find(self, picture: _Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:
+        check_whole(passes, "passes", 1, _LIMIT)
+        check_whole(batch, "batch", 1, _LIMIT)
         check_number(worth, "worth", 0, float("inf"))
         return find_all(
             self._open(picture), self.evidence, self.classes, target, passes=passes, batch=batch, worth=worth
         )
 
-    def _open(self, picture: Picture) -> LiveGlances:
+    def _open(self, picture: _Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
 
 
-def search(
+def search_windows(
     glances: Glances,
     evidence: GlimpseEvidence,
     classes: tuple[str, ...],
@@ -207,7 +207,7 @@ def search(
     passes: int = 24,
     confirm: float | None = None,
     give_up: float | None = None,
-    closer: int = MOST,
+    closer: int = MOST_CLOSER,
 ) -> ZoomPath:
     """Search a picture for one object of a class and decide whether it is there.
 

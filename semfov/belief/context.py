@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief.context_table import cooccurrence_from, places_from, read_table
+from semfov.belief.context_table import cooccurrence_from, places_from, read_named_table
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check, check_shape, lookup, values_known
@@ -253,11 +253,11 @@ class ContextPrior(Pretrained):
         digest = _digest(path)
         if sha256 is not None and sha256.lower() != digest:
             raise DataError(f"{path}: expected a table with sha256 {sha256}, got {digest}; download it again")
-        cooccurrence, missing = cooccurrence_from(read_table(path), classes, len(edges) + 1)
+        cooccurrence, missing = cooccurrence_from(read_named_table(path), classes, len(edges) + 1)
         place = torch.zeros(len(classes) + 1, 1, 1)
         told: dict[str, Any] = {"source": source, "sha256": digest, "missing": missing}
         if places is not None:
-            place = places_from(read_table(places), classes)
+            place = places_from(read_named_table(places), classes)
             told["places_sha256"] = _digest(places)
         weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
         return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": told})

@@ -33,7 +33,7 @@ class NamedTable:
     values: Tensor
 
 
-def read_table(path: str | PathLike[str]) -> NamedTable:
+def read_named_table(path: str | PathLike[str]) -> NamedTable:
     """Read a table from CSV: names in the first row and the first column, numbers or empty cells elsewhere.
 
     Args:

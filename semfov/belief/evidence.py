@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.belief.look_features import FEATURES, nothing_seen
+from semfov.belief.look_features import LOOK_FEATURES, nothing_seen
 from semfov.io.pretrained import PretrainedForEye
 
 READOUT = 14
@@ -79,7 +79,7 @@ class Evidence(PretrainedForEye):
         super().__init__()
         self.widths = look_width, readout_width
         self.metadata = dict(metadata or {})
-        self.look = network(FEATURES, look_width)
+        self.look = network(LOOK_FEATURES, look_width)
         self.read = network(READOUT + more, readout_width)
         self.prior = nn.Parameter(torch.zeros(components))
 

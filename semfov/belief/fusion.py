@@ -7,7 +7,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup, values_known
 
-Rule = Callable[[Tensor, Tensor], Tensor]
+_Rule = Callable[[Tensor, Tensor], Tensor]
 
 
 def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
     return beta + scaled / scaled.sum(-1, keepdim=True)
 
 
-RULES: dict[str, Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "sum": sum_scaled}
+RULES: dict[str, _Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "sum": sum_scaled}
 
 
 def check_parameters(beta: Tensor) -> None:
@@ -262,7 +262,7 @@ def _scaled(likelihood: Tensor, covered: Tensor) -> Tensor:
     return scale_likelihood(torch.where(covered.any(-1, keepdim=True), likelihood, 1.0))
 
 
-def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: Rule) -> Tensor:
+def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: _Rule) -> Tensor:
     """`fuse` as one graph, given scaled likelihoods."""
     for number in range(evidence.shape[1]):
         said, covers = evidence[:, number, None], footprint[:, number, :, None]

@@ -7,7 +7,7 @@ from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_shape
 
-FEATURES = 10
+LOOK_FEATURES = 10
 _FLOOR = 1e-6
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import FEATURES, class_features
+from semfov.belief.look_features import LOOK_FEATURES, class_features
 from semfov.detection.detections import Detections
 from semfov.errors import check_whole
 from semfov.io.schema import Field, Number, Pair, Schema, perceptron
@@ -59,7 +59,7 @@ class MapEvidence(Evidence):
 
     schema: ClassVar[Schema] = Schema(
         {
-            **perceptron("look", FEATURES, "L"),
+            **perceptron("look", LOOK_FEATURES, "L"),
             **perceptron("read", READOUT + 1, "R"),
             **perceptron("void", _EMPTINESS, "R"),
             **perceptron("worth", _GAIN, "R"),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import FEATURES, look_features
+from semfov.belief.look_features import LOOK_FEATURES, look_features
 from semfov.detection.detections import Detections
 from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
 
@@ -83,7 +83,7 @@ class TargetEvidence(Evidence):
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
     schema: ClassVar[Schema] = Schema(
         {
-            **perceptron("look", FEATURES, "L"),
+            **perceptron("look", LOOK_FEATURES, "L"),
             **perceptron("read", READOUT, "R"),
             **perceptron("guide", READOUT + 1, "R"),
             **perceptron("judge", _PRESENCE, "R"),

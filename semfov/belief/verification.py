@@ -14,7 +14,7 @@ from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import box_iou
 
-FEATURES = 7
+CLOSER_FEATURES = 7
 """Number of features of a closer look (`closer_features`)."""
 
 MATCHED = 0.3
@@ -51,7 +51,7 @@ class Verification(PretrainedForEye):
     shipped: ClassVar[Path] = Path(__file__).parent / "models" / "verification"
     schema: ClassVar[Schema] = Schema(
         {
-            "linear.weight": Field((2, FEATURES), low=-1e3, high=1e3),
+            "linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3),
             "linear.bias": Field((2,), low=-1e3, high=1e3),
         },
         {"thresholds": THRESHOLDS},
@@ -61,7 +61,7 @@ class Verification(PretrainedForEye):
         super().__init__()
         self.metadata = dict(metadata or {})
         self.thresholds = thresholds
-        self.linear = nn.Linear(FEATURES, 2)
+        self.linear = nn.Linear(CLOSER_FEATURES, 2)
 
     def forward(self, features: Tensor) -> Tensor:
         """Log odds after closer looks.
@@ -139,7 +139,7 @@ def closer_features(
     seen = [0.0] * 4
     if len(boxes):
         score = scores[:, target]
-        best, overlap = match(boxes, score, box)
+        best, overlap = best_detection(boxes, score, box)
         other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
         seen = [
             float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
@@ -149,7 +149,7 @@ def closer_features(
     return box.new_tensor([*before, *seen]).logit(_FLOOR), box
 
 
-def match(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
+def best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
     r"""Find the detection that best shows the target in a box: :math:`m = \arg\max_l s_l o_l`.
 
     Args:

@@ -108,10 +108,10 @@ def fetch_split(
             brought = root / archive.name
             if brought.exists():
                 _verify(brought, archive, f"delete it, and run again to fetch {address}/{archive.path}")
-                unpack(brought, root, members)
+                unpack_members(brought, root, members)
                 continue
-            file = fetch(archive, root / ".download", address=address, pause=pause)
-            unpack(file, root, members)
+            file = fetch_archive(archive, root / ".download", address=address, pause=pause)
+            unpack_members(file, root, members)
             if keep:
                 file.replace(brought)
             else:
@@ -124,7 +124,7 @@ def fetch_split(
         ) from error
 
 
-def fetch(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
+def fetch_archive(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
     """Fetch an archive and verify it; a transfer that breaks off is continued.
 
     Unfinished bytes are kept in `<name>.part`, also from one run to the next. The file itself appears only when it is
@@ -170,7 +170,7 @@ def fetch(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: floa
     return file
 
 
-def unpack(file: Path, root: Path, members: str) -> None:
+def unpack_members(file: Path, root: Path, members: str) -> None:
     """Unpack the members of a zip file whose names begin with `members`, each one atomically.
 
     Files that already have the right content are skipped, so an interrupted run can be continued.

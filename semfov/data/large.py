@@ -17,7 +17,7 @@ from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
 from semfov.data.inputs import ImageLike, as_image, channels_first, pixels_of
-from semfov.data.reduction import FIRST, LARGE, Box, ReducedCopies, bytes_of, reduction_for
+from semfov.data.reduction import FIRST, LARGE, PixelBox, ReducedCopies, bytes_of, reduction_for
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
@@ -34,7 +34,7 @@ class LargePicture(ABC):
     size: tuple[int, int]
 
     @abstractmethod
-    def pixels(self, box: Box) -> NDArray[np.uint8]:
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window.
 
         Args:
@@ -58,7 +58,7 @@ class LargePicture(ABC):
         reduction = reduction_for(int(ratio)) if many else 1
         return reduction if reduction >= FIRST else 1
 
-    def read(self, box: Box, reduction: int = 1) -> Tensor:
+    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
         """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
 
         The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels
@@ -100,7 +100,7 @@ class ArrayPicture(LargePicture):
         self._array = array
         self.size = array.shape[1], array.shape[0]
 
-    def pixels(self, box: Box) -> NDArray[np.uint8]:
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
         x1, y1, x2, y2 = box
         window = self._array[y1:y2, x1:x2]
@@ -160,7 +160,7 @@ class PhotographPicture(LargePicture):
             # Turned upright the picture may have another size, and windows refer to the upright picture.
             self.size = self._whole().shape[1::-1]
 
-    def pixels(self, box: Box) -> NDArray[np.uint8]:
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
         x1, y1, x2, y2 = box
         return self._whole()[y1:y2, x1:x2]
@@ -170,7 +170,7 @@ class PhotographPicture(LargePicture):
         undecoded = self._drafts and self._array is None
         return reduction_for(int(ratio)) if undecoded else super().reduction(ratio)
 
-    def read(self, box: Box, reduction: int = 1) -> Tensor:
+    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
         """Read a window; the whole of a JPEG that is not decoded yet is read as the coarsest draft allowed."""
         whole = box == (0, 0, *self.size)
         if not (whole and reduction > 1 and self._drafts and self._array is None):
@@ -226,12 +226,12 @@ class TiffPicture(LargePicture):
         self._page = page
         self.size = shape[1], shape[0]
 
-    def pixels(self, box: Box) -> NDArray[np.uint8]:
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
         with _opening(self.path, "decoded"):
             return self._tiles(box)
 
-    def _tiles(self, box: Box) -> NDArray[np.uint8]:
+    def _tiles(self, box: PixelBox) -> NDArray[np.uint8]:
         x1, y1, x2, y2 = box
         page = self._page
         wide, high = (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)

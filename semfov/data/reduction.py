@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-Box = tuple[int, int, int, int]
+PixelBox = tuple[int, int, int, int]
 
 LARGE = 1 << 24
 """Pictures with more pixels have copies."""
@@ -80,12 +80,12 @@ class ReducedCopies:
     torch.Size([3, 8, 8])
     """
 
-    def __init__(self, size: tuple[int, int], read: Callable[[Box], NDArray[np.uint8]]) -> None:
+    def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:
         self.size = size
         self._read = read
         self._copies: dict[int, Tensor] = {}
 
-    def window(self, box: Box, reduction: int) -> Tensor:
+    def window(self, box: PixelBox, reduction: int) -> Tensor:
         """Read a window from a copy.
 
         Args:

@@ -56,7 +56,7 @@ class Photograph:
     box: _Box = (0, 0, 0, 0)
 
 
-OBJECTS = (
+PHOTOGRAPHED_OBJECTS = (
     Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
     Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
     Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
@@ -130,10 +130,12 @@ class EmbeddedScenes:
         self.ids = list(range(count))
         self._seed = seed
         self._labels = class_indices(self.classes)
-        known = {photograph.label for photograph in OBJECTS}
+        known = {photograph.label for photograph in PHOTOGRAPHED_OBJECTS}
         some = f"at least one of {', '.join(sorted(known))}"
         check(not known.isdisjoint(self._labels), "classes", some, self.classes)
-        files = sorted({(p.package, p.file) for p in OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES})
+        files = sorted(
+            {(p.package, p.file) for p in PHOTOGRAPHED_OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES}
+        )
         digests = [hashlib.sha256(_path(*file).read_bytes()).hexdigest() for file in files]
         settings = json.dumps([_VERSION, self.classes, count, seed, digests])
         self.fingerprint = hashlib.sha256(settings.encode()).hexdigest()
@@ -211,7 +213,7 @@ class EmbeddedScenes:
 
 def _layout(generator: np.random.Generator) -> list[Item]:
     """Five objects and five distractors, each at a random position in a slot of its own."""
-    photographs = [OBJECTS[i] for i in generator.permutation(len(OBJECTS))[:5]]
+    photographs = [PHOTOGRAPHED_OBJECTS[i] for i in generator.permutation(len(PHOTOGRAPHED_OBJECTS))[:5]]
     photographs += [DISTRACTORS[i] for i in generator.permutation(len(DISTRACTORS))[:5]]
     columns, rows = _SLOTS
     pitch = _SIZE[0] // columns, _SIZE[1] // rows

@@ -1,7 +1,7 @@
 """Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
 
 from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
-from semfov.decision.closer_look import CloserLook
+from semfov.decision.close_up import CloseUp
 from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
 from semfov.decision.rule import (
     NEARLY,
@@ -18,17 +18,17 @@ from semfov.decision.rule import (
     surely,
     verified,
 )
-from semfov.decision.verifier import MOST, Verifier
+from semfov.decision.verifier import MOST_CLOSER, Verifier
 
 __all__ = [
-    "MOST",
+    "MOST_CLOSER",
     "NEARLY",
     "OUTCOMES",
     "SAME",
     "CandidateCells",
     "CandidatePlace",
     "CandidatePlaces",
-    "CloserLook",
+    "CloseUp",
     "Decision",
     "Outcome",
     "Verifier",

@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.verification import closer_features
-from semfov.decision.closer_look import CloserLook
+from semfov.decision.close_up import CloseUp
 from semfov.decision.evidence import cell_of, strength, strongest
 from semfov.decision.rule import place_known
 from semfov.detection.detections import Detections
@@ -24,10 +24,10 @@ SAME = 0.5
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
 _MOST_LOOKS = 1000  # largest number of looks at a stream whose detections are kept
 
-Look = TypeVar("Look")
+LookType = TypeVar("LookType")
 """A look of a search, with what is known after it."""
 
-CloseUp = Callable[[Tensor], Detections]
+LookAt = Callable[[Tensor], Detections]
 """Looks closely at a box `(4,)`; gives the detections, a batch of one (`semfov.Eye.close_up`)."""
 
 
@@ -48,7 +48,7 @@ class CandidatePlace:
     cell: int | None = None
 
 
-class CandidatePlaces(ABC, Generic[Look]):
+class CandidatePlaces(ABC, Generic[LookType]):
     """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
 
     Args:
@@ -59,7 +59,7 @@ class CandidatePlaces(ABC, Generic[Look]):
         self.forgetting = Forgetting() if forgetting is None else forgetting
 
     @abstractmethod
-    def see(self, look: Look) -> None:
+    def see(self, look: LookType) -> None:
         """Take in a look of the search."""
 
     @property
@@ -104,7 +104,7 @@ class CandidatePlaces(ABC, Generic[Look]):
         """
 
     @abstractmethod
-    def record(self, box: Tensor, place: float, presence: float) -> CloserLook:
+    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look.
 
         Args:
@@ -116,7 +116,7 @@ class CandidatePlaces(ABC, Generic[Look]):
             The record.
         """
 
-    def examine(self, candidate: CandidatePlace, close_up: CloseUp) -> tuple[Tensor, Tensor]:
+    def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
         """Look closely at a candidate, and dismiss it.
 
         Args:
@@ -140,11 +140,11 @@ class CandidatePlaces(ABC, Generic[Look]):
     def wait(self) -> None:
         """Let a frame pass."""
 
-    def move(self, look: CloserLook, box: Tensor) -> CloserLook:
+    def move(self, look: CloseUp, box: Tensor) -> CloseUp:
         """The record of a closer look whose target has moved to another box."""
         return replace(look, box=box)
 
-    def probability(self, look: CloserLook) -> float:
+    def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
         raise NotImplementedError(f"{type(self).__name__} has no belief towards which closer looks could fade")
 
@@ -229,9 +229,9 @@ class CandidateCells(CandidatePlaces[Step]):
         covered[candidate.cell] = True
         self._dismissed.append(_Dismissed(self._frame, boxes, covered))
 
-    def record(self, box: Tensor, place: float, presence: float) -> CloserLook:
+    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look, after the last fixation."""
-        return CloserLook(self._step.shift, self.target, cell_of(box, self.grid), box, place, presence)
+        return CloseUp(self._step.shift, self.target, cell_of(box, self.grid), box, place, presence)
 
     def wait(self) -> None:
         """Let a frame pass: drop looks, and list places again, of which less than half the evidence is left."""
@@ -240,11 +240,11 @@ class CandidateCells(CandidatePlaces[Step]):
         self._looks = [(frame, look) for frame, look in self._looks[-_MOST_LOOKS:] if frame >= oldest]
         self._dismissed = [place for place in self._dismissed if place.frame >= oldest]
 
-    def move(self, look: CloserLook, box: Tensor) -> CloserLook:
+    def move(self, look: CloseUp, box: Tensor) -> CloseUp:
         """The record of a closer look whose target has moved to another box, and its cell."""
         return replace(look, box=box, cell=cell_of(box, self.grid))
 
-    def probability(self, look: CloserLook) -> float:
+    def probability(self, look: CloseUp) -> float:
         """Present probability that the target is in the cell of a closer look."""
         return float(self._step.belief.probability(self._target)[0, look.cell])
 

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.belief.verification import MATCHED, Verification, match
-from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, CloseUp, Look
-from semfov.decision.closer_look import CloserLook
+from semfov.belief.verification import MATCHED, Verification, best_detection
+from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
+from semfov.decision.close_up import CloseUp
 from semfov.decision.rule import OUTCOMES, Decision, verified
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.observation.matching import box_iou
 
-MOST = 2
+MOST_CLOSER = 2
 """Default for the largest number of closer looks in a search."""
 
 _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
@@ -29,15 +29,15 @@ class Verdict:
     """What a closer look has shown, some frames ago.
 
     Attributes:
-        look: the closer look; its box and its cell follow the target (`follow`).
+        look: the closer look; its box and its cell follow the target (`follow_target`).
         age: number of frames since then.
     """
 
-    look: CloserLook
+    look: CloseUp
     age: int = 0
 
 
-class Verifier(Generic[Look]):
+class Verifier(Generic[LookType]):
     r"""Decides one search, with closer looks at the places that seem to hold the target.
 
     After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
@@ -56,7 +56,7 @@ class Verifier(Generic[Look]):
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
     place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
     place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
-    and the boxes of the verdicts follow the detections of each look (`follow`).
+    and the boxes of the verdicts follow the detections of each look (`follow_target`).
 
     Args:
         model: gives the probabilities after closer looks.
@@ -84,10 +84,10 @@ class Verifier(Generic[Look]):
     def __init__(
         self,
         model: Verification,
-        places: CandidatePlaces[Look],
-        close_up: CloseUp,
+        places: CandidatePlaces[LookType],
+        close_up: LookAt,
         thresholds: Thresholds | None = None,
-        most: int = MOST,
+        most: int = MOST_CLOSER,
     ) -> None:
         thresholds = model.thresholds if thresholds is None else thresholds
         check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
@@ -100,7 +100,7 @@ class Verifier(Generic[Look]):
         self._last = False
 
     @property
-    def looks(self) -> list[CloserLook]:
+    def looks(self) -> list[CloseUp]:
         """The closer looks, in order."""
         return [verdict.look for verdict in self.verdicts]
 
@@ -110,7 +110,7 @@ class Verifier(Generic[Look]):
         aged = (replace(verdict, age=verdict.age + 1) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
-    def see(self, look: Look, *, last: bool = False) -> None:
+    def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely.
 
         Args:
@@ -122,7 +122,7 @@ class Verifier(Generic[Look]):
             self.verdicts = [self._followed(verdict) for verdict in self.verdicts]
         self._choose(last=last)
 
-    def look(self) -> CloserLook:
+    def look(self) -> CloseUp:
         """Look closely at the candidate, and choose the next one.
 
         Returns:
@@ -219,7 +219,7 @@ class Verifier(Generic[Look]):
         return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
 
     @property
-    def best(self) -> CloserLook:
+    def best(self) -> CloseUp:
         """The closer look with the largest probability of the place; there must be one."""
         return max(zip(self._chances, self.looks, strict=True), key=lambda pair: pair[0])[1]
 
@@ -251,7 +251,9 @@ class Verifier(Generic[Look]):
     def _followed(self, verdict: Verdict) -> Verdict:
         """The verdict at the place to which a look has followed its target."""
         look = verdict.look
-        return replace(verdict, look=self.places.move(look, follow(look.box, self.places.detections, look.target)))
+        return replace(
+            verdict, look=self.places.move(look, follow_target(look.box, self.places.detections, look.target))
+        )
 
     def _recent(self, verdict: Verdict) -> bool:
         """Whether at least half of the evidence of a closer look is left."""
@@ -266,8 +268,8 @@ class Verifier(Generic[Look]):
         return float((weight * odds + (1 - weight) * present).sigmoid())
 
 
-def follow(box: Tensor, seen: Detections, target: int) -> Tensor:
-    """Move the box of a target to the middle of the detection that best shows it (`semfov.belief.verification.match`).
+def follow_target(box: Tensor, seen: Detections, target: int) -> Tensor:
+    """Move the box of a target to the middle of the detection that best shows it (`best_detection`).
 
     The box keeps its size, because a closer look measures it better than a look of the fovea.
 
@@ -287,13 +289,13 @@ def follow(box: Tensor, seen: Detections, target: int) -> Tensor:
     boxes, scores = seen.boxes[0][shown], seen.scores[0][shown, target]
     if not len(boxes):
         return box
-    best, overlap = match(boxes, scores, box)
+    best, overlap = best_detection(boxes, scores, box)
     if float(overlap[best]) < MATCHED:
         return box
     shift = (boxes[best] - box).view(2, 2).mean(0)
     return box + shift.repeat(2)
 
 
-def _same(one: CloserLook, other: CloserLook) -> bool:
+def _same(one: CloseUp, other: CloseUp) -> bool:
     """Whether two closer looks show the same place of a scene that changes."""
     return one.cell == other.cell or float(box_iou(one.box[None], other.box[None])) >= SAME

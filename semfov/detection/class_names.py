@@ -12,7 +12,7 @@ PLACEHOLDERS = ("", "N/A", "__background__")
 """Names of outputs that do not stand for a class: gaps in COCO's category ids, and background."""
 
 
-def named(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
+def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Find the names that stand for a class.
 
     Args:

@@ -11,8 +11,8 @@ from semfov.detection.darknet_layers import Convolution, Head, MaxPool, Route, S
 VERSION = 1
 """Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
 
-OPSET = 17
-IR_VERSION = 8
+_OPSET = 17
+_IR_VERSION = 8
 """IR version from the time of opset 17; some runtimes that could run the model refuse newer versions."""
 
 OUTPUTS = ("boxes", "objectness", "classes")
@@ -172,8 +172,8 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
             list(graph.constants.values()),
         ),
         producer_name="semfov",
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
     )
 
 

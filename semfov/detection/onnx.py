@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.class_names import keep_classes, named
+from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.onnx_file import check_canvas, check_elements
@@ -65,7 +65,7 @@ class OnnxDetector(Detector):
         digest: str = "",
     ) -> None:
         family = HEADS[lookup(head, HEADS, "head")]
-        names, places = named(classes)
+        names, places = named_outputs(classes)
         preprocessing = family.preprocessing if preprocessing is None else preprocessing
         super().__init__(
             name,

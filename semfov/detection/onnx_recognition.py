@@ -25,7 +25,7 @@ DETR_LOGITS = ("logits", "pred_logits")
 
 
 @dataclass(frozen=True)
-class Head:
+class DetectionHead:
     """The head of a family of networks.
 
     Attributes:
@@ -202,22 +202,22 @@ def _rtdetr(outputs: Outputs, canvas: Canvas) -> Candidates:
     return heads.decode_rtdetr_rows(_first(outputs), canvas)
 
 
-HEADS: dict[str, Head] = {
-    "candidates": Head(_candidates),
-    "yolox": Head(
+HEADS: dict[str, DetectionHead] = {
+    "candidates": DetectionHead(_candidates),
+    "yolox": DetectionHead(
         lambda outputs, canvas: heads.decode_yolox(_first(outputs), canvas),
         Preprocessing(channels="bgr", scale=255.0, corner=True),
     ),
-    "yolov5": Head(lambda outputs, canvas: heads.decode_yolov5(_first(outputs))),
-    "yolov8": Head(lambda outputs, canvas: heads.decode_yolov8(_first(outputs))),
-    "picodet": Head(_level_maps, _IMAGENET),
-    "nanodet": Head(_level_maps, _NANODET),
-    "nanodet-plus": Head(_nanodet_plus, _NANODET),
-    "detr": Head(
+    "yolov5": DetectionHead(lambda outputs, canvas: heads.decode_yolov5(_first(outputs))),
+    "yolov8": DetectionHead(lambda outputs, canvas: heads.decode_yolov8(_first(outputs))),
+    "picodet": DetectionHead(_level_maps, _IMAGENET),
+    "nanodet": DetectionHead(_level_maps, _NANODET),
+    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET),
+    "detr": DetectionHead(
         lambda outputs, canvas: heads.decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
         "own",
     ),
-    "rtdetr": Head(_rtdetr, Preprocessing(stretch=True)),
+    "rtdetr": DetectionHead(_rtdetr, Preprocessing(stretch=True)),
 }
 """All known heads by name."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.detection.onnx_file import MOST_BATCH, check_file
 from semfov.errors import DataError, InputError, check
 
-FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
+_FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
 # Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
 EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -88,7 +88,7 @@ class OnnxSession:
         self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
         self.producer: str = meta.producer_name
         for output in self._session.get_outputs():
-            if output.type not in FLOATS:
+            if output.type not in _FLOATS:
                 what = f"{self.path.name}: output {output.name!r}"
                 raise InputError(f"{what}: expected floating-point numbers, got {output.type}")
         self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
@@ -97,7 +97,7 @@ class OnnxSession:
     def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
         """Name, shape and dtype of the image input, and the names of the other inputs."""
         inputs = self._session.get_inputs()
-        images = [i for i in inputs if len(i.shape) == 4 and i.type in FLOATS]
+        images = [i for i in inputs if len(i.shape) == 4 and i.type in _FLOATS]
         found = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
         if len(images) != 1 or _sizes(images[0].shape)[1] not in (3, None):
             raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {found}")
@@ -106,7 +106,7 @@ class OnnxSession:
             raise InputError(
                 f"{self.path.name}: expected no inputs but an image and {', '.join(EXTRA_INPUTS)}, got {found}"
             )
-        return images[0].name, _sizes(images[0].shape), FLOATS[images[0].type], extra
+        return images[0].name, _sizes(images[0].shape), _FLOATS[images[0].type], extra
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients; a model with a fixed batch size runs several times if needed.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection.class_names import keep_classes, named
+from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -63,7 +63,7 @@ class TorchvisionDetector(Detector):
             raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
         outputs, softmax = head
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
-        names, places = named(classes)
+        names, places = named_outputs(classes)
         transform: Any = model.transform
         fixed = transform.fixed_size
         own: BackgroundPolicy = "own" if softmax else "residual"

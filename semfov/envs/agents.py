@@ -22,13 +22,13 @@ from semfov.runs.search_protocol import Episode
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 
-Cells = NDArray[np.int64]
+_Cells = NDArray[np.int64]
 
 
 class Agent(Protocol):
     """Anything that chooses cells `(B,)` from the observations and infos of B episodes."""
 
-    def __call__(self, observations: Any, infos: dict[str, Any]) -> Cells:
+    def __call__(self, observations: Any, infos: dict[str, Any]) -> _Cells:
         """Choose the next cell of every episode."""
 
 

@@ -208,7 +208,7 @@ class CellGazes(Gazes):
         """Gain of the last look, and whether the task is done, each `(n,)`."""
 
 
-class Searches(CellGazes):
+class SearchGazes(CellGazes):
     """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
 
     def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
@@ -271,5 +271,5 @@ class Explorations(CellGazes):
         return count_right(self._all_or(rows).class_probabilities(), answers) / answers.any(-1).sum(-1)
 
 
-GAZES: dict[str, type[CellGazes]] = {"search": Searches, "exploration": Explorations}
+GAZES: dict[str, type[CellGazes]] = {"search": SearchGazes, "exploration": Explorations}
 """Kind of gazes for each task."""

@@ -18,7 +18,7 @@ from semfov.envs.windows import WindowGaze
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 from semfov.errors import InputError, check
 
-Opened = TypeVar("Opened", Scenery, ZoomScenery)
+_Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
 
 PRICES = {"search": 0.05, "exploration": 0.01}
 """Cost of a look by default, for each task."""
@@ -188,7 +188,7 @@ class GazeEnv(EpisodeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        self.scenery = opened(scenery, open_scenery, options, self.task)
+        self.scenery = scenery_or_open(scenery, open_scenery, options, self.task)
         gazes = GAZES[self.task](
             self.scenery,
             price=PRICES[self.task] if price is None else price,
@@ -290,7 +290,7 @@ class ZoomEnv(EpisodeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        self.scenery = opened(scenery, open_zoom_scenery, options)
+        self.scenery = scenery_or_open(scenery, open_zoom_scenery, options)
         gazes = WindowGaze(
             self.scenery,
             self.task,
@@ -340,7 +340,9 @@ class ZoomExplore(ZoomEnv):
     task = "exploration"
 
 
-def opened(scenery: Opened | None, open_it: Callable[..., Opened], options: dict[str, Any], *task: str) -> Opened:
+def scenery_or_open(
+    scenery: _Scenery | None, open_it: Callable[..., _Scenery], options: dict[str, Any], *task: str
+) -> _Scenery:
     """Take the scenery that is given, or open one; raises an error if both a scenery and options are given."""
     expected = f"no options of `{open_it.__name__}` beside it"
     check(scenery is None or not options, "scenery", expected, ", ".join(options))

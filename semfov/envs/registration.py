@@ -15,10 +15,10 @@ from semfov.errors import lookup
 
 IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
 
-Action = Literal["cell", "window"]
+_Action = Literal["cell", "window"]
 """Kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
 
-KINDS: dict[str, dict[str, type[Any]]] = {
+_KINDS: dict[str, dict[str, type[Any]]] = {
     "cell": {"search": GazeSearch, "exploration": GazeExplore},
     "window": {"search": ZoomSearch, "exploration": ZoomExplore},
 }
@@ -37,15 +37,15 @@ def register() -> None:
             gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})
 
 
-def make(task: str, action: Action = "cell", **options: Any) -> EpisodeEnv:
+def make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
     """Make an environment; options of `GazeEnv`, or of `ZoomEnv` where actions are windows."""
-    env: EpisodeEnv = KINDS[lookup(action, KINDS, "action")][task](**options)
+    env: EpisodeEnv = _KINDS[lookup(action, _KINDS, "action")][task](**options)
     return env
 
 
-def make_vector(task: str, num_envs: int = 1, action: Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
+def make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
     """Make environments side by side; options of `GazeVectorEnv`, or of `ZoomEnv` where actions are windows."""
-    if lookup(action, KINDS, "action") == "cell":
+    if lookup(action, _KINDS, "action") == "cell":
         return GazeVectorEnv(task, num_envs, **options)
     # Single environments with shared looks, since a belief about windows is about one picture.
     mode = AutoresetMode(options.pop("autoreset_mode", AutoresetMode.NEXT_STEP))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.envs.cells import GAZES
-from semfov.envs.environment import PRICES, opened
+from semfov.envs.environment import PRICES, scenery_or_open
 from semfov.envs.gazes import Arrays
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
@@ -71,7 +71,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         mode = AutoresetMode(lookup(str(name), modes, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
         self.num_envs, self.task = num_envs, task
-        self.scenery = opened(scenery, open_scenery, options, task)
+        self.scenery = scenery_or_open(scenery, open_scenery, options, task)
         self.gazes = GAZES[task](
             self.scenery,
             num_envs,

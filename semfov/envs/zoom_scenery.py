@@ -17,7 +17,7 @@ from semfov.data.sources import PHOTOGRAPHS
 from semfov.envs.scenery import Source
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.runs.config import DataConfig, DetectorConfig
-from semfov.runs.window_looking import SHOWN, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.window_looking import LEAST_CONFIDENCE, WindowLooking, WindowLookingConfig, found_in
 from semfov.zoom.glances import Glance, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -147,7 +147,7 @@ class ZoomScenery:
             Whether it was found.
         """
         if not self.known:
-            return any(float(glance.show[target - 1]) >= SHOWN for glance in looks)
+            return any(float(glance.show[target - 1]) >= LEAST_CONFIDENCE for glance in looks)
         return bool(found_in(looks, self._of(scene, target), target).any())
 
     def share(self, looks: Sequence[Glance], scene: int) -> float:
@@ -161,7 +161,7 @@ class ZoomScenery:
             From 0 to 1; the number of objects found where there are no annotations.
         """
         if not self.known:
-            return float(len(merge(looks, None, score=SHOWN)))
+            return float(len(merge(looks, None, score=LEAST_CONFIDENCE)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
     def boxes(self, scene: int, target: int) -> Tensor:

@@ -13,13 +13,13 @@ import yaml
 from semfov.agent import ActivePerception
 from semfov.errors import InputError
 from semfov.fit.detector_parts.workshop import Workshop
-from semfov.fit.detector_report import class_counts, next_commands, report
+from semfov.fit.detector_report import class_counts, detector_report, next_commands
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.looking import Looking, looking_of
-from semfov.runs.progress import Whole
+from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import detector_options, plain
 from semfov.runs.workers import available_cores, rank
@@ -105,7 +105,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     config = shop.config
     missing = class_counts(run, range(len(run.scenes)))
     _tell(missing)
-    with Whole("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
+    with WholeBar("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
         if rank() > 0:
@@ -114,7 +114,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
             with whole.stage(part):
                 shop.fit(part)
     path = manifest_of(config, run, shop).write(config.out)
-    text = report(config, run, shop.parts, time.monotonic() - started)
+    text = detector_report(config, run, shop.parts, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))

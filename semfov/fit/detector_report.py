@@ -33,7 +33,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
     return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
 
 
-def report(config: FitDetectorConfig, run: Looking, parts: dict[str, Fitted], seconds: float) -> str:
+def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Fitted], seconds: float) -> str:
     """Write the report as Markdown.
 
     Args:

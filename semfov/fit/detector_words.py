@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from semfov.fit.held_out import Array, Difference
+from semfov.fit.held_out import Difference
 from semfov.gaze.policies import Task
-from semfov.metrics.averages import standard_error
+from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.tables import percent, table
 
 
@@ -28,12 +28,12 @@ def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
     )
 
 
-def mean_percent(values: Array) -> str:
+def mean_percent(values: FloatArray) -> str:
     """Format the mean of shares `(P,)` in percent, with its standard error."""
     return percent(float(values.mean()), float(standard_error(values)))
 
 
-def share(value: float) -> str:
+def percent_of(value: float) -> str:
     """Format a share in percent."""
     return f"{100 * value:.1f}"
 
@@ -43,7 +43,7 @@ def section(text: str, rows: list[list[str]]) -> str:
     return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
 
 
-def curves_figure(curves: dict[str, Array], task: Task) -> Any:
+def curves_figure(curves: dict[str, FloatArray], task: Task) -> Any:
     """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
     from semfov.viz import plot_cumulative_performance, plot_success_rate
 

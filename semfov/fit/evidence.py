@@ -79,13 +79,13 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
-    model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
-    judged, model.thresholds = judge(config, model, examples[held_out], grid)
+    model = train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
+    judged, model.thresholds = judge_evidence(config, model, examples[held_out], grid)
     counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, report(judged, model.thresholds, *counts))
+    return Fit(model, judged, *counts, evidence_report(judged, model.thresholds, *counts))
 
 
-def train(
+def train_evidence(
     config: FitSearchConfig, examples: Examples, grid: Grid, metadata: dict[str, object], components: int
 ) -> TargetEvidence:
     """Train the model on searches that it makes itself. Some of their fixations are random.
@@ -113,7 +113,7 @@ def train(
         loss = chosen.score.new_zeros(())
         for step in searches(model, chosen, grid, config.looks, astray, generator):
             if step.shift + 1 in (1, *counted):
-                loss = loss + objective(config, step, chosen.goal)
+                loss = loss + evidence_objective(config, step, chosen.goal)
         return loss
 
     descend(model.parameters(), loss_of, config.steps, config.rate)
@@ -143,7 +143,7 @@ def searches(
     return rollout(ExampleLooks(examples, grid), observer, TargetPosterior(1), start, choice, most=looks)
 
 
-def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
+def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
     r"""Compute the training loss after a look.
 
     .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
@@ -185,7 +185,7 @@ def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def judge(
+def judge_evidence(
     config: FitSearchConfig, model: TargetEvidence, examples: Examples, grid: Grid
 ) -> tuple[list[dict[str, float]], Thresholds]:
     """Evaluate the model on held-out searches and choose its thresholds.
@@ -294,7 +294,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
     return chosen
 
 
-def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
+def evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
     """Report the evaluation and the thresholds as Markdown."""
     head = [
         "looks",

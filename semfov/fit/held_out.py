@@ -10,14 +10,13 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms
 from semfov.episode import Step, StoredLooks
-from semfov.metrics.averages import standard_error
+from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import answers_of, success_rate
 from semfov.metrics.search import cumulative_performance
 from semfov.runs.candidates import Candidate
@@ -29,7 +28,6 @@ from semfov.runs.search_protocol import choose_classes, episodes_of, run_episode
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
 
-Array = NDArray[np.float64]
 Ways = Mapping[str, Strategy]
 """Strategies for a task, by their names in reports."""
 
@@ -56,7 +54,7 @@ class Difference:
     photographs: int
 
     @classmethod
-    def of(cls, fitted: Array, raw: Array) -> Difference:
+    def of(cls, fitted: FloatArray, raw: FloatArray) -> Difference:
         """Compute the paired difference of two measures `(P,)`, with one value for each photograph."""
         paired = np.asarray(fitted, dtype=np.float64) - np.asarray(raw, dtype=np.float64)
         return cls(float(paired.mean()), float(standard_error(paired)), len(paired))
@@ -69,7 +67,7 @@ class Difference:
 
 def search_curves(
     run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
-) -> dict[str, Array]:
+) -> dict[str, FloatArray]:
     """Measure the cumulative performance of search strategies on every photograph with a target.
 
     Args:
@@ -83,7 +81,7 @@ def search_curves(
         For each strategy the curve of each photograph, `(P, shifts+1)`.
     """
     columns, rows = run.config.belief.columns, run.config.belief.rows
-    curves: dict[str, list[Array]] = {name: [] for name in ways}
+    curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
     for index in track(scenes, "searching", "scene"):
         targets = legal_targets(run.scenes.annotation(index), max_area)
         episodes = episodes_of(run.scenes, index, columns, rows, protocol, targets)
@@ -109,7 +107,7 @@ def search_curves(
 
 def explore_curves(
     run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
-) -> dict[str, dict[str, Array]]:
+) -> dict[str, dict[str, FloatArray]]:
     """Measure the share of cells that exploration strategies classify correctly.
 
     The answer for a cell may be background, which is correct if the cell contains no object.
@@ -124,7 +122,7 @@ def explore_curves(
         Curves `(P, shifts+1)` of each strategy: under `objects` over the cells with objects (the published success
         rate), and under `all` over all cells.
     """
-    curves: dict[str, dict[str, list[Array]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
+    curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
     for index in track(scenes, "exploring", "scene"):
         grid = run.grid(index)
         answers = answers_of(run.scenes.annotation(index), grid, len(run.scenes.classes) + 1)

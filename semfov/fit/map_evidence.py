@@ -26,7 +26,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.tables import table
 
-JUDGED = (1, 2, 3, 5, 10, 15)
+_JUDGED = (1, 2, 3, 5, 10, 15)
 """Numbers of looks after which a map is evaluated."""
 
 
@@ -76,11 +76,11 @@ def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
         model = MapEvidence(components=len(run.scenes.classes) + 1, metadata=metadata)
     with torch.no_grad():
         model.prior.copy_(frequencies(run, config.holdout))
-    train(config, model, examples[~held_out], grid)
+    train_map(config, model, examples[~held_out], grid)
     train_gain(config, model, examples[~held_out], grid)
-    judged = judge(config, model.eval(), examples[held_out], grid)
+    judged = judge_map(config, model.eval(), examples[held_out], grid)
     counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, report(judged, *counts))
+    return Fit(model, judged, *counts, map_report(judged, *counts))
 
 
 def frequencies(run: Looking, holdout: int) -> Tensor:
@@ -103,7 +103,7 @@ def frequencies(run: Looking, holdout: int) -> Tensor:
     return ((count + 1) / (cells + 2)).logit() / 4 + 1
 
 
-def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+def train_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
     """Train on explorations that follow the model. Some of their fixations are random."""
     generator = torch.Generator().manual_seed(config.seed)
 
@@ -113,7 +113,7 @@ def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
         loss = chosen.score.new_zeros(())
         for step in explorations(model, chosen, grid, max(counted), config.astray, generator):
             if step.shift + 1 in (1, *counted):
-                loss = loss + objective(step, chosen)
+                loss = loss + map_objective(step, chosen)
         return loss
 
     descend(model.parameters(), loss_of, config.steps, config.rate)
@@ -142,7 +142,7 @@ def explorations(
     return rollout(MapExampleLooks(examples, grid), observer, CloserLook(grid), start, choice, most=looks)
 
 
-def objective(step: Step, examples: MapExamples) -> Tensor:
+def map_objective(step: Step, examples: MapExamples) -> Tensor:
     """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
 
     A class that was drawn at random counts as often as the number of classes that it represents.
@@ -199,7 +199,7 @@ def right(step: Step, answers: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
+def judge_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
     """Evaluate the model on held-out explorations.
 
     Args:
@@ -209,14 +209,14 @@ def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
         grid: the grid of cells.
 
     Returns:
-        The measures after each number of looks in `JUDGED`.
+        The measures after each number of looks in `_JUDGED`.
     """
     generator = torch.Generator().manual_seed(config.seed)
     judged = []
     answers = examples.answers
     some = ~answers[..., 0]
     before: tuple[Tensor, Tensor] | None = None
-    for step in explorations(model, examples, grid, max(JUDGED), 0.0, generator):
+    for step in explorations(model, examples, grid, max(_JUDGED), 0.0, generator):
         belief = step.belief
         assert isinstance(belief, MapBelief)
         p, now = belief.probabilities, right(step, answers)
@@ -226,7 +226,7 @@ def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
             distance = examples.distance[torch.arange(len(examples)), step.cell][:, None]
             known, was = before
             gained = float(known.sum(-1).mean()), float((now - was).sum(-1).mean())
-        if step.shift + 1 in JUDGED:
+        if step.shift + 1 in _JUDGED:
             judged.append(
                 {
                     "looks": step.shift + 1,
@@ -245,7 +245,7 @@ def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
     return judged
 
 
-def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
+def map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
     """Report the evaluation as Markdown."""
     head = [
         "looks",

@@ -5,10 +5,12 @@ from torch import Tensor
 
 from semfov.data.scene import Scenes
 from semfov.observation import MissCounts
-from semfov.runs.samples import Cells, Samples
+from semfov.runs.samples import CellsOfLook, Samples
 
 
-def count_misses(photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: Cells) -> MissCounts:
+def count_misses(
+    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: CellsOfLook
+) -> MissCounts:
     """Count cells without any detection over all looks at some photographs.
 
     Args:

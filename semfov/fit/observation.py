@@ -14,7 +14,7 @@ from semfov.observation import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.samples import Samples, SampleSettings, collect
+from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.workers import rank
 from semfov.runs.zoom_samples import MosaicSettings
 from semfov.zoom.eye import WindowEye
@@ -25,7 +25,7 @@ def fit_fom(config: FitObservationConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     kind = MosaicSettings if config.mosaics else SampleSettings
     settings = kind.of(config)
-    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
     held_out = samples.scene % config.holdout == 0
@@ -71,12 +71,12 @@ def fit_model(config: FitObservationConfig, sampler: Looker, samples: Samples) -
         The model.
     """
     if config.method != "discriminative":
-        return published_model(config, sampler, samples, config.method)
-    start = published_model(config, sampler, samples, "newton", expected="empirical")
+        return fit_published(config, sampler, samples, config.method)
+    start = fit_published(config, sampler, samples, "newton", expected="empirical")
     return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
-def published_model(
+def fit_published(
     config: FitObservationConfig,
     sampler: Looker,
     samples: Samples,
@@ -132,9 +132,9 @@ def fit_all(
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
-        models[f"Dirichlet, {method}"] = published_model(config, sampler, samples, method)
-    models["Dirichlet with class prior"] = published_model(config, sampler, samples, "newton", prior=True)
-    models["the same, tempered 0.1"] = published_model(config, sampler, samples, "newton", prior=True, tempering=0.1)
+        models[f"Dirichlet, {method}"] = fit_published(config, sampler, samples, method)
+    models["Dirichlet with class prior"] = fit_published(config, sampler, samples, "newton", prior=True)
+    models["the same, tempered 0.1"] = fit_published(config, sampler, samples, "newton", prior=True, tempering=0.1)
     if config.method == "discriminative":
         models["discriminative"] = model
     return models

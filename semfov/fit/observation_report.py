@@ -25,13 +25,13 @@ from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 
-Models = dict[str, FovealObservationModel]
+_Models = dict[str, FovealObservationModel]
 
 
 def write_report(
     config: FitObservationConfig,
     model: FovealObservationModel,
-    models: Models,
+    models: _Models,
     samples: Samples,
     held_out: torch.Tensor,
 ) -> list[Path]:
@@ -60,7 +60,7 @@ def write_report(
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    write_text(config.out / "manifest.json", json.dumps(manifest(model, figures), indent=2) + "\n")
+    write_text(config.out / "manifest.json", json.dumps(fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
     write_text(config.out / "counts.csv", counts_csv(model))
     figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
@@ -168,7 +168,7 @@ def counts_csv(model: FovealObservationModel) -> str:
     return text.getvalue()
 
 
-def manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
+def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
     """Record the command, the commit, the versions and the model that the measures come from."""
     known = {key: value for key, value in model.metadata.items() if key != "counts"}
     return {

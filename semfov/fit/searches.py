@@ -17,13 +17,13 @@ from semfov.belief.observers import Observer, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
 from semfov.decision import CandidateCells, CandidatePlaces, cell_of, conclude, decide
-from semfov.decision.candidates import Look
+from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
-from semfov.runs.looks import Box, photograph_looks
+from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.search_protocol import choose_classes
@@ -31,7 +31,7 @@ from semfov.runs.seeds import generator_for
 from semfov.runs.store import DetectionStore
 
 
-class TargetSearch(ABC, Generic[Look]):
+class TargetSearch(ABC, Generic[LookType]):
     """Base of the searches for a class in a picture, with all their looks but the closer ones.
 
     Decisions do not move the gaze, so all of them can be made along the same looks.
@@ -59,7 +59,7 @@ class TargetSearch(ABC, Generic[Look]):
         """Number of looks."""
 
     @abstractmethod
-    def look(self, index: int, number: int) -> Look:
+    def look(self, index: int, number: int) -> LookType:
         """Return a look.
 
         Args:
@@ -71,7 +71,7 @@ class TargetSearch(ABC, Generic[Look]):
         """
 
     @abstractmethod
-    def candidates(self) -> CandidatePlaces[Look]:
+    def candidates(self) -> CandidatePlaces[LookType]:
         """Make the source of places to look at closely."""
 
     @abstractmethod
@@ -125,7 +125,7 @@ class SearchTarget:
         return bool(self.goal.any())
 
 
-class Photograph:
+class SearchedPhotograph:
     """A photograph with the classes to search for, and all looks at it so far.
 
     Args:
@@ -152,7 +152,7 @@ class Photograph:
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
         self.grid, self.targets, self.store, self.everywhere = grid, targets, store, everywhere
-        self.looks: RememberedLooks[int | Box, Detections] = RememberedLooks(
+        self.looks: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
             lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
         )
         self._image: Tensor | None = None
@@ -190,7 +190,7 @@ class PhotographLooks(Looks):
         target: class 1..K that is searched for.
     """
 
-    def __init__(self, photograph: Photograph, target: int) -> None:
+    def __init__(self, photograph: SearchedPhotograph, target: int) -> None:
         self.photograph, self.grid, self.target = photograph, photograph.grid, target
         self.like = photograph.grid.centres
 
@@ -200,7 +200,7 @@ class PhotographLooks(Looks):
         return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
 
 
-def photographs(
+def open_photographs(
     eye: Eye,
     scenes: Scenes,
     chosen: Sequence[int],
@@ -213,7 +213,7 @@ def photographs(
     store: DetectionStore | None = None,
     spare: int = 0,
     everywhere: Callable[[int], Detections] | None = None,
-) -> list[Photograph]:
+) -> list[SearchedPhotograph]:
     """Draw classes to search for in photographs.
 
     Args:
@@ -232,7 +232,7 @@ def photographs(
     Returns:
         The photographs with classes to search for.
     """
-    found: list[Photograph] = []
+    found: list[SearchedPhotograph] = []
     for index in chosen:
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
@@ -252,12 +252,12 @@ def photographs(
             for number, target in enumerate(wide)
         )
         if targets:
-            found.append(Photograph(eye, scenes, index, len(found), grid, wanted, store, everywhere))
+            found.append(SearchedPhotograph(eye, scenes, index, len(found), grid, wanted, store, everywhere))
     return found
 
 
-def search(
-    photograph: Photograph,
+def search_photograph(
+    photograph: SearchedPhotograph,
     target: SearchTarget,
     observer: Observer,
     looks: int,
@@ -293,10 +293,12 @@ class PhotographSearch(TargetSearch[Step]):
 
     after = (1, 3, 5, 8, 12)
 
-    def __init__(self, photograph: Photograph, target: SearchTarget, evidence: TargetEvidence, looks: int) -> None:
+    def __init__(
+        self, photograph: SearchedPhotograph, target: SearchTarget, evidence: TargetEvidence, looks: int
+    ) -> None:
         super().__init__(photograph.number, target.target, present=target.present, spare=target.spare)
         self.photograph, self.goal = photograph, target.goal
-        self._search = lambda: search(photograph, target, Target(evidence), looks)
+        self._search = lambda: search_photograph(photograph, target, Target(evidence), looks)
 
     @cached_property
     def steps(self) -> list[Step]:
@@ -338,7 +340,7 @@ class PhotographSearch(TargetSearch[Step]):
 
 
 def photograph_searches(
-    seen: Sequence[Photograph], evidence: TargetEvidence, looks: int, title: str
+    seen: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
 ) -> Iterator[PhotographSearch]:
     """Search photographs for all their classes; after the searches of a photograph, its looks are stored and freed.
 

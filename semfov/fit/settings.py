@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from semfov.runs.config import DataConfig, OutcomeConfig, SensorConfig, WorkConfig
-from semfov.runs.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Side, SingleName
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class NameConfig(Settings):
         name: name of the model (None: the detector's name).
     """
 
-    name: Name | None = None
+    name: SingleName | None = None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from semfov.fit.settings import FovealFitConfig
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import WorkConfig
 from semfov.runs.progress import track
-from semfov.runs.samples import Sampler, Samples, SampleSettings, collect
+from semfov.runs.samples import Sampler, Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
@@ -69,12 +69,12 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
     settings = SampleSettings.of(config)
-    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
     model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
-    text = report(hits)
+    text = tempering_report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
@@ -193,7 +193,7 @@ def hit_rate(
     return float(share.mean()) if len(share) else None
 
 
-def report(hits: dict[float, dict[str, float]]) -> str:
+def tempering_report(hits: dict[float, dict[str, float]]) -> str:
     """Report the hit rates of every exponent and the best exponent as Markdown."""
     best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
     rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]

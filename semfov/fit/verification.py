@@ -11,20 +11,20 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.belief.verification import FEATURES, Verification
+from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
-from semfov.fit.searches import Photograph, TargetSearch, photograph_searches, photographs
+from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FovealFitConfig, NameConfig
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.config import DataConfig
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Positive, Range, Share, Side
 from semfov.runs.setup import make_eye, make_scenes, make_target_evidence
 from semfov.runs.store import cell_store
-from semfov.runs.tables import mean, share, table
+from semfov.runs.tables import mean_or_dash, share, table
 
 LEVELS = tuple(number / 100 for number in range(50, 100))
 """Values from which the threshold `confirm` is chosen."""
@@ -39,7 +39,7 @@ _EACH = 3  # places examined after some looks
 _LEAST = 0.03  # least probability of these places
 _RIDGE = 1e-4
 
-SHOWN = (0.5, 0.6, 0.7, 0.8, 0.9)
+_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
 """Values of the threshold `confirm` in the table, besides the chosen one."""
 
 SearchEnd = tuple[bool | None, int]
@@ -171,8 +171,8 @@ def fit_verification(config: FitVerificationConfig) -> None:
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
     size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
-    store = cell_store(cache_folder(config.cache) / "searches", eye.settings(), *size, components)
-    seen = photographs(
+    store = cell_store(store_folder(config.cache) / "searches", eye.settings(), *size, components)
+    seen = open_photographs(
         eye,
         scenes,
         chosen,
@@ -187,12 +187,12 @@ def fit_verification(config: FitVerificationConfig) -> None:
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
-    text, figures = report(fitted, f"{len(seen)} photographs")
+    text, figures = verification_report(fitted, f"{len(seen)} photographs")
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
 def fit_in_folds(
-    seen: Sequence[Photograph],
+    seen: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
     config: FitVerificationConfig,
     prior: Verification | None = None,
@@ -366,7 +366,7 @@ def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) 
         raise DataError(f"data: expected closer looks in all folds but one, got {len(phi)}; give more photographs")
     goal = torch.stack([closer.right, closer.present], -1)[chosen].double()
     mean, scale = phi.mean(0), phi.std(0).clamp(min=1e-6)
-    centre, level = torch.zeros(2, FEATURES, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    centre, level = torch.zeros(2, CLOSER_FEATURES, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     weights, biases = _RIDGE, 0.0
     if prior is not None:
         given = prior.linear.weight.detach().double()
@@ -401,7 +401,7 @@ def shipped_mean() -> Verification:
     return model.eval().requires_grad_(False)
 
 
-def report(
+def verification_report(
     fitted: VerificationResult,
     pictures: str,
     how: str = "Each photograph is evaluated with a model fitted to other folds.",
@@ -444,7 +444,7 @@ def report(
     chosen = fitted.model.thresholds.confirm
     decisions = [["confirm", "found, there", "found, not there", "place right", "looks, there", "looks, not there"]]
     decisions.append(["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])])
-    for confirm in sorted({*SHOWN, chosen}):
+    for confirm in sorted({*_THRESHOLDS, chosen}):
         mark = " (chosen)" if confirm == chosen else ""
         ended = [each.found(confirm) for each in searches]
         decisions.append([f"{confirm:.2f}{mark}", *_row(there.tolist(), ended)])
@@ -481,6 +481,6 @@ def _row(present: Sequence[bool], ended: Sequence[SearchEnd]) -> list[str]:
         of_kind = [each for each, there in zip(ended, present, strict=True) if there == kind]
         found = [right for right, _ in of_kind if right is not None]
         shares.append(share(len(found), len(of_kind)))
-        looks.append(mean([end for _, end in of_kind]))
+        looks.append(mean_or_dash([end for _, end in of_kind]))
         places += found
     return [*shares, share(sum(places), len(places)), *looks]

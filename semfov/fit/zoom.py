@@ -16,13 +16,13 @@ from semfov.fit.outputs import training_of, write_outputs
 from semfov.fit.zoom_choice import choose_foresight, choose_patience, open_all
 from semfov.fit.zoom_decision import fit_judge, judge_searches, search_mosaics
 from semfov.fit.zoom_examples import ZoomExample, example_of, windows_of
-from semfov.fit.zoom_presence import fit_presence, pair_windows, presence_loss, presence_of
+from semfov.fit.zoom_presence import fit_presence, pair_windows, presence_log_odds, presence_loss
 from semfov.fit.zoom_rates import fit_rates, rate_loss
-from semfov.fit.zoom_settings import FitZoomConfig, Part
+from semfov.fit.zoom_settings import FitZoomConfig, RefitPart
 from semfov.fit.zoom_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.zoom_verification import fit_closer
 from semfov.io.files import inside
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.workers import available_cores, run_tasks
@@ -40,13 +40,13 @@ VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", 
 SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
 
-JUDGED = ("judged", "judged far", "judged crowded")
+_JUDGED = ("judged", "judged far", "judged crowded")
 """Mosaics of held-out photographs on which foresight is chosen."""
 
 _log = logging.getLogger(__name__)
 
 
-def make_eye(config: FitZoomConfig) -> WindowEye:
+def make_window_eye(config: FitZoomConfig) -> WindowEye:
     """Make the eye that looks at the mosaics."""
     return WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
 
@@ -77,16 +77,16 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
 
 def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
     """Open the store of looks at mosaics."""
-    return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+    return GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
 
 _process: dict[str, Any] = {}
 
 
-def prepare_process(config: FitZoomConfig) -> None:
+def prepare_fit_process(config: FitZoomConfig) -> None:
     """Build the eye, the mosaics and the store once in this process."""
     prepare_worker()
-    eye = make_eye(config)
+    eye = make_window_eye(config)
     _process.update(eye=eye, mosaics=make_mosaics(config, eye.detector.classes), store=make_store(config, eye))
 
 
@@ -107,17 +107,17 @@ def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    eye = make_eye(config)
+    eye = make_window_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
     store = make_store(config, eye)
     parts: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey", "verification"}
+    refit: set[RefitPart] = set(config.refit) if config.evidence else {"decision", "survey", "verification"}
     examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
     if config.evidence is None:
         model = fit_looks(config, eye, mosaics, examples)
-        text, figures = judge(model, examples["judged"])
+        text, figures = judge_windows(model, examples["judged"])
         tried = choose_patience(model, eye, mosaics["judged"], store)
         parts += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
     else:
@@ -126,7 +126,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     if "survey" in refit:
         measured = survey_again(config, model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
-        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in JUDGED}, store)
+        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
         parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
@@ -153,7 +153,7 @@ def look_at_all(
     looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
-    for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
+    for _ in run_tasks(look, todo, workers=workers, setup=prepare_fit_process, settings=(config,), title="looking",
                        unit="mosaic"):  # fmt: skip
         pass
     prepare_worker()
@@ -236,7 +236,7 @@ def fit_decision(
 
 
 @torch.no_grad()
-def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
+def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
     """Evaluate the model on held-out mosaics.
 
     Args:
@@ -253,7 +253,7 @@ def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str
         figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
         figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
     slots = first[windows.slot[first]]
-    odds, shown = presence_of(model, windows, slots), windows.shown[slots]
+    odds, shown = presence_log_odds(model, windows, slots), windows.shown[slots]
     passes: dict[str, list[int]] = defaultdict(list)
     for mosaic in windows.mosaic[slots].unique():
         here = windows.mosaic[slots] == mosaic

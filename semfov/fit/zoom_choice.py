@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.runs.window_looking import SHOWN, found_in
+from semfov.runs.window_looking import LEAST_CONFIDENCE, found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -130,7 +130,7 @@ def mean_passes(model: GlimpseEvidence, glances: Sequence[Glances], slots: Seque
     """
     counts = []
     for looks, photographs in zip(glances, slots, strict=True):
-        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= SHOWN
+        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= LEAST_CONFIDENCE
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
             path = look_for(looks, model, target, slices=photographs)
             counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))

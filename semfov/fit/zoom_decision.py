@@ -26,7 +26,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.facts import SearchFacts
 from semfov.zoom.search import look_for
 
-JUDGED = (1, 4, 8, 16)
+_JUDGED = (1, 4, 8, 16)
 """Numbers of looks after which the probability of presence is evaluated."""
 
 
@@ -156,7 +156,7 @@ def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -
     # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
     model.thresholds = chosen.changed(place=0.0)
     rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
-    for number in (each for each in (*JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
+    for number in (each for each in (*_JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
         presence = BinarySums.of(anywhere[:, number - 1], there)
         raw = BinarySums.of(searches.best[:, number - 1], there)
         area = area_under_roc(anywhere[:, number - 1], there) if bool(there.any() and not there.all()) else float("nan")

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.zoom_examples import ZoomExample
-from semfov.runs.window_looking import SHOWN
+from semfov.runs.window_looking import LEAST_CONFIDENCE
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.networks import STEPS
 
@@ -61,7 +61,7 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
                 if look.level > 0 and before < 0:
                     continue
                 slot = closer.window.within is not None
-                rows.append((pooled, summary, steps, closer.show >= SHOWN, before, slot, number))
+                rows.append((pooled, summary, steps, closer.show >= LEAST_CONFIDENCE, before, slot, number))
     columns: list[Any] = [*zip(*rows, strict=True)]
     whole = [torch.tensor(columns[place]) for place in (2, 4, 5, 6)]
     return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
@@ -93,12 +93,12 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
 
 
 def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the mean cross-entropy of `presence_of` over rows and classes."""
-    odds = presence_of(model, windows, rows)
+    """Compute the mean cross-entropy of `presence_log_odds` over rows and classes."""
+    odds = presence_log_odds(model, windows, rows)
     return F.binary_cross_entropy_with_logits(odds, windows.shown[rows].to(odds))
 
 
-def presence_of(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
+def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
     """Compute the log-odds that closer looks show each class.
 
     Args:
@@ -114,6 +114,6 @@ def presence_of(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tenso
         training = model.training
         model.eval()
         with torch.no_grad():
-            before = presence_of(model, windows, windows.before[rows])
+            before = presence_log_odds(model, windows, windows.before[rows])
         model.train(training)
     return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)

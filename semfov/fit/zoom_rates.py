@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.fit.zoom_examples import LookedAt, ZoomExample, closer_windows
-from semfov.runs.window_looking import SHOWN
+from semfov.runs.window_looking import LEAST_CONFIDENCE
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.gist import Gist
@@ -83,7 +83,10 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
         The mean over looks, a scalar.
     """
     shown = torch.stack([look.show for look in example.looks]).amax(0)
-    sure, faint = (shown >= SHOWN).nonzero()[:, 0] + 1, ((shown >= 0.02) & (shown < SHOWN)).nonzero()[:, 0] + 1
+    sure, faint = (
+        (shown >= LEAST_CONFIDENCE).nonzero()[:, 0] + 1,
+        ((shown >= 0.02) & (shown < LEAST_CONFIDENCE)).nonzero()[:, 0] + 1,
+    )
     targets = torch.cat([_some(sure, 8), _some(faint, 4)])
     if not len(targets):
         targets = _some(torch.arange(len(shown)) + 1, 1)

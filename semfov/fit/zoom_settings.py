@@ -7,9 +7,9 @@ from typing import Literal
 from semfov.fit.settings import FitConfig
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.settings import Count, Share
-from semfov.runs.window_looking import Tile
+from semfov.runs.window_looking import TileSize
 
-Part = Literal["decision", "survey", "verification"]
+RefitPart = Literal["decision", "survey", "verification"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
     crowded: Count = 240
     judged: Count = 80
     judged_far: Count = 4
-    tile: Tile = 480
+    tile: TileSize = 480
     searched: Count = 50
     sought: Count = 4
     passes: Count = 24
@@ -63,7 +63,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
     lost: Share = 0.02
     place: Share = 0.2
     evidence: Path | None = None
-    refit: tuple[Part, ...] = ("decision", "verification")
+    refit: tuple[RefitPart, ...] = ("decision", "verification")
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300

@@ -13,7 +13,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.decision import SAME, settle
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import VerificationResult, choose_confirm, examine, fit, report, verify
+from semfov.fit.verification import VerificationResult, choose_confirm, examine, fit, verification_report, verify
 from semfov.fit.zoom_decision import searches_of
 from semfov.observation.matching import box_iou
 from semfov.runs.zoom_store import StoredGlances
@@ -199,4 +199,4 @@ def fit_closer(
         looks.save()
     how = f"The model was fitted to {len(known.fold)} closer looks at mosaics of other photographs."
     pictures = f"{len(opened['judged'])} mosaics of held-out photographs"
-    return report(VerificationResult(fitted, [fitted], held_out, decisions), pictures, how)[0]
+    return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), pictures, how)[0]

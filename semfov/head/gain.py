@@ -13,7 +13,7 @@ from semfov.belief.observers.base import own
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
 from semfov.head.speeds import Speeds
-from semfov.head.views import SIDE, Views
+from semfov.head.views import CELL_POINTS, Views
 
 FORESIGHT = 0.5
 """Weight of the gain in sharpness over the cells of a view (`SearchGain`)."""
@@ -29,7 +29,7 @@ OUT = -1e6
 """Value of actions that must not be chosen."""
 
 
-class Gain(nn.Module, ABC):
+class LookGain(nn.Module, ABC):
     """Base of the expected gains of a look.
 
     Args:
@@ -51,7 +51,7 @@ class Gain(nn.Module, ABC):
         """
 
 
-class SearchGain(Gain):
+class SearchGain(LookGain):
     r"""Probability that a look finds the target, plus a weighted gain in sharpness over the cells of the view.
 
     .. math:: G(h, f) = P(t \in f) + c \sum_x |x| \, P(t \in x) \, [a(d_{h,f}(x)) - a(d^*(x))]_+
@@ -95,7 +95,7 @@ class SearchGain(Gain):
         return gains
 
 
-class ExploreGain(Gain):
+class ExploreGain(LookGain):
     r"""Expected number of additional cells of the scene that are classified correctly after a look, weighted by area.
 
     .. math:: G(h, f) = \sum_{x \text{ seen}} |x| \, E[\Delta \mid f](x) + u \sum_{x \text{ not}} |x| \, a(d_{h,f}(x))
@@ -122,8 +122,8 @@ class ExploreGain(Gain):
         super().__init__(views)
         self.model, self.unseen = model, unseen
         self._acuity = [views.acuity(distance) for distance in views.distances]
-        third = torch.tensor([SIDE // 5, SIDE // 2, SIDE - 1 - SIDE // 5])
-        self._landings = (third[:, None] * SIDE + third).flatten()
+        third = torch.tensor([CELL_POINTS // 5, CELL_POINTS // 2, CELL_POINTS - 1 - CELL_POINTS // 5])
+        self._landings = (third[:, None] * CELL_POINTS + third).flatten()
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
         """Gains `(A,)`, in cells of average area; the lowest value where the eye does not land."""
@@ -166,7 +166,7 @@ class PerPrice(AcquisitionFunction):
     400
     """
 
-    def __init__(self, gain: Gain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
+    def __init__(self, gain: LookGain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
         super().__init__()
         self.gain, self.speeds, self.action = gain, speeds, action
         tiling = chain.from_iterable(chain.from_iterable(gain.views.tiling))
@@ -202,7 +202,7 @@ class Scan(AcquisitionFunction):
     2
     """
 
-    def __init__(self, gain: Gain, order: Sequence[int], dwell: int, action: int) -> None:
+    def __init__(self, gain: LookGain, order: Sequence[int], dwell: int, action: int) -> None:
         super().__init__()
         self.gain, self.order, self.dwell, self.action = gain, order, dwell, action
 

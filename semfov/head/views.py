@@ -13,12 +13,12 @@ from semfov.errors import check
 from semfov.head.speeds import Speeds
 from semfov.head.world import World
 
-SIDE = 10
+CELL_POINTS = 10
 """Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class VisibleCells:
     """Cells of the scene that a view shows.
 
     Attributes:
@@ -75,8 +75,8 @@ class Views:
             self.tiling.append([row[::2] for row in numbers[::2]])
         self.poses = torch.stack(poses)
         wide, high = world.size
-        self.view_grid = Grid(SIDE, SIDE, (wide, high))
-        self.grid = Grid(SIDE, SIDE * len(poses), (wide, high * len(poses)))
+        self.view_grid = Grid(CELL_POINTS, CELL_POINTS, (wide, high))
+        self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.cell_of(self.gaze)
         self.seen = [self._seen(pose) for pose in self.poses]
@@ -85,9 +85,9 @@ class Views:
         """Number of poses."""
         return len(self.poses)
 
-    def _seen(self, pose: Tensor) -> Seen:
+    def _seen(self, pose: Tensor) -> VisibleCells:
         points, inside = self.world.to_view(self.world.centres, pose)
-        return Seen(inside.nonzero()[:, 0], points[inside])
+        return VisibleCells(inside.nonzero()[:, 0], points[inside])
 
     @property
     def cells(self) -> int:
@@ -122,7 +122,7 @@ class Views:
         Returns:
             `(C, V)`, by bilinear interpolation.
         """
-        image = values.unflatten(-1, (SIDE, SIDE))[None]
+        image = values.unflatten(-1, (CELL_POINTS, CELL_POINTS))[None]
         place = self.places(pose)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 

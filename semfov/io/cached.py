@@ -6,14 +6,14 @@ from pathlib import Path
 from torch import Tensor
 
 from semfov.io.schema import Schema
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 
 _KIND = "cached-tensors"
 
 
 def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
     """Write tensors atomically, with a checksum, the key of the inputs they depend on, and the name of their file."""
-    write(path, tensors, {"kind": _KIND, "key": key, "file": path.name})
+    write_file(path, tensors, {"kind": _KIND, "key": key, "file": path.name})
 
 
 def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str, Tensor] | None:

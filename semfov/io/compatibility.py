@@ -28,7 +28,7 @@ _FIT = "use that value, ActivePerception.raw with any sensor, or fit models for 
 _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 
-def recommended(detector: str, growth: float) -> str:
+def recommended_model(detector: str, growth: float) -> str:
     """Name the observation model that is shipped for a detector with a sensor of this growth.
 
     Args:
@@ -82,7 +82,7 @@ def check_background(fitted: Mapping[str, Any], background: str | None, what: st
         )
 
 
-def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
+def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
     """Raise `InputError` where the weights or the background policy differ; warn where another setting differs."""
     if not detector or not fitted:
         return

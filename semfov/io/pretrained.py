@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Self
 from torch import Tensor, nn
 
 from semfov.errors import DataError, InputError, check
-from semfov.io.compatibility import check_detector, check_grid, check_sensor
+from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import METADATA, Schema, Text
-from semfov.io.storage import checksum, find, read, write
+from semfov.io.storage import checksum, find, read, write_file
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")
@@ -56,7 +56,7 @@ class Pretrained(nn.Module):
             path: the file.
         """
         record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
-        write(path, self._tensors(), record)
+        write_file(path, self._tensors(), record)
 
     def digest(self) -> str:
         """Checksum of everything that results depend on: tensors, and the values that are needed to make the model.
@@ -110,5 +110,5 @@ class PretrainedForEye(Pretrained):
         """
         if grid is not None:
             check_grid(self.metadata.get("training", {}), grid, self.title)
-        check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
         check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)

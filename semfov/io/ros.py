@@ -20,7 +20,7 @@ _CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": 
 _BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 
 
-class Seen(Protocol):
+class DetectionTensors(Protocol):
     """The tensors of `semfov.Detections`."""
 
     @property
@@ -73,7 +73,7 @@ def header(stamp: Any, frame: str) -> Values:
 
 
 def detection_array(
-    detections: Seen, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
+    detections: DetectionTensors, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
 ) -> Values:
     """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes.
 

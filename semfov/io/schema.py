@@ -20,7 +20,7 @@ Size = int | str
 Sizes = dict[str, int]
 """The numbers that names of sizes stand for, as far as they are known."""
 
-FLOATS = (torch.float32, torch.float64)
+_FLOATS = (torch.float32, torch.float64)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Field:
         shape = ", ".join(str(size) for size in self.shape)
         known = ", ".join(f"{key} = {value}" for key, value in sizes.items())
         check(fits, name, f"shape ({shape})" + (f" with {known}" if known else ""), tuple(tensor.shape))
-        types = FLOATS if self.dtype is None else (self.dtype,)
+        types = _FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
         if not tensor.numel() or not self.finite:
             return

@@ -18,7 +18,7 @@ _KEY = "semfov"
 _CHECKSUM = "sha256"
 
 
-def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
+def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
     """Write tensors and a record of JSON values to a file atomically; the same content gives the same bytes.
 
     Args:
@@ -41,7 +41,7 @@ def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapp
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file that `write` made, and verify its checksum; nothing in the file is executed.
+    """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed.
 
     Args:
         path: the file.

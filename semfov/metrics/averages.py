@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
-def standard_error(values: Array, axis: int = 0) -> Array:
+def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
     r"""Standard error of the mean along one axis.
 
     .. math:: \mathrm{SE} = \sqrt{\frac{1}{n (n - 1)} \sum_i (x_i - \bar x)^2}

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
@@ -73,7 +73,7 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
     return (best & answers).any(-1) & (best.sum(-1) == 1)
 
 
-def success_rate(right: Sequence[int], cells: int) -> Array:
+def success_rate(right: Sequence[int], cells: int) -> _Array:
     """Fraction of the cells with objects whose most probable class is correct, after each gaze shift.
 
     Args:

@@ -5,10 +5,10 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
-def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> Array:
+def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> _Array:
     """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
 
     Args:
@@ -26,7 +26,7 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> Array:
     return np.asarray(found.mean(-2), dtype=np.float64)
 
 
-def random_search(targets: int, shifts: int, cells: int = 100) -> Array:
+def random_search(targets: int, shifts: int, cells: int = 100) -> _Array:
     r"""Probability that random search without return has hit one of `targets` cells after 0..`shifts` gaze shifts.
 
     The start is not a target cell, so n gaze shifts draw n of the other N = `cells - 1` cells, of which m are targets:

@@ -328,7 +328,7 @@ class FovealObservationModel(Pretrained):
         fitted = self.metadata.get("detector", {})
         compatibility.check_classes(self.classes, classes, self.title)
         compatibility.check_background(fitted, background, self.title)
-        compatibility.check_detector(fitted, eye["detector"], self.title)
+        compatibility.check_same_detector(fitted, eye["detector"], self.title)
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
     def _record(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, check_finite, check_shape
 from semfov.io.schema import Field, Number, Schema
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 
 # Sums are integers in units of 2^-32. Integers add exactly, so any order and any split of the samples give the same
 # bits.
@@ -146,7 +146,7 @@ class DirichletStatistics:
             record: JSON values to save with the statistics.
         """
         own = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": FRACTION_BITS}
-        write(path, {"count": self.count, "sums": self.sums}, {**record, **own})
+        write_file(path, {"count": self.count, "sums": self.sums}, {**record, **own})
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> tuple[Self, dict[str, Any]]:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
-from semfov.decision import CloserLook, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.paths.drawing import drawn_by
+from semfov.paths.drawing import drawing_of
 from semfov.paths.endings import FIXATIONS, Ending, sentence
 from semfov.paths.files import Format
 
@@ -75,7 +75,7 @@ class Record(ABC):
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
-        return str(drawn_by("notebook", type(self))(self))
+        return str(drawing_of("notebook", type(self))(self))
 
     @abstractmethod
     def rows(self) -> list[dict[str, Any]]:
@@ -137,7 +137,7 @@ class GazeRecord(Record):
 
     detections: tuple[Detections, ...]
     found: bool = False
-    closer: tuple[CloserLook, ...] = ()
+    closer: tuple[CloseUp, ...] = ()
     ending: Ending | None = None
     seconds: tuple[Any, ...] = ()
 
@@ -182,7 +182,7 @@ class GazeRecord(Record):
         Raises:
             InputError: the picture was not kept, and none is given.
         """
-        figure: Figure = drawn_by("plot", type(self))(self, ax=ax, **options)
+        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
         return figure
 
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:

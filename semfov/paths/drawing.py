@@ -17,6 +17,6 @@ def draws(name: str, kind: type, function: Callable[..., Any]) -> None:
     _drawing[name, kind] = function
 
 
-def drawn_by(name: str, kind: type) -> Callable[..., Any]:
+def drawing_of(name: str, kind: type) -> Callable[..., Any]:
     """The function registered under this name for a kind of records, or for its nearest base class."""
     return next(_drawing[name, each] for each in kind.__mro__ if (name, each) in _drawing)

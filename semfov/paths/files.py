@@ -10,11 +10,11 @@ from typing import Any, Self, get_args
 import torch
 from torch import Tensor
 
-from semfov.decision import CloserLook, Decision, Outcome
+from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Size, Text
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 from semfov.paths.endings import Ending
 from semfov.version import __version__
 
@@ -129,10 +129,10 @@ class Format:
                 whole["box"] = decision.box
         if fields["closer"]:
             whole["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
-        write(path, whole, values)
+        write_file(path, whole, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-        """Read a file that `write` wrote, and check it.
+        """Read a file that `write_file` wrote, and check it.
 
         Args:
             path: the file.
@@ -175,7 +175,7 @@ class Format:
             "found": record["found"],
             "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
             "closer": tuple(
-                CloserLook(**{"fixation": None, "cell": None} | look, box=box)
+                CloseUp(**{"fixation": None, "cell": None} | look, box=box)
                 for look, box in zip(closer, boxes, strict=True)
             ),
             "ending": record.get("ending"),

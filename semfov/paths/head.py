@@ -30,7 +30,7 @@ _WORLD = {
     "degree": POSITIVE,
 }
 
-FORMAT = Format.of(
+_FORMAT = Format.of(
     "head path",
     {
         "actions": Field(("n",), dtype=torch.int64, low=0),
@@ -77,7 +77,7 @@ class HeadPath(GazeRecord):
     seconds: tuple[float, ...]
     maps: Tensor
 
-    _format = FORMAT
+    _format = _FORMAT
 
     @property
     def turns(self) -> int:

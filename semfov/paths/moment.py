@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.decision import CloserLook
+from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.paths.base import Record, detections_in_words
 
@@ -50,7 +50,7 @@ class Moment(Record):
     visited: Tensor
     next_cell: int
     seconds: dict[str, float]
-    closer: CloserLook | None = None
+    closer: CloseUp | None = None
 
     @property
     def probability(self) -> Tensor:

@@ -15,7 +15,7 @@ from semfov.episode import STAGES
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
 from semfov.paths.base import GazeRecord, detections_in_words
-from semfov.paths.drawing import drawn_by
+from semfov.paths.drawing import drawing_of
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
 from semfov.paths.stimulus import Stimulus
 
@@ -41,7 +41,7 @@ _SETTINGS = Object(
 _PLACEMENT = {"size": pair(POSITIVE), "scale": pair(POSITIVE), "offset": pair(WHOLE)}
 _OPTIONAL = ("posterior", "presence")
 
-FORMAT = Format.of(
+_FORMAT = Format.of(
     "scanpath",
     {
         "cells": Field(("n",), dtype=torch.int64, low=0),
@@ -105,7 +105,7 @@ class Scanpath(GazeRecord):
     seconds: tuple[Mapping[str, float], ...] = ()
     stimulus: Stimulus | None = None
 
-    _format = FORMAT
+    _format = _FORMAT
 
     def __len__(self) -> int:
         """Number of fixations, the start included."""
@@ -189,7 +189,7 @@ class Scanpath(GazeRecord):
         Raises:
             InputError: the photograph was not kept.
         """
-        return drawn_by("animate", type(self))(self, path, **options)
+        return drawing_of("animate", type(self))(self, path, **options)
 
     def rows(self) -> list[dict[str, Any]]:
         """The episode as a table of plain values, one row for each fixation.

@@ -33,7 +33,7 @@ _LATTICE = {
 }
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
-FORMAT = Format.of(
+_FORMAT = Format.of(
     "zoom path",
     {
         "values": Field(("n",), mixed=True, finite=False),
@@ -88,7 +88,7 @@ class ZoomPath(GazeRecord):
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
-    _format = FORMAT
+    _format = _FORMAT
     _sentences = WINDOWS
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semfov.viz.curves import highlighted, others_named
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 640, 380
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 20, 16, 66
@@ -18,7 +18,7 @@ _COLOURS = 7
 _DASHES = ("", "9 5", "3 4", "12 4 3 4")
 
 
-def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label: str) -> str:
+def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], label: str) -> str:
     """Curves over gaze shifts as an SVG, in percent, with bands of one standard error and a legend.
 
     Of more than seven curves the legend names some, as in `semfov.viz`; the others are grey.

@@ -9,7 +9,7 @@ from semfov.zoom.gist import FOUND
 WIDTH = 480
 """Width of the drawing in pixels of the screen."""
 
-MOST = 500
+_MOST = 500
 """Largest number of objects that are drawn; the most confident ones are."""
 
 
@@ -31,7 +31,7 @@ def path_html(path: ZoomPath) -> str:
         at = f'x="{window[0] + 3 * unit:.0f}" y="{window[1] + 11 * unit:.0f}"'
         shapes.append(f'<text {at} font-size="{10 * unit:.0f}" fill="#0072b2">{number}</text>')
     sure = path.objects.above(FOUND)
-    for box, label, score in zip(sure.boxes.tolist()[:MOST], sure.labels.tolist(), sure.scores.tolist(), strict=False):
+    for box, label, score in zip(sure.boxes.tolist()[:_MOST], sure.labels.tolist(), sure.scores.tolist(), strict=False):
         shapes.append(_rect(box, "#d55e00", unit, f"<title>{escape(path.classes[label])} {score:.2f}</title>"))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     return f"<div>{escape(path.summary())}<br>{drawing}</div>"

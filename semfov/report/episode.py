@@ -15,7 +15,7 @@ from torch import Tensor
 from semfov.detection.placement import resize
 from semfov.paths import Scanpath, sensor_in_words
 from semfov.viz.belief import class_posterior
-from semfov.viz.labels import Box, place_labels
+from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import entropy
 
 Data = dict[str, Any]
@@ -205,7 +205,7 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
 
 
 def tagged(
-    detections: list[Data], texts: Sequence[str], frame: tuple[float, float], taken: Sequence[Box] = ()
+    detections: list[Data], texts: Sequence[str], frame: tuple[float, float], taken: Sequence[LabelBox] = ()
 ) -> list[Data]:
     """Detections with `tag`, the rectangle of their text.
 

@@ -27,7 +27,7 @@ NUMBER = (
 )
 """What values mean where objects are counted (`semfov.zoom.policy.best_find`)."""
 
-PROBABILITY = (
+_PROBABILITY = (
     "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
     "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
     "is the probability, before it, that the target is at the place."
@@ -52,7 +52,7 @@ def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> st
     head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
     looks = "".join(_look(data, number, pool, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
-    value = PROBABILITY if data["decided"] else NUMBER
+    value = _PROBABILITY if data["decided"] else NUMBER
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '

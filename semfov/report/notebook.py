@@ -14,7 +14,7 @@ from semfov.viz.head import plot_head_path
 from semfov.viz.scanpath import plot_scanpath
 from semfov.viz.zoom import plot_zoom_path
 
-MOST = 3_000_000
+MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
 
 HEIGHT = 760
@@ -23,7 +23,7 @@ HEIGHT = 760
 FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
 """Widths in pixels and JPEG qualities of the pictures; the first pair that fits is taken."""
 
-_MAPS = MOST // 4
+_MAPS = MOST_CHARACTERS // 4
 """Largest number of bytes of the probability maps."""
 
 
@@ -50,7 +50,7 @@ def notebook_html(scanpath: Scanpath) -> str:
                 scanpath, scanpath.image, views, pool, name=name, classes=classes, width=width, quality=quality
             )
             frame = framed(page_html(f"semfov: {scanpath.describe()}", [data], pool), scanpath.describe())
-            if len(frame.encode()) <= MOST:
+            if len(frame.encode()) <= MOST_CHARACTERS:
                 return frame
     words = escape(repr(scanpath))
     return f"<pre>{words}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 
-OPACITY = 0.82
+_OPACITY = 0.82
 """Opacity over the photograph of colours that do not stand for probabilities."""
 
 
@@ -71,8 +71,8 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
         "colours": {
             "time": colour_steps(TIME),
             "overlay": colour_steps(overlay_colours()),
-            "probability": colour_steps(PROBABILITY, OPACITY),
-            "uncertainty": colour_steps(UNCERTAINTY, OPACITY),
+            "probability": colour_steps(PROBABILITY, _OPACITY),
+            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
     parts = {

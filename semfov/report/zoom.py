@@ -17,7 +17,7 @@ from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects
 
-Frame = tuple[int, int, int, int]
+_Frame = tuple[int, int, int, int]
 
 DRAWN = 500
 """Largest number of objects that are drawn in the picture."""
@@ -157,7 +157,7 @@ def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture
     }
 
 
-def _detections(path: ZoomPath, glance: Glance, frame: Frame) -> list[Data]:
+def _detections(path: ZoomPath, glance: Glance, frame: _Frame) -> list[Data]:
     """Detections of a look, those of the target first, with boxes and labels in pixels of the window."""
     x1, y1, x2, y2 = frame
     rows = []
@@ -177,13 +177,13 @@ def _detections(path: ZoomPath, glance: Glance, frame: Frame) -> list[Data]:
     return [*tagged(kept[:SHOWN], numbers, (x2 - x1, y2 - y1)), *kept[SHOWN:]]
 
 
-def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int]) -> Frame:
+def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int]) -> _Frame:
     """A window in whole pixels, with at least one pixel, inside the picture."""
     x1, y1 = (min(max(round(low), 0), most - 1) for low, most in zip(box[:2], size, strict=True))
     x2, y2 = (min(max(round(high), low + 1), most) for high, low, most in zip(box[2:], (x1, y1), size, strict=True))
     return x1, y1, x2, y2
 
 
-def _pixels(source: LargePicture, frame: Frame, across: int) -> Any:
+def _pixels(source: LargePicture, frame: _Frame, across: int) -> Any:
     """Pixels `(3, h, w)` of a window in [0, 1]; very large windows are read at a coarser resolution."""
     return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255

@@ -17,7 +17,7 @@ from semfov.errors import SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.runs.settings import check_settings
 
-Config = TypeVar("Config")
+_Config = TypeVar("_Config")
 
 _GOES_ON = "give the same command again to continue"
 _SAID: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
@@ -62,8 +62,8 @@ def _formatter() -> Any:
 
 
 def run_command(
-    main: Callable[[Config], None],
-    config: type[Config],
+    main: Callable[[_Config], None],
+    config: type[_Config],
     description: str | None,
     arguments: Sequence[str] | None = None,
     *,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import Memory
+from semfov.belief.observers import CellMemory
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import lookup
@@ -18,7 +18,7 @@ from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
-Context = Literal["none", "place", "cooccurrence", "both"]
+ContextKind = Literal["none", "place", "cooccurrence", "both"]
 Scores = Literal["raw", "calibrated", "learned"]
 
 
@@ -169,12 +169,12 @@ class BeliefConfig(Settings):
     fusion: Literal["kaplan", "product", "sum"] = "kaplan"
     footprint: Footprint = "overlap"
     tempering: Positive = 1.0
-    memory: Memory = "all"
+    memory: CellMemory = "all"
     misses: bool = False
     model: str | None = None
     target_model: str | None = None
     map_model: str | None = None
-    context: Context = "none"
+    context: ContextKind = "none"
     context_model: str = "coco"
 
 
@@ -220,10 +220,10 @@ class PolicyConfig(Settings):
     scores: Scores = "raw"
     tempering: Positive | None = None
     footprint: Footprint | None = None
-    memory: Memory | None = None
+    memory: CellMemory | None = None
     misses: bool | None = None
     saliency: SaliencyModel | None = None
-    context: Context | None = None
+    context: ContextKind | None = None
     context_model: str | None = None
 
 

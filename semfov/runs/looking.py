@@ -10,8 +10,8 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
 from semfov.runs.remembered import look_everywhere
-from semfov.runs.results import Record
-from semfov.runs.scene_run import SceneRun, cache_folder
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store
 
@@ -39,7 +39,7 @@ class Looking(SceneRun):
         if not len(self.scenes):
             raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
         size, components = (config.belief.columns, config.belief.rows), len(self.scenes.classes) + 1
-        self.store = cell_store(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *size, components)
         self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
@@ -72,7 +72,7 @@ class Looking(SceneRun):
         image, digest = (lambda: self.scenes[index].image[None]), (lambda: self.digest(index))
         return look_everywhere(self.eye, image, self.grid(index), store, digest)
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Look at a scene; there are no episodes, so there are no records."""
         self.detections(index)
         return [], {}

@@ -12,10 +12,10 @@ from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.eye import Eye, View
 
-Box = tuple[float, ...]
+BoxKey = tuple[float, ...]
 """`(x1, y1, x2, y2)`."""
 
-SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
+LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
 
 
@@ -50,7 +50,7 @@ def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
         return Detections.stack([eye.look(view, point[None]) for point in points])
 
 
-def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | Box], Detections]:
+def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | BoxKey], Detections]:
     """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
 
     Args:
@@ -63,7 +63,7 @@ def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Calla
     """
     view: View | None = None
 
-    def look(action: int | Box) -> Detections:
+    def look(action: int | BoxKey) -> Detections:
         nonlocal view
         if isinstance(action, tuple):
             return tight(eye.close_up(image(), torch.tensor(action)))

@@ -14,7 +14,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import store_folder
 
 
 class PolicyLooking(Looking):
@@ -46,7 +46,7 @@ class PolicyLooking(Looking):
             name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
             for name, policy in self.policies.items()
         }
-        folder, sensor = cache_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
+        folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
         size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
             name: SaliencyStore(folder, name, config.saliency, sensor, size)

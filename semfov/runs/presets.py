@@ -7,18 +7,24 @@ from types import MappingProxyType
 from typing import get_args
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import Memory
+from semfov.belief.observers import CellMemory
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
-from semfov.runs.config import Context, PolicyConfig, SaliencyModel, Scores
+from semfov.runs.config import ContextKind, PolicyConfig, SaliencyModel, Scores
 
 TARGET_EVIDENCE = "target-evidence"
 SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
+WORDS = {
+    "scores": Scores,
+    "footprint": Footprint,
+    "memory": CellMemory,
+    "saliency": SaliencyModel,
+    "context": ContextKind,
+}
 """Settings with a fixed set of values."""
 
-ALIASES = ("recommended", "published")
+_ALIASES = ("recommended", "published")
 """Presets that have another name in tables, like those of `MAXIMUM_A_POSTERIORI`."""
 
 MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
@@ -27,7 +33,7 @@ MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
 """Settings of the map of all classes."""
 
-Choice = str | PolicyConfig
+PolicyChoice = str | PolicyConfig
 """A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
 
 
@@ -84,7 +90,7 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
     return MappingProxyType({**alone, **both, **same})
 
 
-def resolve(choice: Choice, task: Task) -> PolicyConfig:
+def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     """The settings of a policy.
 
     Args:
@@ -126,7 +132,7 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
     return choice
 
 
-def label(choice: Choice, task: Task) -> str:
+def label(choice: PolicyChoice, task: Task) -> str:
     """The name of a policy in tables: the preset that it is based on, and the settings that differ from it.
 
     Args:
@@ -143,7 +149,7 @@ def label(choice: Choice, task: Task) -> str:
     names = {
         preset: name
         for name, preset in presets(task).items()
-        if name not in ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
+        if name not in _ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
     }
     alone = settings.saliency if table_of(settings) == "saliency" else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]

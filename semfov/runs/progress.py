@@ -9,9 +9,9 @@ from typing import Any, Protocol, TypeVar
 
 from tqdm import tqdm
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
-_whole: ContextVar[Whole | None] = ContextVar("whole", default=None)
+_whole: ContextVar[WholeBar | None] = ContextVar("whole", default=None)
 
 
 class Bar(Protocol):
@@ -27,7 +27,7 @@ class Bar(Protocol):
         """End the task."""
 
 
-class Whole:
+class WholeBar:
     """One bar for several stages of different duration, each of which consists of tasks.
 
     While it is open, `track` and `task_bar` move this bar instead of opening a bar for each task.
@@ -80,7 +80,7 @@ class Whole:
         self._at = max(self._at, to)
         self._bar.update(min(self.done, 1.0) - self._bar.n)
 
-    def __enter__(self) -> Whole:
+    def __enter__(self) -> WholeBar:
         self._token = _whole.set(self)
         return self
 
@@ -90,9 +90,9 @@ class Whole:
 
 
 class _Task:
-    """A task that moves the bar of a `Whole`."""
+    """A task that moves the bar of a `WholeBar`."""
 
-    def __init__(self, whole: Whole, step: float) -> None:
+    def __init__(self, whole: WholeBar, step: float) -> None:
         self._whole, self._step = whole, step
 
     def update(self, n: float = 1) -> None:
@@ -106,7 +106,7 @@ class _Task:
 
 
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
-    """A bar for a task; if a `Whole` is open, the task moves its bar instead.
+    """A bar for a task; if a `WholeBar` is open, the task moves its bar instead.
 
     Args:
         total: number of units of the task.
@@ -125,7 +125,7 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Ba
     return shown
 
 
-def track(items: Iterable[Item], title: str, unit: str) -> Iterator[Item]:
+def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:
     """Iterate over items and show a bar that moves with them (`task_bar`)."""
     listed = list(items)
     bar = task_bar(len(listed), title, unit)

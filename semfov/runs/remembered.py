@@ -10,10 +10,10 @@ from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
 from semfov.runs.looks import one_thread, photograph_looks
-from semfov.runs.store import Action, DetectionStore, Look, LookStore
+from semfov.runs.store import Action, DetectionStore, LookStore, StoredLook
 
 
-class RememberedLooks(Generic[Action, Look]):
+class RememberedLooks(Generic[Action, StoredLook]):
     """Looks at one scene by action, each made once: read from a store, or computed when it is first asked for.
 
     Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
@@ -27,24 +27,24 @@ class RememberedLooks(Generic[Action, Look]):
 
     def __init__(
         self,
-        open_scene: Callable[[], Callable[[Action], Look]],
-        store: LookStore[Action, Look] | None = None,
+        open_scene: Callable[[], Callable[[Action], StoredLook]],
+        store: LookStore[Action, StoredLook] | None = None,
         digest: Callable[[], str] = lambda: "",
     ) -> None:
         self._open, self._store, self._digest = open_scene, store, digest
-        self._look: Callable[[Action], Look] | None = None
-        self._looks: dict[Action, Look] | None = None
+        self._look: Callable[[Action], StoredLook] | None = None
+        self._looks: dict[Action, StoredLook] | None = None
         self._stored = 0
 
     @property
-    def looks(self) -> dict[Action, Look]:
+    def looks(self) -> dict[Action, StoredLook]:
         """All looks so far, by action."""
         if self._looks is None:
             self._looks = {} if self._store is None else self._store.load(self._digest())
             self._stored = len(self._looks)
         return self._looks
 
-    def __call__(self, action: Action) -> Look:
+    def __call__(self, action: Action) -> StoredLook:
         """Look, or remember."""
         looks = self.looks
         if action not in looks:

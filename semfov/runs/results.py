@@ -11,11 +11,11 @@ from typing import Any
 from semfov.io.files import check_regular, write_text
 from semfov.io.schema import is_number
 
-Record = dict[str, Any]
+ResultRecord = dict[str, Any]
 """The stored outcome of an episode, made of JSON values."""
 
 
-class Parts:
+class SceneResults:
     """Outcomes of finished scenes, one file each.
 
     Args:
@@ -47,7 +47,7 @@ class Parts:
             return None
         return part if whole and formed else None
 
-    def save(self, index: int, records: list[Record], seconds: dict[str, float]) -> None:
+    def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
         """Store the outcomes of a scene."""
         verified = {"key": self.key, "sha256": self._sha256(index, records, seconds)}
         write_text(self.path(index), json.dumps({**verified, "records": records, "seconds": seconds}))

@@ -18,12 +18,12 @@ from semfov.runs.looks import one_thread
 from semfov.runs.store import SceneStore, looks_digest
 from semfov.sensor import Sensor
 
-Model = Callable[[Tensor], Tensor]
+SaliencyMap = Callable[[Tensor], Tensor]
 
-SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
+_SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
 """Modules that saliency depends on, in addition to those of a look."""
 
-SALIENCY_MODELS: dict[str, Callable[[], Model]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
+SALIENCY_CLASSES: dict[str, Callable[[], SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
 
 class SaliencyStore(SceneStore):
@@ -49,7 +49,7 @@ class SaliencyStore(SceneStore):
         }
         cells = grid[0] * grid[1]
         schema = Schema({"saliency": Field(("F", cells), low=0)})
-        super().__init__(folder, what, looks_digest(*SOURCES), schema)
+        super().__init__(folder, what, looks_digest(*_SOURCES), schema)
         self.fixations = cells if saliency.view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:
@@ -81,13 +81,15 @@ def saliency_table(
     Returns:
         `(X·Y, X·Y)`, a row for the view from the centre of each cell, or `(1, X·Y)` for the whole photograph.
     """
-    model = SALIENCY_MODELS[name]()
+    model = SALIENCY_CLASSES[name]()
     with one_thread(), torch.inference_mode():
         if saliency.view == "picture":
-            return cells_of(model, image[None], grid, saliency)
+            return saliency_of_cells(model, image[None], grid, saliency)
         state, fixations = seen_by(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
-        return torch.cat([cells_of(model, sensor.look(state, point[None]), grid, saliency) for point in fixations])
+        return torch.cat(
+            [saliency_of_cells(model, sensor.look(state, point[None]), grid, saliency) for point in fixations]
+        )
 
 
 def seen_by(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
@@ -98,6 +100,6 @@ def seen_by(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> 
     return sensor.open(resize(image[None], size), ratio.new_ones(2)), (points + 0.5) * ratio - 0.5
 
 
-def cells_of(model: Model, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
+def saliency_of_cells(model: SaliencyMap, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
     """Saliency of the cells of pictures `(B, 3, h, w)`, `(B, X·Y)`."""
     return cell_saliency(model(pictures), grid.columns, grid.rows, saliency.reduction)

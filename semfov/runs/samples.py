@@ -115,7 +115,7 @@ class Samples:
 _DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
 _NAMES = (*_DETECTIONS, "scenes", "fixations")
 
-SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")
+_SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")
 """Modules that samples depend on, in addition to those of a look."""
 
 
@@ -151,12 +151,12 @@ class SampleSettings:
         return Sampler(self, folder)
 
 
-Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
+CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 """Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
 `(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
-def cells_of(columns: int, rows: int) -> Cells:
+def whole_photograph(columns: int, rows: int) -> CellsOfLook:
     """A grid over whole photographs: every look shows all cells, at their distances from the fixation."""
 
     def cells(size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
@@ -179,7 +179,7 @@ class Sampler:
         coordinates: number of coordinates of a fixation.
     """
 
-    sources: ClassVar[tuple[str, ...]] = SOURCES
+    sources: ClassVar[tuple[str, ...]] = _SOURCES
     coordinates: ClassVar[int] = 2
 
     def __init__(self, settings: SampleSettings, folder: Path) -> None:
@@ -211,8 +211,8 @@ class Sampler:
         return eye, make_scenes(self.settings.data, eye.detector.classes)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """The cells in which misses are counted (`Cells`)."""
-        return cells_of(10, 10)(size, fixation)
+        """The cells in which misses are counted (`CellsOfLook`)."""
+        return whole_photograph(10, 10)(size, fixation)
 
     @property
     def foveal_eye(self) -> Eye:
@@ -271,7 +271,7 @@ def _run_shard(shard: int) -> int:
     return shard
 
 
-def collect(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
+def collect_samples(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
     """Collect the labelled detections of all photographs in order; finished shards are read, the others computed.
 
     The result is the same to the last bit for any number of workers and ranks.

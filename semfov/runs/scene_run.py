@@ -17,7 +17,7 @@ from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
-from semfov.runs.results import Parts, Record
+from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import available_cores, mine, rank, run_tasks, wait_for_others
@@ -73,20 +73,20 @@ class SceneRun(ABC):
         return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
-    def parts(self) -> Parts:
+    def parts(self) -> SceneResults:
         """The outcomes of finished scenes."""
-        return Parts(self.config.out / "parts", self.key, self.digest)
+        return SceneResults(self.config.out / "parts", self.key, self.digest)
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a scene depend on."""
         return self.scenes.digest(index)
 
     @abstractmethod
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
 
 
-def cache_folder(chosen: Path | None) -> Path:
+def store_folder(chosen: Path | None) -> Path:
     """Folder of the stores: the chosen one, or the user's cache."""
     if chosen is not None:
         return chosen
@@ -121,7 +121,7 @@ def finish(run: SceneRun, title: str) -> None:
     wait_for_others(range(len(run.scenes)), lambda index: parts.load(index) is not None)
 
 
-def complete(run: SceneRun, title: str) -> list[Record] | None:
+def complete(run: SceneRun, title: str) -> list[ResultRecord] | None:
     """Run all scenes that are not finished yet.
 
     Args:
@@ -135,9 +135,9 @@ def complete(run: SceneRun, title: str) -> list[Record] | None:
     return gather(run)[0] if rank() == 0 else None
 
 
-def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
+def gather(run: SceneRun) -> tuple[list[ResultRecord], dict[str, float]]:
     """Records of all scenes in their order, and the seconds that each stage took."""
-    records: list[Record] = []
+    records: list[ResultRecord] = []
     seconds: dict[str, float] = defaultdict(float)
     for index in range(len(run.scenes)):
         part = run.parts.load(index)

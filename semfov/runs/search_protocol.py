@@ -42,7 +42,7 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class EpisodeOutcome:
     """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
 
     cells: tuple[int, ...]
@@ -148,7 +148,7 @@ def run_episodes(
     *,
     shifts: int,
     batch: int,
-) -> list[Outcome]:
+) -> list[EpisodeOutcome]:
     """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
 
     Args:
@@ -163,7 +163,7 @@ def run_episodes(
     Returns:
         The result of each episode.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[EpisodeOutcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
         outcomes += _run_batch(episodes[part], candidate, detections, grid, noise[part], shifts)
@@ -172,7 +172,7 @@ def run_episodes(
 
 def _run_batch(
     episodes: Sequence[Episode], candidate: Candidate, detections: Detections, grid: Grid, noise: Tensor, shifts: int
-) -> list[Outcome]:
+) -> list[EpisodeOutcome]:
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
     for row, episode in enumerate(episodes):
         goals[row, list(episode.goal)] = True
@@ -197,7 +197,7 @@ def _run_batch(
         number = seeking[step.episodes[going]]
         visits[number, step.shift + 1] = step.next_cell[going]
         found_at[number[lands(step)[going]]] = step.shift + 1
-    return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
+    return [EpisodeOutcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
 
 
 def search_steps(

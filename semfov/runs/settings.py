@@ -48,7 +48,7 @@ class FileName:
         return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
 
 
-Name = Annotated[str, FileName()]
+SingleName = Annotated[str, FileName()]
 """Name of a model to write."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 """Seed of a random generator."""

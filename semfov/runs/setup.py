@@ -17,7 +17,7 @@ from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
 from semfov.gaze.templates import ClassTemplates
-from semfov.io.compatibility import learned_for, recommended
+from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
@@ -164,7 +164,7 @@ def growth_of(eye: Eye) -> float:
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
     if name is None:
-        name = shipped_model(FovealObservationModel, recommended(eye.detector.name, growth_of(eye)), "MODEL")
+        name = shipped_model(FovealObservationModel, recommended_model(eye.detector.name, growth_of(eye)), "MODEL")
     model = FovealObservationModel.from_pretrained(name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)

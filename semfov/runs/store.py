@@ -21,11 +21,11 @@ from semfov.detection.detections import Detections
 from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
-from semfov.runs.looks import SOURCES, Box
+from semfov.runs.looks import LOOK_SOURCES, BoxKey
 from semfov.version import __version__
 
 Action = TypeVar("Action", bound=Hashable)
-Look = TypeVar("Look")
+StoredLook = TypeVar("StoredLook")
 
 
 class SceneStore:
@@ -60,7 +60,7 @@ class SceneStore:
         write_tensors(self.path(digest), self.key, tensors)
 
 
-class LookStore(SceneStore, ABC, Generic[Action, Look]):
+class LookStore(SceneStore, ABC, Generic[Action, StoredLook]):
     """Looks at scenes by action, with the looks at a scene in one file.
 
     A subclass says how an action is written as numbers, and how looks are written as tensors.
@@ -89,7 +89,7 @@ class LookStore(SceneStore, ABC, Generic[Action, Look]):
         code = modules_digest(*sources, __name__)
         super().__init__(folder, what, code, Schema(fields | self.more()))
 
-    def load(self, digest: str) -> dict[Action, Look]:
+    def load(self, digest: str) -> dict[Action, StoredLook]:
         """Read the looks at a scene.
 
         Args:
@@ -104,7 +104,7 @@ class LookStore(SceneStore, ABC, Generic[Action, Look]):
         actions = [self.decode(row) for row in tensors["actions"].tolist()]
         return dict(zip(actions, self.unpack(tensors, actions), strict=True))
 
-    def save(self, digest: str, looks: Mapping[Action, Look]) -> None:
+    def save(self, digest: str, looks: Mapping[Action, StoredLook]) -> None:
         """Store the looks at a scene.
 
         Args:
@@ -129,11 +129,11 @@ class LookStore(SceneStore, ABC, Generic[Action, Look]):
         """Read an action from its numbers."""
 
     @abstractmethod
-    def pack(self, looks: Sequence[Look]) -> dict[str, Tensor]:
+    def pack(self, looks: Sequence[StoredLook]) -> dict[str, Tensor]:
         """Convert looks to tensors for a file."""
 
     @abstractmethod
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Action]) -> list[Look]:
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Action]) -> list[StoredLook]:
         """Convert the tensors of a file back to the looks of these actions."""
 
 
@@ -145,11 +145,11 @@ class DetectionStore(LookStore[Any, Detections]):
 
     width = 5
 
-    def encode(self, action: int | Box) -> Sequence[float]:
+    def encode(self, action: int | BoxKey) -> Sequence[float]:
         """A number, or -1 and the corners of a box."""
         return (-1, *action) if isinstance(action, tuple) else (action, 0, 0, 0, 0)
 
-    def decode(self, row: Sequence[float]) -> int | Box:
+    def decode(self, row: Sequence[float]) -> int | BoxKey:
         """A number or a box."""
         return tuple(row[1:]) if row[0] < 0 else int(row[0])
 
@@ -157,7 +157,7 @@ class DetectionStore(LookStore[Any, Detections]):
         """Convert detections to tensors for a file."""
         return pack(looks)
 
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[int | Box]) -> list[Detections]:
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[int | BoxKey]) -> list[Detections]:
         """Convert the tensors of a file back to the detections of each action."""
         return unpack(tensors)
 
@@ -199,7 +199,7 @@ def cell_store(
     # The cell centres in a picture of odd size identify the way in which a grid is laid out.
     centres = Grid(columns, rows, (641, 479)).centres.tolist()
     what = {"settings": settings, "grid": [columns, rows], "centres": centres}
-    return DetectionStore(folder, what, SOURCES, components)
+    return DetectionStore(folder, what, LOOK_SOURCES, components)
 
 
 def versions() -> dict[str, object]:
@@ -225,4 +225,4 @@ def looks_digest(*more: str) -> str:
     Returns:
         The sha256.
     """
-    return modules_digest(*SOURCES, *more)
+    return modules_digest(*LOOK_SOURCES, *more)

@@ -23,6 +23,6 @@ def share(count: int, total: int) -> str:
     return f"{100 * count / total:.1f}" if total else "-"
 
 
-def mean(values: Sequence[float], digits: int = 1) -> str:
+def mean_or_dash(values: Sequence[float], digits: int = 1) -> str:
     """The mean with `digits` decimal places, or a dash where there are no values."""
     return f"{sum(values) / len(values):.{digits}f}" if values else "-"

@@ -14,7 +14,7 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.errors import DataError
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Range, Seed, Side, Whole
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
@@ -24,10 +24,10 @@ from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge
 
-SHOWN = 0.3
+LEAST_CONFIDENCE = 0.3
 """Smallest score with which a look confirms a class."""
 
-Tile = Annotated[int, Range(16, 16_384)]
+TileSize = Annotated[int, Range(16, 16_384)]
 """Side of a part of a picture in pixels."""
 
 
@@ -56,7 +56,7 @@ class WindowLookingConfig(WorkConfig):
     mosaics: Whole = 100
     columns: Side = 4
     rows: Side = 4
-    tile: Tile = 640
+    tile: TileSize = 640
     cut: Cut = "keep"
     model: str | None = None
     seed: Seed = 0
@@ -94,7 +94,7 @@ class WindowLooking:
             self.scenes = Mosaics(
                 photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
             )
-        folder = cache_folder(config.cache) / "glances"
+        folder = store_folder(config.cache) / "glances"
         self.store = GlanceStore(folder, self.eye.settings(), len(detector.classes))
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:

@@ -19,7 +19,7 @@ from semfov.runs.progress import task_bar
 
 _log = logging.getLogger(__name__)
 
-Task = TypeVar("Task")
+_Task = TypeVar("_Task")
 Result = TypeVar("Result")
 
 
@@ -33,12 +33,12 @@ def world() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def mine(tasks: Sequence[Task]) -> list[Task]:
+def mine(tasks: Sequence[_Task]) -> list[_Task]:
     """The tasks of this rank: every `world`-th."""
     return list(tasks[rank() :: world()])
 
 
-def wait_for_others(tasks: Sequence[Task], finished: Callable[[Task], bool], *, seconds: float = 1.0) -> None:
+def wait_for_others(tasks: Sequence[_Task], finished: Callable[[_Task], bool], *, seconds: float = 1.0) -> None:
     """Wait until the tasks of all ranks are finished, however long that takes; without torchrun return at once.
 
     The ranks communicate only through the results in their shared folder. (torchrun ends all ranks when one fails.)
@@ -64,8 +64,8 @@ def available_cores() -> int:
 
 
 def run_tasks(
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
+    function: Callable[[_Task], Result],
+    tasks: Sequence[_Task],
     *,
     workers: int,
     setup: Callable[..., None],

@@ -25,7 +25,7 @@ def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
     return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
 
 
-def raster(windows: Sequence[Window]) -> Order:
+def in_order(windows: Sequence[Window]) -> Order:
     """The windows in their order."""
     return lambda looks, done: [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
 
@@ -33,7 +33,7 @@ def raster(windows: Sequence[Window]) -> Order:
 def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
     """The windows in random order."""
     order = np.random.Generator(np.random.PCG64(list(seed))).permutation(len(windows))
-    return raster([windows[n] for n in order])
+    return in_order([windows[n] for n in order])
 
 
 def ranked(windows: Sequence[Window], target: int | None, *, most: bool) -> Order:

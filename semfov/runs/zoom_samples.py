@@ -18,7 +18,7 @@ from semfov.runs.looks import one_thread
 from semfov.runs.samples import Sampler, Samples, SampleSettings
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
-from semfov.runs.zoom_store import SOURCES as GLANCES
+from semfov.runs.zoom_store import WINDOW_SOURCES as GLANCES
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 

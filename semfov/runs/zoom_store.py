@@ -17,7 +17,7 @@ from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 
-SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
+WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
 """Modules that turn a large picture into glances; all modules that they import count, too."""
 
 
@@ -34,7 +34,7 @@ class GlanceStore(LookStore[Window, Glance]):
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
         self.classes = classes
-        super().__init__(folder, {"settings": settings}, SOURCES, classes + 1)
+        super().__init__(folder, {"settings": settings}, WINDOW_SOURCES, classes + 1)
 
     def more(self) -> dict[str, Field]:
         """Whether boxes are cut, the highest scores, and the gists."""

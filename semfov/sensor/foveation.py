@@ -11,7 +11,7 @@ from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, is_ba
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
-from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, places
+from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions
 
 
 def foveate(
@@ -79,7 +79,7 @@ def foveate(
 
 
 @dataclass(frozen=True)
-class Opened:
+class FoveationCanvas:
     """A canvas that `Foveation.open` has prepared.
 
     Attributes:
@@ -154,12 +154,12 @@ class Foveation(Sensor):
         """
         return laplacian_pyramid(_batch(image), self.levels, self.convention)
 
-    def open(self, canvas: Tensor, scale: Tensor) -> Opened:
+    def open(self, canvas: Tensor, scale: Tensor) -> FoveationCanvas:
         """Compute the pyramid of a canvas, and scale the width of the fovea."""
         shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
-        return Opened(self.pyramid(canvas), self.sigma * shrink)
+        return FoveationCanvas(self.pyramid(canvas), self.sigma * shrink)
 
-    def look(self, state: Opened, gaze: Tensor) -> Tensor:
+    def look(self, state: FoveationCanvas, gaze: Tensor) -> Tensor:
         """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
         return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
 
@@ -253,7 +253,7 @@ def _layout(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Positions of the pixels along x and y of every band, exponents of the growth, and indices of axes and widths."""
     lines = [(axis, k) for k in range(len(sizes)) for axis in (0, 1)]
-    place = [places(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
+    place = [pixel_positions(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
     counts = torch.tensor([sizes[k][1 - axis] for axis, k in lines])
     axes, levels = (torch.tensor(n).repeat_interleave(counts) for n in zip(*lines, strict=True))
     power = torch.arange(len(sizes))

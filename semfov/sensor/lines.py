@@ -19,10 +19,10 @@ from semfov.errors import values_known
 _SMALL = 160
 
 Constant = TypeVar("Constant")
-Settings = TypeVarTuple("Settings")
+_Settings = TypeVarTuple("_Settings")
 
 
-def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings], Constant]:
+def constant(function: Callable[[*_Settings], Constant]) -> Callable[[*_Settings], Constant]:
     """Cache the results of a function of sizes and settings; a compiled graph computes its own."""
 
     @lru_cache(maxsize=256)
@@ -32,7 +32,7 @@ def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings],
             return function(*settings)
 
     @wraps(function)
-    def call(*settings: *Settings) -> Constant:
+    def call(*settings: *_Settings) -> Constant:
         if torch.compiler.is_compiling():
             return function(*settings)
         result: Constant = remember(*settings)

@@ -150,7 +150,7 @@ def from_log_polar(
 
 
 @dataclass(frozen=True)
-class Opened:
+class LogPolarCanvas:
     """A canvas that `LogPolar.open` has prepared.
 
     Attributes:
@@ -235,14 +235,14 @@ class LogPolar(Sensor):
         finest = image[0] if isinstance(image, tuple) else image
         return self.back(self.cortical(image, gaze), gaze, _size(finest))
 
-    def open(self, canvas: Tensor, scale: Tensor) -> Opened:
+    def open(self, canvas: Tensor, scale: Tensor) -> LogPolarCanvas:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
         own = self.retina
         retina = Retina(own.fovea, own.spacing, own.pooling, (across, down))
-        return Opened(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
+        return LogPolarCanvas(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
 
-    def look(self, state: Opened, gaze: Tensor) -> Tensor:
+    def look(self, state: LogPolarCanvas, gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         fixation, _ = fixations(gaze[None], state.levels[0])
         seen = _sample(state.levels, fixation, state.retina)

@@ -57,10 +57,10 @@ class Bands:
             Positions `(n,)` in image pixels.
         """
         band = self.details[k]
-        return places(band.shape[axis], self.size[axis], k, self.convention).to(band)
+        return pixel_positions(band.shape[axis], self.size[axis], k, self.convention).to(band)
 
 
-def places(count: int, length: int, k: int, convention: Convention) -> Tensor:
+def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
     """Positions of the `count` pixels of band k along an image side of `length` pixels: `(count,)`, float64."""
     place = torch.arange(count, dtype=torch.float64)
     return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Curves = Mapping[str, NDArray[np.float64]]
+_Curves = Mapping[str, NDArray[np.float64]]
 
 REST = "0.6"
 """Colour of the curves that the legend does not name."""
@@ -23,7 +23,7 @@ REST = "0.6"
 
 @styled
 def plot_cumulative_performance(
-    curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
+    curves: _Curves, errors: _Curves | None = None, *, title: str = "", ax: Axes | None = None
 ) -> Figure:
     """Plot the fraction of targets found after each gaze shift, one curve a policy, with bands of one standard error.
 
@@ -50,7 +50,7 @@ def plot_cumulative_performance(
 
 @styled
 def plot_success_rate(
-    curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
+    curves: _Curves, errors: _Curves | None = None, *, title: str = "", ax: Axes | None = None
 ) -> Figure:
     """Plot the fraction of cells with objects whose class is correct after each gaze shift, one curve for each policy.
 
@@ -75,7 +75,7 @@ def plot_success_rate(
 
 @styled
 def plot_curve_panels(
-    panels: Mapping[str, tuple[Curves, Curves]],
+    panels: Mapping[str, tuple[_Curves, _Curves]],
     *,
     label: str,
     columns: int = 2,
@@ -111,7 +111,7 @@ def plot_curve_panels(
     return figure
 
 
-def highlighted(curves: Curves, most: int = len(COLOURS)) -> list[str]:
+def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
     """The curves that a legend names: the highest on average, and random gaze as the reference.
 
     Args:
@@ -144,7 +144,7 @@ def others_named(count: int) -> str:
     return f"{count} other{'s' if count != 1 else ''}"
 
 
-def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float, named: Sequence[str] | None = None) -> None:
+def _draw(axes: Axes, curves: _Curves, errors: _Curves | None, band: float, named: Sequence[str] | None = None) -> None:
     """Draw curves with bands of one standard error; those that are not in `named` are grey."""
     from matplotlib.ticker import MaxNLocator
 
@@ -175,7 +175,9 @@ def legend_of(figure: Figure, axes: Axes, *, columns: int, given: bool) -> None:
         figure.legend(lines, names, loc="outside lower center", ncols=columns)
 
 
-def _plot_curves(curves: Curves, errors: Curves | None, title: str, label: str, ax: Axes | None) -> tuple[Figure, Axes]:
+def _plot_curves(
+    curves: _Curves, errors: _Curves | None, title: str, label: str, ax: Axes | None
+) -> tuple[Figure, Axes]:
     check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, given=only(ax))
     _draw(axes, curves, errors, band=0.15, named=highlighted(curves))

@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape
 from semfov.paths import GazeRecord, Scanpath
-from semfov.viz.labels import Box, place_labels
+from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
         The matplotlib image.
     """
     width, height = grid.extent.tolist()
-    drawn = axes.imshow(pixels_of(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
+    drawn = axes.imshow(picture_array(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     return drawn
 
 
-def pixels_of(image: Tensor, *, grey: bool = False) -> Any:
+def picture_array(image: Tensor, *, grey: bool = False) -> Any:
     """A picture `(3, h, w)` as an array for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
     shown = image.detach().cpu().clamp(0, 1)
@@ -91,7 +91,7 @@ def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = 
     """Draw a value of every cell `(X·Y,)` as a colour."""
     width, height = grid.extent.tolist()
     drawn = axes.imshow(
-        table_of(grid, values), extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style
+        cell_table(grid, values), extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style
     )
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     return drawn
@@ -109,7 +109,7 @@ def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
 
 
-def table_of(grid: Grid, values: Tensor) -> Any:
+def cell_table(grid: Grid, values: Tensor) -> Any:
     """Values of cells `(X·Y,)` as a table `(Y, X)`."""
     return values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
 
@@ -152,7 +152,7 @@ def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, lis
 
 
 def draw_detections(
-    axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: list[Box] | None = None
+    axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: list[LabelBox] | None = None
 ) -> list[Artist]:
     """Draw the most confident detections of a look, each labelled with its best class other than background.
 

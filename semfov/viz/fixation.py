@@ -11,14 +11,14 @@ from semfov.paths import Scanpath
 from semfov.viz.belief import belief_title, draw_belief
 from semfov.viz.belief import class_posterior as posterior_of
 from semfov.viz.drawing import (
+    cell_table,
     check_fixation,
     draw_detections,
     draw_gaze,
     draw_image,
     draw_scale,
     photograph_of,
-    pixels_of,
-    table_of,
+    picture_array,
 )
 from semfov.viz.path import GazePath
 from semfov.viz.scanpath import MOST_BOXES, draw_legend, draw_place
@@ -128,7 +128,7 @@ class FixationFigure:
             artist.remove()
         self.path.show(fixation)
         path.set_title(f"fixation {fixation}")
-        self.view.set_data(pixels_of(view))
+        self.view.set_data(picture_array(view))
         self.changing = draw_gaze(seen, self.scanpath, fixation) + draw_gaze(believed, self.scanpath, fixation)
         self.changing += draw_detections(seen, self.scanpath, fixation, MOST_BOXES)
         if self.scanpath.target is None:
@@ -138,5 +138,5 @@ class FixationFigure:
         else:
             values = posterior_of(self.scanpath)[fixation]
             believed.set_title(belief_title(self.scanpath, fixation), parse_math=False)
-        self.belief.set_data(table_of(self.scanpath.grid, values))
+        self.belief.set_data(cell_table(self.scanpath.grid, values))
         return self.figure

@@ -15,7 +15,7 @@ from semfov.data.inputs import ImageLike, as_image
 from semfov.errors import check
 from semfov.paths import HeadPath
 from semfov.viz.animation import Film, render
-from semfov.viz.drawing import draw_image, photograph_of, pixels_of
+from semfov.viz.drawing import draw_image, photograph_of, picture_array
 from semfov.viz.style import FOUND, GAZE, OTHER, STYLE, TARGET, make_figure, only, styled
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
         left, right = below.subplots(1, 2, width_ratios=[1, 1.25])
-        left.imshow(pixels_of(world.view(path.pose(look))))
+        left.imshow(picture_array(world.view(path.pose(look))))
         x, y = path.views.view_grid.centres[action % path.views.cells].tolist()
         left.plot([x], [y], marker="+", markersize=14, color=TARGET, markeredgewidth=2)
         left.set(xticks=[], yticks=[], title="what the head sees")

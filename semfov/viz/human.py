@@ -15,11 +15,11 @@ from semfov.viz.style import line_style, make_figure, styled
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Curves = Mapping[str, NDArray[np.float64]]
+_Curves = Mapping[str, NDArray[np.float64]]
 
 
 @styled
-def plot_by_shift(curves: Curves, errors: Curves | None = None, *, label: str, title: str = "") -> Figure:
+def plot_by_shift(curves: _Curves, errors: _Curves | None = None, *, label: str, title: str = "") -> Figure:
     """Plot a measure after 1, 2, … gaze shifts, one curve for each model, with bands of one standard error.
 
     Args:

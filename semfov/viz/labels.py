@@ -3,12 +3,14 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
-Box = tuple[float, float, float, float]
-Size = tuple[float, float]
+LabelBox = tuple[float, float, float, float]
+_Size = tuple[float, float]
 Point = tuple[float, float]
 
 
-def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()) -> list[Box]:
+def place_labels(
+    boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, taken: Sequence[LabelBox] = ()
+) -> list[LabelBox]:
     """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
 
     Args:
@@ -23,7 +25,7 @@ def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken
     >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
     [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
     """
-    placed: list[Box] = list(taken)
+    placed: list[LabelBox] = list(taken)
     for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
         corners = [
             (x1, y1),
@@ -39,7 +41,7 @@ def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken
     return placed[len(taken) :]
 
 
-def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, reach: float) -> list[Box | None]:
+def place_numbers(points: Sequence[Point], sizes: Sequence[_Size], frame: _Size, reach: float) -> list[LabelBox | None]:
     """Rectangles for the numbers of points: on the point where there is room, or else near it.
 
     No number covers another number or another point. The first and the last point are placed first.
@@ -57,8 +59,8 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, r
     >>> first[2] <= second[0]
     True
     """
-    placed: list[Box] = []
-    places: list[Box | None] = [None] * len(points)
+    placed: list[LabelBox] = []
+    places: list[LabelBox | None] = [None] * len(points)
     ends = [len(points) - 1, 0] if len(points) > 1 else [0]
     for number in [*ends, *range(1, len(points) - 1)]:
         width, height = sizes[number]
@@ -73,8 +75,8 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, r
 
 
 def place_within(
-    candidates: Sequence[Iterable[Point]], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()
-) -> list[Box]:
+    candidates: Sequence[Iterable[Point]], sizes: Sequence[_Size], frame: _Size, taken: Sequence[LabelBox] = ()
+) -> list[LabelBox]:
     """Rectangles for labels whose middle may be at any of several points: at the first free one.
 
     Where none is free, the label is moved down from the first point.
@@ -91,7 +93,7 @@ def place_within(
     >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
     [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
     """
-    placed: list[Box] = list(taken)
+    placed: list[LabelBox] = list(taken)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x - width / 2, y - height / 2, width, height, frame) for x, y in points]
         free = next((label for label in inside if not _covers_any(label, placed)), None)
@@ -99,7 +101,7 @@ def place_within(
     return placed[len(taken) :]
 
 
-def _around(point: Point, size: Size, reach: float) -> Iterator[Point]:
+def _around(point: Point, size: _Size, reach: float) -> Iterator[Point]:
     """The point itself, followed by rings of points around it."""
     yield point
     radius = step = 0.6 * max(size)
@@ -110,16 +112,16 @@ def _around(point: Point, size: Size, reach: float) -> Iterator[Point]:
         radius += step / 2
 
 
-def _holds(label: Box, point: Point) -> bool:
+def _holds(label: LabelBox, point: Point) -> bool:
     return label[0] < point[0] < label[2] and label[1] < point[1] < label[3]
 
 
-def _into(x: float, y: float, width: float, height: float, frame: Size) -> Box:
+def _into(x: float, y: float, width: float, height: float, frame: _Size) -> LabelBox:
     x, y = max(0.0, min(x, frame[0] - width)), max(0.0, min(y, frame[1] - height))
     return x, y, x + width, y + height
 
 
-def _further(label: Box, placed: list[Box]) -> Box:
+def _further(label: LabelBox, placed: list[LabelBox]) -> LabelBox:
     """The label moved down until it is free, out of the frame if necessary."""
     x1, y1, x2, y2 = label
     while covered := [other for other in placed if _cover((x1, y1, x2, y2), other)]:
@@ -127,9 +129,9 @@ def _further(label: Box, placed: list[Box]) -> Box:
     return x1, y1, x2, y2
 
 
-def _covers_any(label: Box, placed: list[Box]) -> bool:
+def _covers_any(label: LabelBox, placed: list[LabelBox]) -> bool:
     return any(_cover(label, other) for other in placed)
 
 
-def _cover(a: Box, b: Box) -> bool:
+def _cover(a: LabelBox, b: LabelBox) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

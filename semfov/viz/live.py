@@ -16,14 +16,14 @@ from semfov.io.files import replacing
 from semfov.paths import Moment
 from semfov.viz.style import FOUND, GAZE, TARGET
 
-Frame = NDArray[np.uint8]
+_Frame = NDArray[np.uint8]
 
 _LONGEST = 640
 # Containers and codecs in the order in which they are tried; every build of OpenCV has the last one.
 _CODECS = ((".mp4", "mp4v"), (".avi", "MJPG"))
 
 
-def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
+def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
     """Draw belief, gaze and decision into a frame.
 
     The opacity of the colour over a cell is proportional to the probability that the cell holds the target, or in an
@@ -81,7 +81,7 @@ def video_suffix() -> str:
 
 
 @contextmanager
-def video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
+def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
     """Write frames to a video, whole or not at all.
 
     Args:
@@ -105,7 +105,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
         writer: Any = None
         try:
 
-            def add(frame: Frame) -> None:
+            def add(frame: _Frame) -> None:
                 nonlocal writer
                 if writer is None:
                     code = cv2.VideoWriter.fourcc(*codec)

@@ -8,7 +8,7 @@ import numpy as np
 
 from semfov.paths import Scanpath
 from semfov.viz.drawing import lightness, per_point
-from semfov.viz.labels import Box, place_numbers
+from semfov.viz.labels import LabelBox, place_numbers
 from semfov.viz.style import FOUND, TIME
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class GazePath:
         points = [(float(x), float(y)) for x, y in self.path]
         frame = self.scanpath.grid.extent.tolist()
         places = place_numbers(points, sizes, (frame[0], frame[1]), 60 * scale)
-        self.taken: list[Box] = [place for place in places if place is not None]
+        self.taken: list[LabelBox] = [place for place in places if place is not None]
         written: list[Annotation | None] = []
         for number, (point, place) in enumerate(zip(points, places, strict=True)):
             if place is None:

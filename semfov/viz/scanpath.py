@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from semfov.decision import CloserLook
+from semfov.decision import CloseUp
 from semfov.errors import check
 from semfov.paths import Scanpath
 from semfov.viz.belief import draw_belief
@@ -238,7 +238,7 @@ def found_box(scanpath: Scanpath) -> Tensor | None:
     return None if scanpath.decision is None else scanpath.decision.box
 
 
-def dismissed(scanpath: Scanpath) -> list[CloserLook]:
+def dismissed(scanpath: Scanpath) -> list[CloseUp]:
     """The closer looks at places other than that of a target that was found."""
     decision = scanpath.decision
     found = None if decision is None else decision.box

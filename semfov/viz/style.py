@@ -31,7 +31,7 @@ TIME = "viridis"
 OVERLAY = "plasma"
 """Colour maps, whose lightness increases steadily, so that they work in grey print too."""
 
-OPACITY = 0.85
+_OPACITY = 0.85
 """Opacity of an overlay where the probability is 1."""
 
 STYLE: Any = {
@@ -185,7 +185,7 @@ def overlay_colours() -> Colormap:
 
     share = np.linspace(0, 1, 256)
     colours = colormaps[OVERLAY](share)
-    colours[:, 3] = OPACITY * np.sqrt(share)
+    colours[:, 3] = _OPACITY * np.sqrt(share)
     return ListedColormap(colours, name="overlay")
 
 

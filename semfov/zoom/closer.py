@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloserLook
+from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.detection.detections import Detections
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
@@ -143,6 +143,6 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         self._examined += [candidate.box, box]
         self._number += 1
 
-    def record(self, box: Tensor, place: float, presence: float) -> CloserLook:
+    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look, which is the last look of the path."""
-        return CloserLook(None, self._target, None, box, place, presence, number=self._number - 1)
+        return CloseUp(None, self._target, None, box, place, presence, number=self._number - 1)

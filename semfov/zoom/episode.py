@@ -8,13 +8,13 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Glances, Window, overview
 from semfov.zoom.policy import Choice
 
-Belief = TypeVar("Belief", ZoomBelief, None)
+_Belief = TypeVar("_Belief", ZoomBelief, None)
 
 Order = Callable[[Sequence[Glance], set[Window]], Sequence[Choice]]
 """Maps the looks so far, and their windows, to the windows to look at next with their values; none ends the episode."""
 
 
-class Turn(Generic[Belief]):
+class Turn(Generic[_Belief]):
     """A turn of an episode: one look.
 
     Attributes:
@@ -23,9 +23,9 @@ class Turn(Generic[Belief]):
         belief: belief after it; None in episodes without one.
     """
 
-    def __init__(self, glance: Glance, worth: float, belief: Belief, choose: Callable[[], Sequence[Choice]]) -> None:
+    def __init__(self, glance: Glance, worth: float, belief: _Belief, choose: Callable[[], Sequence[Choice]]) -> None:
         self.glance, self.worth, self._choose = glance, worth, choose
-        self.belief: Belief = belief
+        self.belief: _Belief = belief
 
     @cached_property
     def choices(self) -> Sequence[Choice]:
@@ -41,11 +41,11 @@ class Turn(Generic[Belief]):
 def look_by_look(
     glances: Glances,
     order: Order,
-    belief: Belief,
+    belief: _Belief,
     *,
     ends: Callable[[Glance], bool] = lambda glance: False,
     hints: bool = True,
-) -> Iterator[Turn[Belief]]:
+) -> Iterator[Turn[_Belief]]:
     """Look at the whole picture, and then at the windows of an order, until it has none left.
 
     The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it.

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
-from semfov.belief.verification import FEATURES, Verification
+from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
-from semfov.io.compatibility import check_detector
+from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Field, Maybe, Number, Object, Schema, perceptron
 from semfov.sensor.lines import constant
@@ -100,7 +100,7 @@ class GlimpseEvidence(Pretrained):
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
             **survey_fields(),
-            "verification.linear.weight": Field((2, FEATURES), low=-1e3, high=1e3, optional=True),
+            "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
             "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
         },
         {
@@ -270,7 +270,7 @@ class GlimpseEvidence(Pretrained):
         Args:
             settings: `WindowEye.settings()`.
         """
-        check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
 
     def _record(self) -> dict[str, Any]:
         """Sizes and chosen settings, for the file."""

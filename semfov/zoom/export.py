@@ -26,7 +26,7 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.gist import FINEST, Gist
 from semfov.zoom.networks import STEPS
 
-METADATA_KEY = "semfov.look"
+LOOK_METADATA_KEY = "semfov.look"
 
 
 def export_look(
@@ -122,7 +122,7 @@ def export_look(
         ir_version=IR_VERSION,
     )
     told = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
-    model.metadata_props.add(key=METADATA_KEY, value=json.dumps(told))
+    model.metadata_props.add(key=LOOK_METADATA_KEY, value=json.dumps(told))
     checker.check_model(model)
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(model.SerializeToString())

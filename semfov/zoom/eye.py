@@ -21,7 +21,7 @@ from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
-Frame = tuple[int, int, int, int, int, int, int, int]
+_Frame = tuple[int, int, int, int, int, int, int, int]
 """`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
 
 BORDER = 2.0
@@ -47,7 +47,7 @@ class WindowView:
 
 
 @dataclass(frozen=True)
-class Seen:
+class WindowLooks:
     """The result of several looks.
 
     Attributes:
@@ -125,7 +125,7 @@ class WindowEye(nn.Module):
 
     def glance(
         self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
-    ) -> Seen:
+    ) -> WindowLooks:
         """Look at a picture and return hints too.
 
         Args:
@@ -149,10 +149,10 @@ class WindowEye(nn.Module):
         found, cut = self._treat(Detections(boxes, selected.scores, selected.mask), place.cut(selected))
         windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
-            return Seen(found, cut, None, windows)
+            return WindowLooks(found, cut, None, windows)
         faint = [hints_of(candidates, number, policy) for number in range(len(frames))]
         placed = [Hints(place.to_picture(each.boxes, number), each.scores) for number, each in enumerate(faint)]
-        return Seen(found, cut, tuple(placed), windows)
+        return WindowLooks(found, cut, tuple(placed), windows)
 
     def glimpse(
         self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -176,7 +176,7 @@ class WindowEye(nn.Module):
 
     def _resample(
         self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None
-    ) -> tuple[Tensor, list[Frame]]:
+    ) -> tuple[Tensor, list[_Frame]]:
         """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames; the canvases are bytes if the padding is a byte."""
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
@@ -195,7 +195,7 @@ class WindowEye(nn.Module):
 
     def _show(
         self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None
-    ) -> tuple[Tensor, Frame]:
+    ) -> tuple[Tensor, _Frame]:
         """One canvas `(1, 3, h, w)` of the dtype of `blank`, a pixel of padding, and its frame."""
         wide, high = self.detector.input_size
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
@@ -288,7 +288,7 @@ class _Placement:
         like: boxes that have the dtype and device to compute in.
     """
 
-    def __init__(self, frames: Sequence[Frame], size: tuple[int, int], like: Tensor) -> None:
+    def __init__(self, frames: Sequence[_Frame], size: tuple[int, int], like: Tensor) -> None:
         wide, high = size
         rows = []
         # Python's numbers: tensors this small spend their time in calls.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.zoom.eye import Seen, WindowEye, WindowView
+from semfov.zoom.eye import WindowEye, WindowLooks, WindowView
 from semfov.zoom.gist import Gist, gist
 from semfov.zoom.lattice import Lattice
 
@@ -128,7 +128,7 @@ class LiveGlances(Glances):
         return [glance(seen, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
-def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
+def glance(seen: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
     detections = _only(seen.detections, number)
     told = None

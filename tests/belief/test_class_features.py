@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import Detections, Grid
-from semfov.belief.look_features import FEATURES, class_features, highest_score, look_features, nothing_seen
+from semfov.belief.look_features import LOOK_FEATURES, class_features, highest_score, look_features, nothing_seen
 from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
@@ -65,7 +65,7 @@ def test_features_of_several_classes_equal_a_loop(random_looks, dtype, device):
     looks = random_looks(dtype=dtype)
     targets = torch.tensor([3, 1, 4])
     got = class_features(looks.to(device), FIXATIONS.to(device, dtype), GRID, targets.to(device))
-    assert got.shape == (4, 3, 24, FEATURES)
+    assert got.shape == (4, 3, 24, LOOK_FEATURES)
     assert got.dtype == dtype
     assert got.device.type == device.type
     close = 1e-4 if dtype == torch.float32 else 1e-9
@@ -116,7 +116,7 @@ def test_features_without_detections_equal_a_loop(most):
     """No detections, with padding or without."""
     nothing = Detections(torch.zeros(4, most, 4), torch.zeros(4, most, 5), torch.zeros(4, most, dtype=torch.bool))
     got = class_features(nothing, FIXATIONS, GRID, torch.arange(1, 5))
-    assert got.shape == (4, 4, 24, FEATURES)
+    assert got.shape == (4, 4, 24, LOOK_FEATURES)
     for look in range(4):
         for cell in range(24):
             expected = features_by_loop(nothing, look, 1, cell)

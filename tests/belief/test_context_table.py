@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from semfov.belief import ContextPrior, context_table
-from semfov.belief.context_table import read_table
+from semfov.belief.context_table import read_named_table
 from semfov.errors import DataError, InputError
 
 CLASSES = ("cup", "dining table", "cow", "zebra")
@@ -94,7 +94,7 @@ def test_a_written_table_is_read_back_unchanged(tmp_path):
     names, values = ["cup", 'a "b", c', "two\r\nlines"], torch.tensor([[math.nan, 0.125], [-3.5, 7.0], [1000, -1000]])
     values = torch.cat([values, values[:, :1]], 1)
     write_table(tmp_path / "t.csv", names, names, values)
-    table = read_table(tmp_path / "t.csv")
+    table = read_named_table(tmp_path / "t.csv")
     assert (table.rows, table.columns) == (tuple(names), tuple(names))
     torch.testing.assert_close(table.values, values, equal_nan=True)
 
@@ -129,15 +129,15 @@ def test_checksum_and_source_are_checked(path):
 def test_errors_in_a_table_name_the_line(path, text, message):
     path.write_text(text)
     with pytest.raises(DataError, match=message):
-        read_table(path)
+        read_named_table(path)
     path.write_bytes(b"\xff\xfe,cup\n")
     with pytest.raises(DataError, match="CSV"):
-        read_table(path)
+        read_named_table(path)
 
 
 def test_a_byte_order_mark_is_not_part_of_the_first_cell(path):
     path.write_text('\ufeff"of, with",cup\ncow,2\n', encoding="utf-8")
-    table = read_table(path)
+    table = read_named_table(path)
     assert (table.rows, table.columns, table.values.tolist()) == (("cow",), ("cup",), [[2.0]])
 
 
@@ -147,10 +147,10 @@ def test_the_number_of_names_is_limited(path, monkeypatch, rows, columns):
     names = [f"thing {index}" for index in range(4)]
     write_table(path, names[:rows], names[:columns], torch.zeros(rows, columns))
     if max(rows, columns) <= 3:
-        assert read_table(path).values.shape == (rows, columns)
+        assert read_named_table(path).values.shape == (rows, columns)
     else:
         with pytest.raises(DataError, match="expected 1 to 3 names"):
-            read_table(path)
+            read_named_table(path)
 
 
 @pytest.mark.parametrize(

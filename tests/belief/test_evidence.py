@@ -12,7 +12,7 @@ from semfov.belief.evidence import READOUT, blur, logarithm, nearness, network
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.io.storage import write
+from semfov.io.storage import write_file
 
 
 class Recorder(nn.Module):
@@ -155,7 +155,7 @@ def test_incomplete_files_are_refused(tmp_path, kind, damage):
     record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
     tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
     (DAMAGES | OF_MAPS | OF_TARGETS)[damage](record, tensors)
-    write(path, tensors, record)
+    write_file(path, tensors, record)
     named = "map" if kind is MapEvidence else "target"
     with pytest.raises(DataError, match=rf"old\.safetensors: not a complete model of {named} evidence"):
         kind.from_pretrained(path)

@@ -8,7 +8,7 @@ from semfov import Grid
 from semfov.belief.look_features import class_features
 from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import DataError, InputError
-from semfov.io.storage import write
+from semfov.io.storage import write_file
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -226,7 +226,7 @@ def test_files_of_another_kind_and_damaged_ones_are_refused(tmp_path, toy_map):
     model = toy_map()
     tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
     other = tmp_path / "other.safetensors"
-    write(other, tensors, {"kind": "target-evidence", "version": "0", **model._record(), "metadata": {}})
+    write_file(other, tensors, {"kind": "target-evidence", "version": "0", **model._record(), "metadata": {}})
     with pytest.raises(DataError, match=r"other\.safetensors"):
         MapEvidence.from_pretrained(other)
     model.save(tmp_path / "whole.safetensors")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from semfov.data import download
-from semfov.data.download import SPLITS, Archive, download_coco, fetch, fetch_split, main, unpack
+from semfov.data.download import SPLITS, Archive, download_coco, fetch_archive, fetch_split, main, unpack_members
 from semfov.errors import DataError, InputError
 
 NAMES = [f"{n:012d}.jpg" for n in (139, 285, 632)]
@@ -132,17 +132,17 @@ def test_a_later_run_resumes_the_transfer(server, tmp_path):
     server.stop_after = 0
     (tmp_path / "val2017.zip.part").write_bytes(FILES["/zips/val2017.zip"][:70_000])
     with pytest.raises(DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"):
-        fetch(IMAGES, tmp_path, address=server.address, pause=0)
+        fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
     assert (tmp_path / "val2017.zip.part").stat().st_size == 70_000
     server.stop_after = None
-    assert fetch(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+    assert fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
     assert server.requests[-1][1] == 70_000
 
 
 def test_a_server_without_range_requests_sends_the_whole_file(server, tmp_path):
     server.ranges = False
     (tmp_path / "val2017.zip.part").write_bytes(b"x" * 70_000)
-    assert fetch(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+    assert fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
 
 
 def test_changed_content_is_refused_and_deleted(server, tmp_path):
@@ -150,22 +150,22 @@ def test_changed_content_is_refused_and_deleted(server, tmp_path):
     data[1000] ^= 1
     server.files["/zips/val2017.zip"] = bytes(data)
     with pytest.raises(DataError, match=f"expected sha256 {IMAGES.sha256}, got .*; it was deleted; run again"):
-        fetch(IMAGES, tmp_path, address=server.address)
+        fetch_archive(IMAGES, tmp_path, address=server.address)
     assert tree(tmp_path) == []
 
 
 def test_a_file_of_another_size_is_refused(server, tmp_path):
     server.files["/zips/val2017.zip"] += b"more"
     with pytest.raises(DataError, match=r"expected [\d,]+ bytes, the server has"):
-        fetch(IMAGES, tmp_path, address=server.address)
+        fetch_archive(IMAGES, tmp_path, address=server.address)
 
 
 def test_a_busy_server_is_asked_again_and_a_missing_file_is_an_error(server, tmp_path):
     with pytest.raises(DataError, match=r"/elsewhere/zips/val2017\.zip: the server answers 404"):
-        fetch(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
+        fetch_archive(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
     server.status = 503
     with pytest.raises(DataError, match="transfer failed at 0"):
-        fetch(IMAGES, tmp_path, address=server.address, pause=0)
+        fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
     assert len(server.requests) == 4  # one request for a missing file, several to a busy server
 
 
@@ -175,7 +175,7 @@ def test_without_a_network_the_error_suggests_copying_the_archive(tmp_path, unre
 
 
 def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(download, "unpack", lambda *_: 1 / 0)
+    monkeypatch.setattr(download, "unpack_members", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         get(tmp_path, server.address)
     assert tree(tmp_path) == [".download/annotations_trainval2017.zip"]
@@ -217,7 +217,7 @@ def test_unpacking_keeps_complete_files_and_replaces_damaged_ones(tmp_path):
     (tmp_path / first).write_bytes(PICTURES[first])
     (tmp_path / second).write_bytes(PICTURES[second][:-1] + b"?")
     before = (tmp_path / first).stat().st_mtime_ns
-    unpack(tmp_path / "val2017.zip", tmp_path, "val2017/")
+    unpack_members(tmp_path / "val2017.zip", tmp_path, "val2017/")
     assert all((tmp_path / name).read_bytes() == content for name, content in PICTURES.items())
     assert (tmp_path / first).stat().st_mtime_ns == before
 
@@ -251,7 +251,7 @@ def linked():
 def test_archives_that_are_unsafe_damaged_or_empty_are_refused(tmp_path, content, message):
     (tmp_path / "a.zip").write_bytes(content)
     with pytest.raises(DataError, match=message):
-        unpack(tmp_path / "a.zip", tmp_path / "root", "val2017/")
+        unpack_members(tmp_path / "a.zip", tmp_path / "root", "val2017/")
     assert tree(tmp_path) == ["a.zip"]
 
 

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from eval.decide import main
-from eval.decide.report import summary
+from eval.decide.report import decision_summary
 from semfov.belief import TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
 from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye
-from semfov.runs.tables import mean, share
+from semfov.runs.tables import mean_or_dash, share
 
 POLICIES = [
     "target-evidence",
@@ -124,7 +124,7 @@ def test_table_matches_hand_calculations():
     }
     first = [{**each, "sharp_place": fits.get(number)} for number, each in enumerate(first)]
     second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
-    text = summary([*first, *second], "sensed")
+    text = decision_summary([*first, *second], "sensed")
     assert "Closer looks" not in text
     assert "6 searches (sensed), 4 of them for a present class." in text
     area, other, sharp, tiled, a, b, look, landed, nowhere = rows_of(text)
@@ -152,10 +152,10 @@ def test_the_table_counts_closer_looks():
         for present in (1, 0)
     ]
     alone = [{**each, "policy": "target-evidence, no closer looks", "looks": 2, "closer": 0} for each in agent]
-    text = summary([*agent, *alone], "sensed")
+    text = decision_summary([*agent, *alone], "sensed")
     assert "Closer looks count as looks; target-evidence makes 1.50 of them in a search." in text
 
 
 def test_shares_and_means_of_nothing_are_shown_as_a_dash():
     assert (share(1, 8), share(0, 3), share(0, 0)) == ("12.5", "0.0", "-")
-    assert (mean([1, 2]), mean([0.125], 2), mean([])) == ("1.5", "0.12", "-")
+    assert (mean_or_dash([1, 2]), mean_or_dash([0.125], 2), mean_or_dash([])) == ("1.5", "0.12", "-")

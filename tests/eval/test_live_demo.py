@@ -11,7 +11,7 @@ from semfov import ActivePerception, Detections, Grid
 from semfov.belief import DirichletBelief, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, Stream, embedded_picture
-from semfov.decision import CloserLook, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.paths import Moment
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
@@ -176,7 +176,7 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     assert changed[110:190, 110].all()
     assert not changed[115:185, 115:185].any()
     # A closer look is marked around its box instead of at the fixated point.
-    closer = CloserLook(0, 1, 6, box, 0.9, 0.95)
+    closer = CloseUp(0, 1, 6, box, 0.9, 0.95)
     there = {"grid": grid, "fixation": grid.centres[6], "next_cell": 6}
     close = draw_moment(grey, moment(**there, closer=closer), "cup").astype(int)
     changed = abs(close - draw_moment(grey, moment(**there), "cup")).max(-1) > 8

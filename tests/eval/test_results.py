@@ -10,10 +10,10 @@ from eval.explore.config import ExploreConfig
 from eval.page import paper
 from eval.page.curves import behind
 from eval.page.experiments import ResultsConfig, experiments
-from eval.page.figures import FIGURES, draw_figures
+from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
-from eval.page.tables import agreement, central, first_fixations, paired, summary
-from eval.results import TABLES, WHOLE, fill, results
+from eval.page.tables import agreement, central, first_fixations, paired, run_summary
+from eval.results import TABLES, WHOLE, fill_page, results
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.config import SensorConfig
@@ -101,30 +101,30 @@ def test_published_experiments_have_the_published_sensor_and_model(runs):
 
 def test_lines_of_the_template_are_replaced_by_tables(searched):
     runs, _ = searched
-    text = fill("before\n@@ beyond-search-tiny second\nafter\n", runs)
+    text = fill_page("before\n@@ beyond-search-tiny second\nafter\n", runs)
     assert text == "before\n**two** (2)\n\n| b |\nafter\n"
-    assert fill("@@ beyond-explore-nano all\n", runs) == "*Not run yet.*\n"
-    assert fill("@@ sensitivity\n", runs).count("not run yet") > 50
-    assert fill("@@ explore-sensor\n", runs).count("not run yet") == 6 * 2 * 7
-    assert fill("@@ table-1\n", runs).count("not run yet") == 4 * 4 * 4
-    assert summary(runs["beyond-search-tiny"].out, 0)[0] == "**one** (1)"
+    assert fill_page("@@ beyond-explore-nano all\n", runs) == "*Not run yet.*\n"
+    assert fill_page("@@ sensitivity\n", runs).count("not run yet") > 50
+    assert fill_page("@@ explore-sensor\n", runs).count("not run yet") == 6 * 2 * 7
+    assert fill_page("@@ table-1\n", runs).count("not run yet") == 4 * 4 * 4
+    assert run_summary(runs["beyond-search-tiny"].out, 0)[0] == "**one** (1)"
     with pytest.raises(InputError, match="did you mean 'beyond-search-tiny'"):
-        fill("@@ beyond-search-tin first\n", runs)
+        fill_page("@@ beyond-search-tin first\n", runs)
     with pytest.raises(InputError, match="table"):
-        fill("@@ beyond-search-tiny third\n", runs)
+        fill_page("@@ beyond-search-tiny third\n", runs)
 
 
 def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
     """Tables are chosen by their number in the file, without the prose around them."""
-    assert fill("@@ decide-tiny presence\n", runs) == "*Not run yet.*\n"
+    assert fill_page("@@ decide-tiny presence\n", runs) == "*Not run yet.*\n"
     for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
         runs[name].out.mkdir(parents=True)
         parts = [f"Some words.\n\n| {number} |\n|---|\n| x |\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
     for number, kind in enumerate(("presence", "decisions", "landings")):
-        assert fill(f"@@ decide-tiny {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+        assert fill_page(f"@@ decide-tiny {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
     for number, kind in enumerate(("by-looks", "by-distance")):
-        assert fill(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+        assert fill_page(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
 
 
 def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
@@ -181,7 +181,7 @@ def test_one_command_writes_both_pages(runs, tmp_path):
     )
     results(config)
     for page in templates:
-        assert (tmp_path / f"{page}.md").read_text() == fill(f"{page}\n@@ table-1\n", runs)
+        assert (tmp_path / f"{page}.md").read_text() == fill_page(f"{page}\n@@ table-1\n", runs)
     templates["tables"].unlink()
     with pytest.raises(DataError, match=r"tables\.template\.md cannot be read"):
         results(config)
@@ -211,7 +211,7 @@ def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
     records = searches(tuple(paper.TABLE_II), lambda policy, scene, _: found.get((policy, scene), 1))
     write_records(runs["search-published-nano"].out, records)
-    rows = [cells_of(row) for row in fill("@@ table-2\n", runs).splitlines()]
+    rows = [cells_of(row) for row in fill_page("@@ table-2\n", runs).splitlines()]
     assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
     # The target of one of the three even scenes is found within 5 and 15 gaze shifts, of two within 30.
     assert rows[2][:4] == ["random", "CP@5", "45.20", "33.3 ± 33.3"]
@@ -264,7 +264,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
         for scene in (0, 1)
     ]
     write_records(runs["explore-sensor fovea 50 px, growth 1"].out, records)
-    rows = [cells_of(row) for row in fill("@@ explore-sensor\n", runs).splitlines()]
+    rows = [cells_of(row) for row in fill_page("@@ explore-sensor\n", runs).splitlines()]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
     assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
     assert rows[3][1:3] == ["closer-look-learned", "87.5 ± 12.5"]
@@ -279,5 +279,5 @@ def test_figures_are_drawn_once_their_experiments_have_run(runs, tmp_path):
             run = runs[f"search-{fovea}-{name}"]
             write_records(run.out, searches(run.policies, lambda policy, scene, repetition: scene + repetition))
     drawn = draw_figures(tmp_path, runs)
-    assert {path.stem for path in drawn} == {name for name, figure in FIGURES.items() if figure.kind == "search"}
+    assert {path.stem for path in drawn} == {name for name, figure in PAGE_FIGURES.items() if figure.kind == "search"}
     assert all(path.stat().st_size > 10_000 for path in drawn)

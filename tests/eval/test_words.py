@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval.words.run import WordsConfig, differences, told, words
+from eval.words.run import WordsConfig, differences, outcome_tables, words
 from semfov.belief import ContextPrior
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import InputError
@@ -84,10 +84,10 @@ def test_table_lists_searches_that_miss_at_the_first_look_separately(records, co
     middle = scores[len(scores) // 2]
     below = sum(score < middle for score in scores)
     assert 0 < below < len(scores)
-    text = "\n".join(told(records, arms, replace(config, missed=middle)))
+    text = "\n".join(outcome_tables(records, arms, replace(config, missed=middle)))
     assert f", {len(scores)} searches per arm" in text
     assert f", {below} searches per arm" in text
-    assert "misses the target: none." in "\n".join(told(records, arms, replace(config, missed=0.0)))
+    assert "misses the target: none." in "\n".join(outcome_tables(records, arms, replace(config, missed=0.0)))
 
 
 def test_tables_need_different_names(config, folder):

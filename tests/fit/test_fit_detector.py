@@ -37,7 +37,7 @@ from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
-from semfov.runs.progress import Whole, task_bar, track
+from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_network, write_photographs
 from train.fit_detector import main
@@ -505,7 +505,7 @@ def test_one_photograph_or_no_difference_is_not_an_improvement():
 
 def test_one_progress_bar_covers_all_stages(capsys):
     """Stages and tasks count by their weights; unknown tasks do not count, and skipped stages count as done."""
-    with Whole("all", {"one": {"a": 3, "b": 1}, "two": {"c": 4}, "three": {"d": 2}}) as whole:
+    with WholeBar("all", {"one": {"a": 3, "b": 1}, "two": {"c": 4}, "three": {"d": 2}}) as whole:
         with whole.stage("one"):
             seen = [(item, whole.done) for item in track(range(6), "a", "unit")]
             assert [share for _, share in seen] == pytest.approx([0.05 * number for number in range(6)])

@@ -14,7 +14,7 @@ from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.map_evidence import FitMapConfig, frequencies, objective, train, train_gain
+from semfov.fit.map_evidence import FitMapConfig, frequencies, map_objective, train_gain, train_map
 from semfov.fit.map_examples import MapExampleLooks, make_map_examples
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
@@ -136,7 +136,7 @@ def test_objective_equals_its_formula(examples):
                 right = bool(examples.answers[row, cell, place])
                 value = float(p[row, cell, place])
                 total -= share * math.log(value if right else 1 - value) / CELLS / 4
-    assert float(objective(SimpleNamespace(belief=known), examples)) == pytest.approx(total, rel=1e-6)
+    assert float(map_objective(SimpleNamespace(belief=known), examples)) == pytest.approx(total, rel=1e-6)
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -146,7 +146,7 @@ def test_training_is_repeatable(examples):
         torch.manual_seed(0)
         model = MapEvidence(4, 4, components=len(CLASSES) + 1)
         torch.manual_seed(seed)  # random numbers drawn elsewhere change nothing
-        train(config, model, examples, GRID)
+        train_map(config, model, examples, GRID)
         before = {name: value.clone() for name, value in model.state_dict().items()}
         train_gain(config, model, examples, GRID)
         for name, value in model.state_dict().items():

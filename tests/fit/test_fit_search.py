@@ -16,7 +16,15 @@ from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.evidence import JUDGED, FitSearchConfig, choose_thresholds, judge, objective, searches, train
+from semfov.fit.evidence import (
+    JUDGED,
+    FitSearchConfig,
+    choose_thresholds,
+    evidence_objective,
+    judge_evidence,
+    searches,
+    train_evidence,
+)
 from semfov.fit.evidence_examples import ExampleLooks, make_examples
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
@@ -159,7 +167,7 @@ def test_objective_equals_its_formula(held):
     expected += 0.7 * sum(landing) / len(landing) if landing else 0
     belief = Target(TargetEvidence(4, 4)).start(3, GRID, cells)
     belief = replace(belief, present=cells, following=following, anywhere=anywhere)
-    got = objective(config, SimpleNamespace(belief=belief, visited=visited, next_cell=following_cell), goal)
+    got = evidence_objective(config, SimpleNamespace(belief=belief, visited=visited, next_cell=following_cell), goal)
     assert float(got) == pytest.approx(expected, rel=1e-6)
 
 
@@ -173,7 +181,7 @@ def test_gradients_of_certain_beliefs_are_finite():
     visited, following_cell = goal.new_zeros(2, CELLS), torch.tensor([0, 1])
     visited[:, [2, 3]] = True
     step = SimpleNamespace(belief=belief, visited=visited, next_cell=following_cell)
-    loss = objective(FitSearchConfig(), step, goal)
+    loss = evidence_objective(FitSearchConfig(), step, goal)
     loss.backward()
     assert bool(loss.isfinite())
     assert bool(cells.grad.isfinite().all())
@@ -253,10 +261,10 @@ def test_training_is_repeatable_and_keeps_the_global_random_state(examples):
     config = FitSearchConfig(columns=4, rows=4, steps=12, batch=4, looks=3)
     torch.manual_seed(5)
     state = torch.random.get_rng_state()
-    first = train(config, examples, GRID, {"some": "metadata"}, len(CLASSES) + 1)
+    first = train_evidence(config, examples, GRID, {"some": "metadata"}, len(CLASSES) + 1)
     assert torch.equal(torch.random.get_rng_state(), state)
     torch.manual_seed(6)
-    second = train(config, examples, GRID, {}, len(CLASSES) + 1)
+    second = train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
     assert not first.training
     assert first.metadata == {"some": "metadata"}
     for name, value in first.state_dict().items():
@@ -271,8 +279,8 @@ def test_more_training_lowers_the_evaluated_loss(examples):
     nll = []
     for steps in (1, 60):
         config = FitSearchConfig(columns=4, rows=4, steps=steps, batch=8, looks=4)
-        model = train(config, examples, GRID, {}, len(CLASSES) + 1)
-        judged, thresholds = judge(config, model, examples, GRID)
+        model = train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
+        judged, thresholds = judge_evidence(config, model, examples, GRID)
         assert [row["looks"] for row in judged] == list(JUDGED)
         assert 0.49 < thresholds.confirm <= 1
         assert 0 <= thresholds.give_up <= 0.3

@@ -15,7 +15,7 @@ from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
-from semfov.fit.searches import photograph_searches, photographs, search
+from semfov.fit.searches import open_photographs, photograph_searches, search_photograph
 from semfov.fit.verification import (
     LEVELS,
     SHIPPED,
@@ -178,7 +178,7 @@ def opened(detector, store=None):
     torch.manual_seed(0)
     evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
     kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
-    return photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
+    return open_photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
 
 
 @pytest.fixture
@@ -189,9 +189,9 @@ def seen():
 def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
     found, evidence = seen
     photograph = found[0]
-    first = list(search(photograph, photograph.targets[0], Target(evidence), 3))
+    first = list(search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
     count = len(photograph.looks.looks)
-    again = list(search(photograph, photograph.targets[0], Target(evidence), 3))
+    again = list(search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
     assert len(photograph.looks.looks) == count == 3
     view = photograph.eye.open(photograph.image)
     for one, other in zip(first, again, strict=True):
@@ -214,11 +214,13 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
         return look_from(eye, scenes[index].image, live[index].grid.centres)
 
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
-    found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
+    found = open_photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
     for _ in range(2):
         for one, other in zip(live, found, strict=True):
             for sought in one.targets:
-                pairs = zip(*(search(each, sought, Target(evidence), 5) for each in (one, other)), strict=True)
+                pairs = zip(
+                    *(search_photograph(each, sought, Target(evidence), 5) for each in (one, other)), strict=True
+                )
                 for first, second in pairs:
                     torch.testing.assert_close(first.belief.probability(1), second.belief.probability(1))
             other.close()
@@ -228,7 +230,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
 def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
     live, evidence = seen
     options = {"classes": 1, "absent": 0, "max_area": 1.0, "seed": 0}
-    few, many = (photographs(live[0].eye, live[0].scenes, [0, 1, 2], (4, 3), **options, spare=n) for n in (0, 1))
+    few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], (4, 3), **options, spare=n) for n in (0, 1))
     config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
     for one, other in zip(few, many, strict=True):
         assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]

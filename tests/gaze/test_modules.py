@@ -232,9 +232,9 @@ class TestCloser(PolicyTester):
         return policies.Closer()
 
 
-class TestObjects(PolicyTester):
+class TestObjectSeeking(PolicyTester):
     def make(self):
-        return policies.Objects()
+        return policies.ObjectSeeking()
 
 
 class TestKL(PolicyTester):

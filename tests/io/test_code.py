@@ -65,9 +65,9 @@ def test_the_digest_of_a_class_without_a_file_is_valid_in_one_process_only():
 
 
 def test_the_code_of_looks_does_not_include_beliefs_or_gaze():
-    from semfov.runs.looks import SOURCES
+    from semfov.runs.looks import LOOK_SOURCES
 
-    files = code.closure(SOURCES, lambda name: name.startswith("semfov."))
+    files = code.closure(LOOK_SOURCES, lambda name: name.startswith("semfov."))
     folders = {file.relative_to(file.parents[1]).as_posix() for file in files}
     for name in ("sensor/pyramid.py", "detection/selection.py", "detection/onnx_heads.py", "data/images.py"):
         assert name in folders

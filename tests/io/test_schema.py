@@ -50,7 +50,7 @@ def parts(model):
 
 def message_of_refused_file(name, tmp_path, tensors, record):
     path = tmp_path / "model.safetensors"
-    storage.write(path, tensors, record)
+    storage.write_file(path, tensors, record)
     with pytest.raises(DataError) as caught:
         LOADERS[name].from_pretrained(path)
     message = str(caught.value)
@@ -126,7 +126,7 @@ def test_invalid_values_in_records_are_refused_and_valid_ones_are_loaded(name, t
 
 def loaded_or_none(name, tmp_path, tensors, record):
     path = tmp_path / "model.safetensors"
-    storage.write(path, tensors, record)
+    storage.write_file(path, tensors, record)
     try:
         return LOADERS[name].from_pretrained(path)
     except DataError:
@@ -204,7 +204,7 @@ def test_statistics_out_of_range_are_refused(tmp_path):
         ({**tensors, "more": torch.zeros(1)}, record),
     ]
     for content in wrong:
-        storage.write(path, *content)
+        storage.write_file(path, *content)
         with pytest.raises(DataError):
             DirichletStatistics.load(path)
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval.calibration.beliefs import BANDS, CELLS, LOOKS, BeliefCalibrationRun
-from eval.calibration.beliefs_report import add_up, curves, landings, pooled, write_belief_report
+from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
+from eval.calibration.beliefs_report import add_up, curves, landing_table, pooled, write_belief_report
 from eval.search.config import SearchConfig
 from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
@@ -42,7 +42,7 @@ def config(tmp_path_factory):
     return SearchConfig(
         data=DataConfig(limit=2, max_target_area=0.5),
         belief=BeliefConfig(columns=4, rows=3, **write_models(folder)),
-        protocol=ProtocolConfig(shifts=LOOKS[-1] - 1),
+        protocol=ProtocolConfig(shifts=COUNTS[-1] - 1),
         cache=folder / "cache",
         out=folder / "out",
         workers=1,
@@ -103,11 +103,11 @@ def test_sums_match_beliefs_updated_step_by_step(run):
                 assert list(judged["looks"]) == ["1", "5"]
                 for looked in (1, 5):
                     seen, p = path[:looked], probabilities[name][looked - 1]
-                    groups = {cell: [] for cell in CELLS}
+                    groups = {cell: [] for cell in CELL_GROUPS}
                     for cell in range(12):
                         closest = min(math.dist(grid.centres[cell], grid.centres[f]) for f in seen) / max(grid.size)
                         band = sum(closest > edge for edge in BANDS)
-                        groups[CELLS[0 if cell in seen else 1 + band]].append((float(p[cell]), bool(goal[cell])))
+                        groups[CELL_GROUPS[0 if cell in seen else 1 + band]].append((float(p[cell]), bool(goal[cell])))
                     got = judged["looks"][str(looked)]
                     assert set(got) == {name for name, cells in groups.items() if cells}
                     for group, cells in groups.items():
@@ -179,26 +179,29 @@ def test_searches_add_up_by_belief_looks_and_group():
         {
             "seen": True,
             "beliefs": {
-                "a": {"looks": {"1": {"fixated": cells((0.9, True)), CELLS[1]: cells((0.2, False))}}, "landing": [0, 1]}
+                "a": {
+                    "looks": {"1": {"fixated": cells((0.9, True)), CELL_GROUPS[1]: cells((0.2, False))}},
+                    "landing": [0, 1],
+                }
             },
         },
         {
             "seen": False,
             "beliefs": {"a": {"looks": {"1": {"fixated": cells((0.5, False), (0.7, True))}}, "landing": [0.5, 0.25]}},
         },
-        {"seen": None, "beliefs": {"a": {"looks": {"1": {CELLS[2]: cells((0.1, False))}}, "landing": None}}},
+        {"seen": None, "beliefs": {"a": {"looks": {"1": {CELL_GROUPS[2]: cells((0.1, False))}}, "landing": None}}},
     ]
     sums = add_up(searches)
     assert {key: each.count for key, each in sums.items()} == {
         ("a", 1, "fixated"): 3,
-        ("a", 1, CELLS[1]): 1,
-        ("a", 1, CELLS[2]): 1,
+        ("a", 1, CELL_GROUPS[1]): 1,
+        ("a", 1, CELL_GROUPS[2]): 1,
     }
     every = pooled(sums, "a", 1)
     assert (every.count, every.rate) == (5, 0.4)
     assert every.brier == pytest.approx((0.01 + 0.04 + 0.25 + 0.09 + 0.01) / 5)
     panels, errors = curves(sums)
     assert torch.equal(panels["after 1 look"]["a"], every.bins)
-    assert errors == {"a": {group: sums["a", 1, group].ece for group in CELLS[:3]}}
+    assert errors == {"a": {group: sums["a", 1, group].ece for group in CELL_GROUPS[:3]}}
     means = ["3", "0.250 → 0.625"]
-    assert landings(searches) == [["a", "2", means[1], "1", "0.000 → 1.000", "1", "0.500 → 0.250"]]
+    assert landing_table(searches) == [["a", "2", means[1], "1", "0.000 → 1.000", "1", "0.500 → 0.250"]]

@@ -7,8 +7,8 @@ import torch
 
 from semfov import Grid
 from semfov.belief import ContextPrior
-from train.context.fit import count_pairs, cross_fit, judge, occupation, shrunk_ratio
-from train.context.settings import FitContextConfig, Places
+from train.context.fit import count_pairs, cross_fit, judge_context, occupation, shrunk_ratio
+from train.context.settings import FitContextConfig, ObjectPlaces
 from train.context.weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
 from train.fit_context import main
 
@@ -25,7 +25,7 @@ def places():
         occupied = torch.rand(20, 4, generator=generator) < 0.2
         occupied[:, 0] = False
         present = occupied.any(0).nonzero()[:, 0].tolist()
-        made.append(Places(occupied, [k for k in present if k < 3], grid, 5))
+        made.append(ObjectPlaces(occupied, [k for k in present if k < 3], grid, 5))
     return made
 
 
@@ -81,7 +81,7 @@ def test_ratios_are_shrunk_towards_those_of_all_classes():
 def test_likelihood_without_context_is_the_share_of_target_cells(places):
     prior = ContextPrior(["a", "b", "c"], torch.zeros(4, 2, 2), torch.zeros(4, 4, 3), EDGES)
     shares = [place.occupied[:, k].float().mean().log() for place in places for k in place.targets]
-    for row in judge(prior, places, 4):
+    for row in judge_context(prior, places, 4):
         assert row["log_likelihood"] == pytest.approx(float(torch.stack(shares).mean()), abs=1e-5)
         assert row["pairs"] == len(shares)
         assert (row["gain"], row["error"]) == pytest.approx((0, 0), abs=1e-6)
@@ -90,7 +90,7 @@ def test_likelihood_without_context_is_the_share_of_target_cells(places):
 def test_gain_is_the_mean_over_photographs(places):
     place = torch.randn(4, 2, 2, generator=torch.Generator().manual_seed(5))
     prior = ContextPrior(["a", "b", "c"], place, torch.zeros(4, 4, 3), EDGES)
-    judged = {row["context"]: row for row in judge(prior, places, 4)}
+    judged = {row["context"]: row for row in judge_context(prior, places, 4)}
     gains = []
     for each in places:
         values = [prior.place_at(each.grid)[k].softmax(0)[each.occupied[:, k]].sum().log() for k in each.targets]
@@ -103,7 +103,7 @@ def test_gain_is_the_mean_over_photographs(places):
 
 def test_a_prior_is_weighted_on_pictures_that_it_did_not_count(places):
     config = FitContextConfig(resolution=4, edges=EDGES, weigh=6, folds=3)
-    square = [Places(place.occupied[:16], place.targets, Grid(4, 4, (80, 60)), 5) for place in places]
+    square = [ObjectPlaces(place.occupied[:16], place.targets, Grid(4, 4, (80, 60)), 5) for place in places]
     folds = cross_fit(square, range(1, 12), ("a", "b", "c"), config)
     assert sum(len(part) for _, part in folds) == 6
     others = [i for i in range(1, 12) if i not in folds[0][1]]

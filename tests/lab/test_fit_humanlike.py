@@ -22,7 +22,7 @@ from semfov.gaze.choice import drawn_by
 from semfov.observation.foveal import FovealObservationModel
 from train.fit_humanlike import main
 from train.humanlike.habits import AGES, EDGES, ORDER, Halves, fit_terms, habits_of
-from train.humanlike.viewings import Choices, cells_of, choices_in, values_in
+from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -36,7 +36,7 @@ def people():
 
 
 def test_choices_equal_a_loop_over_fixations():
-    cells, count = cells_of(people(), GRID)
+    cells, count = fixated_cells(people(), GRID)
     assert count.tolist() == [4, 3, 2, 0, 1]
     choices = choices_in(cells, count, GRID, 6, torch.arange(1, 6))
     expected = []
@@ -64,7 +64,7 @@ def test_values_match_the_beliefs_of_each_person():
     """Person by person, look by look."""
     model = FovealObservationModel(1 + 3 * torch.rand(3, 2, 3), [0.4], ["cup", "cat"]).requires_grad_(False)
     observer, value, seen = Semantic(3), NegativeEntropy(model, GRID), random_detections()
-    cells, count = cells_of(people(), GRID)
+    cells, count = fixated_cells(people(), GRID)
     got = values_in(StoredLooks(seen, GRID), observer, lambda cell: value, cells, count)
     expected = []
     for row in ([0, 5, 0, 11], [3, 3, 3], [7, 2]):

@@ -8,10 +8,10 @@ import pytest
 
 import eval.comparison.page as module
 from eval.comparison.page import choose_episodes, write_run_report
-from eval.explore import report as explore_report
+from eval.explore import exploration_report as explore_report
 from eval.explore.config import ExploreConfig
 from eval.explore.run import ExploreRun
-from eval.search import report as search_report
+from eval.search import search_report
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
@@ -47,7 +47,7 @@ def write_search(run, records, **options):
         curves,
         titles=search_report.AVERAGES,
         label="targets found (%)",
-        shifts=search_report.SHIFTS,
+        shifts=search_report._SHIFTS,
         others={"random, by formula": search_report.expected_random(records, 5, 12)},
         **options,
     )
@@ -76,7 +76,7 @@ def test_the_page_of_a_search_run_shows_curves_and_episodes(searched):
 
 def test_the_size_limit_leaves_one_episode(searched, monkeypatch):
     run, records = searched
-    monkeypatch.setattr(module, "LIMIT", 1)
+    monkeypatch.setattr(module, "MOST_BYTES", 1)
     _, _, data = write_search(run, records)
     assert len(data["episodes"]) == 1
 
@@ -91,7 +91,7 @@ def test_the_page_of_an_exploration_run_shows_episodes_as_recorded(settings):
         curves,
         titles={"all classes": "all classes"},
         label="cells with the right class (%)",
-        shifts=explore_report.SHIFTS,
+        shifts=explore_report._SHIFTS,
     )
     data = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
     assert [episode["target"] for episode in data["episodes"]] == [None, None]

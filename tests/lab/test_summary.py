@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from eval.comparison.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv
-from eval.explore import report as explore_report
-from eval.search import report as search_report
+from eval.explore import exploration_report as explore_report
+from eval.search import search_report
 from semfov.metrics.exploration import success_rate
 from semfov.runs.tables import percent
 

@@ -16,7 +16,7 @@ import torch
 
 from semfov.belief.fusion import kaplan
 from semfov.errors import DataError, InputError
-from semfov.io.compatibility import NETWORKS, check_detector
+from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 
@@ -442,6 +442,8 @@ def test_bad_arguments_are_named(call):
 
 def test_conversions_of_one_checkpoint_count_as_one_detector():
     pair = sorted(digest for digest, name in NETWORKS.items() if name == "yolox-nano")
-    check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]}, "model")
+    check_same_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]}, "model")
     with pytest.raises(InputError, match="the model was fitted for"):
-        check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64}, "model")
+        check_same_detector(
+            {"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64}, "model"
+        )

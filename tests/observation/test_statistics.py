@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semfov.errors import DataError, InputError
-from semfov.io.storage import write
+from semfov.io.storage import write_file
 from semfov.observation import DirichletStatistics
 
 
@@ -121,15 +121,15 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(DataError, match="not a readable"):
         DirichletStatistics.load(path)
-    write(path, {"count": torch.zeros(2)}, {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 32})
+    write_file(path, {"count": torch.zeros(2)}, {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 32})
     with pytest.raises(DataError, match="matching shapes"):
         DirichletStatistics.load(path)
-    write(path, {}, {"kind": "something else"})
+    write_file(path, {}, {"kind": "something else"})
     with pytest.raises(DataError, match="something else"):
         DirichletStatistics.load(path)
     count, sums = torch.zeros(2, dtype=torch.int64), torch.zeros(3, 2, 4, dtype=torch.int64)
     record = {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 20}
-    write(path, {"count": count, "sums": sums}, record)
+    write_file(path, {"count": count, "sums": sums}, record)
     with pytest.raises(DataError, match=r"2\^-32"):
         DirichletStatistics.load(path)
 

@@ -11,10 +11,10 @@ import torch
 from matplotlib.figure import Figure
 
 from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
-from semfov.decision import CloserLook, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 from semfov.paths import GazeRecord, HeadPath, Moment, Record, ZoomPath
 from semfov.zoom import Lattice, Objects
 from semfov.zoom.glances import Glance, around, on_lattice
@@ -50,7 +50,7 @@ def scanpath():
         values=torch.rand(3, 12, generator=generator),
         found=True,
         decision=Decision("found", 0.9, 6, BOX, 0.8),
-        closer=(CloserLook(1, 1, 6, BOX, 0.8, 0.9),),
+        closer=(CloseUp(1, 1, 6, BOX, 0.8, 0.9),),
         ending="decision",
         seconds=({"detect": 0.5}, {"detect": 0.25}, {"detect": 0.125}),
     )
@@ -76,7 +76,7 @@ def zoom_path():
         values=(float("inf"), 0.1 + 0.2, 0.75),
         objects=objects,
         decision=Decision("found", 0.9, None, BOX, 0.8),
-        closer=(CloserLook(None, 1, None, BOX, 0.8, 0.9, number=2),),
+        closer=(CloseUp(None, 1, None, BOX, 0.8, 0.9, number=2),),
         ending="decision",
     )
 
@@ -221,11 +221,11 @@ def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path)
         "more": 1,
         "classes": ["cup"],
     }.items():
-        write(other, tensors, {**values, name: changed})
+        write_file(other, tensors, {**values, name: changed})
         with pytest.raises(DataError, match=f"expected a complete {kind}"):
             type(record).load(other)
     for name in tensors.keys() - {"box"}:
-        write(other, {key: value for key, value in tensors.items() if key != name}, values)
+        write_file(other, {key: value for key, value in tensors.items() if key != name}, values)
         with pytest.raises(DataError, match=name):
             type(record).load(other)
 
@@ -241,7 +241,7 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         (tensors, {**values, "windows": windows}, "windows: expected levels below"),
         (tensors, {**values, "closer": [{**values["closer"][0], "number": 3}]}, "closer"),
     ):
-        write(file, parts, record)
+        write_file(file, parts, record)
         with pytest.raises(DataError, match=message):
             ZoomPath.load(file)
     head_path().save(file)
@@ -257,7 +257,7 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
             "decision.cell",
         ),
     ):
-        write(file, parts, record)
+        write_file(file, parts, record)
         with pytest.raises(DataError, match=message):
             HeadPath.load(file)
 
@@ -301,7 +301,7 @@ def test_scanpaths_that_version_0_1_saved_are_loaded():
     assert loaded.seconds == ({"detect": 0.5}, {"detect": 0.25, "weigh": 0.125})
     box = torch.tensor([0.0, 0, 4, 4])
     assert same(loaded.decision, Decision("found", 0.9375, 0, box, 0.9375))
-    assert same(loaded.closer, (CloserLook(1, 1, 0, box, 0.9375, 0.875),))
+    assert same(loaded.closer, (CloseUp(1, 1, 0, box, 0.9375, 0.875),))
     assert (loaded.ending, loaded.found) == ("decision", True)
     assert same(loaded.stimulus.photograph, torch.arange(96, dtype=torch.uint8).view(3, 4, 8))
     assert [view.shape for view in loaded.views()] == [(3, 4, 8)] * 2

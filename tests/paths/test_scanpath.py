@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from semfov import ActivePerception, Detections, Eye, Foveation, Grid, InputError, Scanpath, observers, policies
-from semfov.decision import CloserLook, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.detection import Candidates, Detector, Placement
 from semfov.errors import DataError
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 from semfov.paths import Stimulus
 from semfov.paths.stimulus import LONGEST
 from semfov.sensor.foveation import foveate
@@ -214,7 +214,7 @@ def variants(scanpath):
         "found": replace(scanpath, found=True, target=2, decision=Decision("found", 0.1 + 0.2, 7, torch.rand(4))),
         "closer": replace(
             scanpath,
-            closer=(CloserLook(0, 2, 3, torch.rand(4), 0.2, 0.4), CloserLook(1, 1, 0, torch.rand(4), 0.7, 0.8)),
+            closer=(CloseUp(0, 2, 3, torch.rand(4), 0.2, 0.4), CloseUp(1, 1, 0, torch.rand(4), 0.7, 0.8)),
             decision=Decision("found", 0.8, 0, torch.rand(4), 0.7),
         ),
         "absent": replace(scanpath, target=1, decision=Decision("absent", 1e-300), ending="decision"),
@@ -291,7 +291,7 @@ def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp
         if named in ("decision", "closer", "ending", "target", "placement", "settings") and len(told) < len(record):
             continue
         path = tmp_path / f"{number}.safetensors"
-        write(path, parts, {"kind": "scanpath", **told})
+        write_file(path, parts, {"kind": "scanpath", **told})
         with pytest.raises(DataError, match="expected a complete scanpath") as caught:
             Scanpath.load(path)
         assert named in str(caught.value), (named, caught.value)
@@ -304,7 +304,7 @@ def test_other_files_are_refused(scanpath, tmp_path):
     save_file({"x": torch.zeros(1)}, path)
     with pytest.raises(DataError, match="without its record"):
         Scanpath.load(path)
-    write(path, {"x": torch.zeros(1)}, {"kind": "observation model"})
+    write_file(path, {"x": torch.zeros(1)}, {"kind": "observation model"})
     with pytest.raises(DataError, match="expected a file of kind scanpath"):
         Scanpath.load(path)
     path.write_bytes(b"not a tensor")

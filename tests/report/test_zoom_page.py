@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.decision import CloserLook, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.errors import InputError
 from semfov.report import Pool, episode_data, page_html, zoom_data
 from semfov.report.zoom import LISTED, SHOWN
@@ -95,7 +95,7 @@ def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_pic
 
 def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     path = replace(
-        zoom_path, closer=(CloserLook(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=2),), ending="decision"
+        zoom_path, closer=(CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=2),), ending="decision"
     )
     data = zoom_data(path, large_picture, pool := Pool(), name="field")
     assert data["decision"].endswith("0.93. A closer look confirmed the target.")

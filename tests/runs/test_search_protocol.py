@@ -12,7 +12,7 @@ from semfov.data import Annotation
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.search_protocol import Outcome, episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import EpisodeOutcome, episodes_of, run_episodes, tie_noise
 from semfov.strategy import Strategy
 from tests.small import FixedLook
 
@@ -73,7 +73,7 @@ def search_by_loop(episode, look, noise, shifts):
     for shift in range(shifts + 1):
         cells.append(cell)
         if cell in episode.goal:
-            return Outcome(tuple(cells), shift)
+            return EpisodeOutcome(tuple(cells), shift)
         for likelihood, footprint in zip(look.likelihood[cell], look.footprint[cell], strict=True):
             for covered in footprint.nonzero()[:, 0].tolist():
                 row = torch.from_numpy(beta[covered])
@@ -85,7 +85,7 @@ def search_by_loop(episode, look, noise, shifts):
         best = max(posterior[c] for c in free)
         tied = [c for c in free if posterior[c] > best * (1 - 1e-6)]
         cell = max(tied, key=lambda c: float(noise[shift, c]))
-    return Outcome(tuple(cells[: shifts + 1]), -1)
+    return EpisodeOutcome(tuple(cells[: shifts + 1]), -1)
 
 
 @pytest.mark.parametrize("ties", ["random", "first"])

@@ -21,7 +21,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import scene_run
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
-from semfov.runs.results import Parts
+from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import finish, gather
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, 
 
 def test_a_part_of_another_image_is_not_loaded(tmp_path):
     digest = {"now": "a" * 64}
-    parts = Parts(tmp_path, "1-2", lambda index: digest["now"])
+    parts = SceneResults(tmp_path, "1-2", lambda index: digest["now"])
     parts.save(3, [{"policy": "random"}], {"look": 0.5})
     assert parts.load(3)["records"] == [{"policy": "random"}]
     digest["now"] = "b" * 64
@@ -111,7 +111,7 @@ def test_a_part_of_another_image_is_not_loaded(tmp_path):
     ],
 )
 def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
-    parts = Parts(tmp_path, "1-2", lambda index: "a")
+    parts = SceneResults(tmp_path, "1-2", lambda index: "a")
     parts.save(0, [{"policy": "random"}], {"look": 0.5})
     part = damage(json.loads(parts.path(0).read_text()))
     if isinstance(part, dict) and {"records", "seconds"} <= part.keys():
@@ -121,7 +121,7 @@ def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
 
 
 def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
-    parts = Parts(tmp_path, "1-2", lambda index: "a")
+    parts = SceneResults(tmp_path, "1-2", lambda index: "a")
     parts.folder.mkdir()
     for content in (b"[" * 100_000, b"\xff\xfe", b"", b'{"key": 1' * 9):
         parts.path(0).write_bytes(content)

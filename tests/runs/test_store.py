@@ -7,7 +7,7 @@ import torch
 
 from semfov.detection import Detections
 from semfov.runs import store as store_module
-from semfov.runs.looks import SOURCES
+from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.store import DetectionStore, cell_store
 from semfov.runs.zoom_store import GlanceStore
@@ -41,7 +41,7 @@ def cells(folder, **settings):
 
 
 def poses(folder, **settings):
-    return DetectionStore(folder, {"fields": [60.0], **settings}, (*SOURCES, "semfov.head.views"), 4)
+    return DetectionStore(folder, {"fields": [60.0], **settings}, (*LOOK_SOURCES, "semfov.head.views"), 4)
 
 
 def windows(folder, **settings):

@@ -53,9 +53,9 @@ def test_names_in_links_double_backticks_and_plain_text_are_not_linked(names):
 
 def test_names_of_internal_functions_are_collected(names):
     inside = set()
-    text = names.link("`semfov.fit.evidence.objective`", inside)
-    assert text == "[`semfov.fit.evidence.objective`][semfov.fit.evidence.objective]"
-    assert inside == {"semfov.fit.evidence.objective"}
+    text = names.link("`semfov.fit.evidence.evidence_objective`", inside)
+    assert text == "[`semfov.fit.evidence.evidence_objective`][semfov.fit.evidence.evidence_objective]"
+    assert inside == {"semfov.fit.evidence.evidence_objective"}
 
 
 def test_a_docstring_becomes_markdown(names):

@@ -151,7 +151,7 @@ def test_entropy_is_that_of_normalised_probabilities():
 
 def test_the_demo_lists_classes_and_their_cells():
     """One line for each class: its number of cells, its highest probability and the cell of that."""
-    lines = demo.told("picture", marginal_map()).splitlines()
+    lines = demo.path_table("picture", marginal_map()).splitlines()
     start = lines.index("what is where:")
     assert lines[start + 1 : start + 3] == [
         "  cat: 4 cells, p up to 0.95 at (3, 1)",
@@ -161,8 +161,8 @@ def test_the_demo_lists_classes_and_their_cells():
 
 def test_the_demo_reports_an_empty_map():
     empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
-    told = demo.told("picture", scanpath_of(empty, 6))
+    told = demo.path_table("picture", scanpath_of(empty, 6))
     assert told.rstrip().endswith("what is where:\n  nothing that is more probable than background")
     one = empty.clone()
     one[-1, 5, 2] = 0.97
-    assert "  cup: 1 cell, p up to 0.97 at (5, 0)" in demo.told("picture", scanpath_of(one, 6)).splitlines()
+    assert "  cup: 1 cell, p up to 0.97 at (5, 0)" in demo.path_table("picture", scanpath_of(one, 6)).splitlines()

@@ -13,7 +13,7 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError
-from semfov.io.storage import read, write
+from semfov.io.storage import read, write_file
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
 from semfov.zoom.glances import Glance, Glances, on_lattice
@@ -239,9 +239,11 @@ def test_the_verification_is_saved_with_the_evidence(tmp_path):
     tensors, record = read(tmp_path / "own.safetensors", "glimpse-evidence")
     # Files of earlier versions have neither tensors nor record of a verification.
     old = {name: tensor for name, tensor in tensors.items() if not name.startswith("verification")}
-    write(tmp_path / "old.safetensors", old, {name: each for name, each in record.items() if name != "verification"})
+    write_file(
+        tmp_path / "old.safetensors", old, {name: each for name, each in record.items() if name != "verification"}
+    )
     assert GlimpseEvidence.from_pretrained(tmp_path / "old.safetensors").verification is None
     for parts in ((old, record), (tensors, json.loads(json.dumps(record)) | {"verification": None})):
-        write(tmp_path / "half.safetensors", *parts)
+        write_file(tmp_path / "half.safetensors", *parts)
         with pytest.raises(DataError, match="not a complete model of evidence"):
             GlimpseEvidence.from_pretrained(tmp_path / "half.safetensors")

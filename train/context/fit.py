@@ -13,11 +13,11 @@ from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, check
 from semfov.fit.outputs import model_path, training_of, write_outputs
 from semfov.metrics.averages import standard_error
-from semfov.runs.samples import SampleSettings, collect
+from semfov.runs.samples import SampleSettings, collect_samples
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
 from semfov.runs.workers import rank
-from train.context.settings import FitContextConfig, Places, read_places
+from train.context.settings import FitContextConfig, ObjectPlaces, read_places
 from train.context.weights import fit_weights, make_cases
 
 
@@ -29,7 +29,9 @@ def fit_context(config: FitContextConfig) -> None:
     sampler, samples, scenes = None, None, None
     if config.weigh:
         settings = SampleSettings.of(config)
-        sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+        sampler, samples = collect_samples(
+            settings, (config.cache or config.out) / "samples", config.workers, "looking"
+        )
         scenes = sampler.scenes
     if rank() > 0:
         return
@@ -38,8 +40,10 @@ def fit_context(config: FitContextConfig) -> None:
     held_out = [index % config.holdout == 0 for index in range(len(places))]
     known = [place for place, out in zip(places, held_out, strict=True) if not out]
     given = table_prior(config, scenes.classes)
-    prior = fit(known, scenes.classes, config) if given is None else given
-    judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
+    prior = count_context(known, scenes.classes, config) if given is None else given
+    judged = judge_context(
+        prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects
+    )
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
     metadata = training_of(config, scenes, "table", "source", "heights") | prior.metadata
     if sampler is not None and samples is not None:
@@ -53,11 +57,11 @@ def fit_context(config: FitContextConfig) -> None:
     )
     path = model_path(config, "context")
     model.save(path)
-    text = report(judged, weights, len(known), config)
+    text = context_report(judged, weights, len(known), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
 
-def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConfig) -> ContextPrior:
+def count_context(places: Sequence[ObjectPlaces], classes: Sequence[str], config: FitContextConfig) -> ContextPrior:
     """Count the context in photographs.
 
     Args:
@@ -95,7 +99,7 @@ def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrio
 
 
 def cross_fit(
-    places: Sequence[Places],
+    places: Sequence[ObjectPlaces],
     usable: Sequence[int],
     classes: Sequence[str],
     config: FitContextConfig,
@@ -119,12 +123,12 @@ def cross_fit(
     for fold in range(config.folds):
         part = [index for position, index in enumerate(chosen) if position % config.folds == fold]
         kept = set(usable).difference(part)
-        prior = fit([places[index] for index in sorted(kept)], classes, config) if given is None else given
+        prior = count_context([places[index] for index in sorted(kept)], classes, config) if given is None else given
         folds.append((prior, part))
     return folds
 
 
-def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
+def occupation(places: Sequence[ObjectPlaces], smoothing: float) -> Tensor:
     r"""Estimate the probability that a class occupies each cell, given that it is in the picture.
 
     .. math:: P(k \in x) = \frac{n_k(x) + s \, \bar P(x)}{n_k + s}
@@ -153,7 +157,7 @@ def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
     return (there + smoothing * average) / (pictures[:, None] + smoothing)
 
 
-def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:
+def count_pairs(places: Sequence[ObjectPlaces], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:
     r"""Count the cells of class k by their distance to the nearest object of class j.
 
     .. math:: O_{kjn} = \sum_i \sum_{x \in k} [\text{band}_j(x) = n], \qquad
@@ -217,7 +221,7 @@ def shrunk_ratio(observed: Tensor, expected: Tensor, class_smoothing: float, pai
     return ratio
 
 
-def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> list[dict[str, object]]:
+def judge_context(prior: ContextPrior, places: Sequence[ObjectPlaces], min_objects: int) -> list[dict[str, object]]:
     r"""Evaluate how well context predicts the position of a class when all other objects are known.
 
     The measure is the mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and
@@ -266,13 +270,13 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
     return rows
 
 
-def _landing(context: ContextPrior, place: Places, target: int, weights: tuple[float, float]) -> Tensor:
+def _landing(context: ContextPrior, place: ObjectPlaces, target: int, weights: tuple[float, float]) -> Tensor:
     """Log probability that a fixation drawn from the context lands on the target."""
     value = context(place.occupied[None].float(), place.grid, target, weights)[0]
     return value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0)
 
 
-def report(
+def context_report(
     judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], known: int, config: FitContextConfig
 ) -> str:
     """Report the fitted context and its evaluation on held-out photographs as Markdown."""

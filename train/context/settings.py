@@ -11,7 +11,7 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes, legal_targets
 from semfov.fit.settings import FovealFitConfig
 from semfov.runs.config import WorkConfig
-from semfov.runs.settings import Count, Name, Positive, Range, Share, Side, Weight, Whole
+from semfov.runs.settings import Count, Positive, Range, Share, Side, SingleName, Weight, Whole
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class FitContextConfig(FovealFitConfig, WorkConfig):
         heights: CSV table of classes by heights in a picture, to use with `table`.
     """
 
-    name: Name = "coco"
+    name: SingleName = "coco"
     resolution: Side = 10
     edges: tuple[Weight, ...] = (0.0, 0.15, 0.35)
     max_target_area: Positive = 0.2
@@ -67,7 +67,7 @@ class FitContextConfig(FovealFitConfig, WorkConfig):
 
 
 @dataclass(frozen=True)
-class Places:
+class ObjectPlaces:
     """The annotated objects of one photograph on a grid.
 
     Attributes:
@@ -83,7 +83,7 @@ class Places:
     objects: int
 
 
-def read_places(scenes: Scenes, config: FitContextConfig) -> list[Places]:
+def read_places(scenes: Scenes, config: FitContextConfig) -> list[ObjectPlaces]:
     """Find the cells that the objects of every photograph overlap."""
     places = []
     for index in range(len(scenes)):
@@ -94,5 +94,5 @@ def read_places(scenes: Scenes, config: FitContextConfig) -> list[Places]:
         for label in annotation.labels.unique().tolist():
             occupied[:, label] = covered[annotation.labels == label].any(0)
         targets = [t for t in legal_targets(annotation, config.max_target_area) if not occupied[:, t].all()]
-        places.append(Places(occupied, targets, grid, len(annotation.labels)))
+        places.append(ObjectPlaces(occupied, targets, grid, len(annotation.labels)))
     return places

@@ -16,7 +16,7 @@ from semfov.belief.observers.context import log_odds
 from semfov.gaze.selection import best_cells
 from semfov.runs.samples import Sampler, Samples
 from semfov.runs.seeds import generator_for
-from train.context.settings import FitContextConfig, Places
+from train.context.settings import FitContextConfig, ObjectPlaces
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def make_cases(
     sampler: Sampler,
     samples: Samples,
     folds: Sequence[tuple[ContextPrior, Sequence[int]]],
-    places: Sequence[Places],
+    places: Sequence[ObjectPlaces],
     config: FitContextConfig,
 ) -> Cases:
     """Compute beliefs after a random number of looks at random cells without the target.

@@ -31,13 +31,13 @@ from semfov.runs.config import (
 from semfov.runs.presets import label, resolve
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import saliency_table
-from semfov.runs.scene_run import cache_folder
+from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Positive
 from semfov.runs.setup import make_eye, prepare_worker
 from semfov.runs.store import cell_store
 from train.humanlike.habits import Halves, fit_terms, habits_of
-from train.humanlike.report import report
-from train.humanlike.viewings import Choices, cells_of, choices_in, values_in
+from train.humanlike.report import humanlike_report
+from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
     names = [label(choice, "exploration") for choice in config.policies]
     if config.save is not None:
         lookup(config.save, names, "policy to save")
-    choices, size, eye = gather(config)
+    choices, size, eye = gather_choices(config)
     columns, rows = config.belief.columns, config.belief.rows
     halves = Halves.of(choices, Grid(columns, rows, size), config.smoothing)
     models = {name: fit_terms(halves, name, config.ridge) for name in [None, *names]}
@@ -92,12 +92,12 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
     path = model_path(config, eye.detector.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     habits.save(path)
-    text = report(halves, [model for several in models.values() for model in several], habits)
+    text = humanlike_report(halves, [model for several in models.values() for model in several], habits)
     figures = [model.figures() for several in models.values() for model in several]
     write_outputs(config, text, ("bits.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
-def gather(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
+def gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
     """Gather people's choices with the value that every policy gives to each cell.
 
     Args:
@@ -139,7 +139,7 @@ class Viewer:
             for name, policy in self.policies.items()
         }
         size = config.belief.columns, config.belief.rows
-        self.store = cell_store(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *size, components)
 
     def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
         """Gather the choices of all people in a picture.
@@ -163,7 +163,7 @@ class Viewer:
             )
         grid = Grid(self.config.belief.columns, self.config.belief.rows, size)
         seen = look_everywhere(self.eye, lambda: image[None], grid, self.store, lambda: digest)
-        cells, count = cells_of(records, grid)
+        cells, count = fixated_cells(records, grid)
         values = {}
         for name in self.policies:
             candidate = self.candidate(name, image, grid)

@@ -85,7 +85,7 @@ class Halves:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedTerms:
     """Some terms of the model, fitted together.
 
     Attributes:
@@ -112,7 +112,7 @@ class Fitted:
         return {**vars(self), "terms": list(self.terms), "weights": self.weights.tolist()}
 
 
-def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[Fitted]:
+def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTerms]:
     """Add the terms one after another, and fit all of them again each time.
 
     Args:
@@ -134,7 +134,7 @@ def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[Fitted]:
         error = float(standard_error(over.numpy()))
         even = float(mean_by_picture(held_out, halves.held_out.picture).mean())
         mean = float(mean_by_picture(fitted, halves.fitted.picture).mean())
-        found.append(Fitted(policy, terms, weights, mean, even, float(over.mean()), error))
+        found.append(FittedTerms(policy, terms, weights, mean, even, float(over.mean()), error))
     return found
 
 
@@ -167,7 +167,7 @@ def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tup
     return torch.cat(parts, -1)
 
 
-def habits_of(model: Fitted, halves: Halves) -> GazeHabits:
+def habits_of(model: FittedTerms, halves: Halves) -> GazeHabits:
     """Convert a fitted model with all terms into a `GazeHabits`, which draws fixations."""
     assert model.terms == ORDER
     pull, centre, *rest = model.weights.tolist()

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from semfov.gaze.habits import GazeHabits
 from semfov.runs.tables import table
-from train.humanlike.habits import AGES, EDGES, Fitted, Halves
+from train.humanlike.habits import AGES, EDGES, FittedTerms, Halves
 
 _TERMS = {"policy": "policy", "centre": "centre bias", "steps": "saccade length", "return": "return"}
 
 
-def report(halves: Halves, models: Sequence[Fitted], habits: GazeHabits) -> str:
+def humanlike_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
     """Write the report as Markdown."""
     sizes = halves.sizes
     rows = [

@@ -53,7 +53,7 @@ class Choices:
         return cls(**tensors, values=values)
 
 
-def cells_of(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor]:
+def fixated_cells(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor]:
     """Convert people's fixations to cells. Fixations outside the picture are left out.
 
     Args:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from eval.human.searching.config import PeopleSearchConfig
-from eval.human.searching.report import report
+from eval.human.searching.report import searching_report
 from eval.human.searching.run import PeopleSearchRun
 from eval.human.searching.scores import Beside, People
 from eval.human.searching.trials import drawn_searches, read_searches
@@ -20,7 +20,7 @@ from semfov.errors import DataError, check
 from semfov.runs.scene_run import finish, gather
 from semfov.runs.workers import rank
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 RANDOM, CENTRE = "random draws", "centre draws"
 
@@ -63,7 +63,7 @@ def compare(config: PeopleSearchConfig) -> None:
         few = {name: searches for name, searches in few.items() if searches}
         title = f"the {len(here)} available pictures"
         tables[title] = _scored({**few, **policies}, few["people"], grid, config)
-    report(config, tables, {**floors, **policies})
+    searching_report(config, tables, {**floors, **policies})
 
 
 def _scored(
@@ -83,7 +83,7 @@ def _floor(name: str, people: Sequence[Fixations], grid: Grid, config: PeopleSea
     return drawn_searches(trials, grid, config.screen.start, density, longest=longest, seed=protocol.seed, name=name)
 
 
-def _centre(people: Sequence[Fixations], grid: Grid) -> Array:
+def _centre(people: Sequence[Fixations], grid: Grid) -> _Array:
     """How often people fixate each cell after their first fixation in all pictures, plus one."""
     points = np.concatenate([each.points[1:] for each in people])
     counts = torch.bincount(grid.cell_of(torch.from_numpy(points)), minlength=len(grid))

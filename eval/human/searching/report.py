@@ -25,7 +25,7 @@ from semfov.viz.style import save_figure
 
 Rows = Mapping[str, Beside]
 
-HEAD = (
+_HEAD = (
     "area under performance",
     "TFP-AUC",
     "probability mismatch",
@@ -36,7 +36,9 @@ HEAD = (
 )
 
 
-def report(config: PeopleSearchConfig, tables: Mapping[str, Rows], scanpaths: Mapping[str, list[Fixations]]) -> None:
+def searching_report(
+    config: PeopleSearchConfig, tables: Mapping[str, Rows], scanpaths: Mapping[str, list[Fixations]]
+) -> None:
     """Write all output and print the tables.
 
     Args:
@@ -77,7 +79,7 @@ def _cells(each: Beside) -> list[tuple[float, float]]:
 
 def _table(rows: Rows) -> list[str]:
     body = [[name, *(_shown(*cell) for cell in _cells(each))] for name, each in rows.items()]
-    return table([["", *HEAD], *body])
+    return table([["", *_HEAD], *body])
 
 
 def _shown(value: float, error: float) -> str:
@@ -90,7 +92,7 @@ def _csv(tables: Mapping[str, Rows]) -> str:
     lines = [["table", "row", "figure", "value", "error"]]
     for title, rows in tables.items():
         for name, each in rows.items():
-            named = dict(zip(HEAD, _cells(each), strict=True))
+            named = dict(zip(_HEAD, _cells(each), strict=True))
             if each.alike:
                 named |= {f"MultiMatch {what}": each.mean(n) for n, what in enumerate(DIMENSIONS)}
             lines += [[title, name, what, f"{value:.5f}", f"{error:.5f}"] for what, (value, error) in named.items()]

@@ -7,14 +7,14 @@ import torch
 from eval.comparison.run import Run
 from eval.human.searching.config import PeopleSearchConfig
 from eval.human.searching.screens import Screens
-from eval.human.searching.trials import goal_cells, read_searches
+from eval.human.searching.trials import goal_rectangle, read_searches
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
-from semfov.runs.results import Record
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Episode, run_episodes, tie_noise
 
 
@@ -36,20 +36,20 @@ class PeopleSearchRun(Run):
         self.screens = Screens(config.pictures, known, self.eye.detector.classes)
         return self.screens
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run a search on a screen with each policy; returns records, and the seconds that each stage took."""
         watch, protocol, grid = Stopwatch(), self.config.protocol, self.grid(index)
         detections = self.detections(index)
         watch.lap("look")
         name = self.screens.ids[index]
         search = self.screens.searches[name]
-        left, right, top, bottom = goal_cells(search, grid)
+        left, right, top, bottom = goal_rectangle(search, grid)
         goal = tuple(y * grid.columns + x for y in range(top, bottom + 1) for x in range(left, right + 1))
         start = int(grid.cell_of(torch.tensor(self.config.screen.start)))
         (target,) = self.scenes.targets(index)
         episode = Episode(index, target, target, 0, start, goal, True)
         noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
-        records: list[Record] = []
+        records: list[ResultRecord] = []
         for policy in self.policies:
             candidate = self.candidate(policy, index)
             with torch.inference_mode():
@@ -61,7 +61,7 @@ class PeopleSearchRun(Run):
             records.append({"policy": policy, "scene": name, "target_name": search.target, **found})
         return records, watch.seconds
 
-    def searches(self, records: list[Record]) -> dict[str, list[Fixations]]:
+    def searches(self, records: list[ResultRecord]) -> dict[str, list[Fixations]]:
         """The policies' scanpaths in pixels of the screen, by policy."""
         screen = self.config.screen
         centres = Grid(self.config.belief.columns, self.config.belief.rows, (screen.width, screen.height)).centres

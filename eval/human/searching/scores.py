@@ -27,7 +27,7 @@ from semfov.metrics.scanpath import (
 from semfov.metrics.scanpath.sequence import fitted_clusters, labels_by
 from semfov.metrics.search import cumulative_performance
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 DIMENSIONS = ("shape", "direction", "length", "position")
 """The dimensions of MultiMatch that need no fixation durations."""
@@ -47,12 +47,12 @@ class Beside:
         alike: by picture `(6,)`: four dimensions of MultiMatch, sequence score, and edit distance to people.
     """
 
-    curve: Array
+    curve: _Array
     area: tuple[float, float]
     tfp_auc: tuple[float, float]
     mismatch: float
     ratio: tuple[float, float]
-    alike: Mapping[str, Array]
+    alike: Mapping[str, _Array]
 
     def mean(self, figure: int) -> tuple[float, float]:
         """Mean over pictures of one measure of `alike`, and its standard error."""
@@ -111,7 +111,7 @@ class People:
             self._alike(searches),
         )
 
-    def _alike(self, searches: Sequence[Fixations]) -> dict[str, Array]:
+    def _alike(self, searches: Sequence[Fixations]) -> dict[str, _Array]:
         themselves = {id(each) for each in self.searches}
         alike = {}
         for name, ours in by_picture(searches).items():
@@ -160,6 +160,6 @@ class People:
         return float((sums / len(categories)).std(ddof=1))
 
 
-def _mean_and_error(values: Array) -> tuple[float, float]:
+def _mean_and_error(values: _Array) -> tuple[float, float]:
     """Mean and standard error; NaN if there are too few values."""
     return (float(values.mean()), float(standard_error(values))) if len(values) else (float("nan"), float("nan"))

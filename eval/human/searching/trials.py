@@ -15,7 +15,7 @@ from semfov.errors import DataError
 from semfov.metrics.scanpath import found_at, merge_close
 from semfov.runs.seeds import generator_for
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
 def read_searches(path: Path, screen: tuple[int, int], subject: str | None = None) -> list[Fixations]:
@@ -56,7 +56,7 @@ def shift_found(search: Fixations, longest: int) -> int:
     return at if at < longest else -1
 
 
-def goal_cells(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
+def goal_rectangle(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
     """First and last column, and first and last row, of the cells that the target's box overlaps."""
     assert search.box is not None
     step = np.array(search.size) / (grid.columns, grid.rows)
@@ -65,7 +65,7 @@ def goal_cells(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
     return int(first[0]), int(last[0]), int(first[1]), int(last[1])
 
 
-def in_cells(search: Fixations, grid: Grid) -> Array:
+def in_cells(search: Fixations, grid: Grid) -> _Array:
     """The fixated cells of a search, up to the first on the target.
 
     Successive fixations in the same cell are merged into one (`merge_close`), and all fixations after the first one in
@@ -80,7 +80,7 @@ def in_cells(search: Fixations, grid: Grid) -> Array:
     """
     step = np.array(search.size) / (grid.columns, grid.rows)
     path = merge_close(np.clip(np.floor(search.points / step), 0, (grid.columns - 1, grid.rows - 1)), (1, 1))
-    left, right, top, bottom = goal_cells(search, grid)
+    left, right, top, bottom = goal_rectangle(search, grid)
     x, y = path.T
     on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
     return path[: on.argmax() + 1] if on.any() else path
@@ -90,7 +90,7 @@ def drawn_searches(
     searches: Sequence[Fixations],
     grid: Grid,
     start: tuple[float, float],
-    density: Array,
+    density: _Array,
     *,
     longest: int,
     seed: int,
@@ -119,7 +119,7 @@ def drawn_searches(
         weights[first] = 0
         others = weights.multinomial(longest - 1, generator=generator).numpy()
         cells = np.concatenate([[first], others])
-        left, right, top, bottom = goal_cells(each, grid)
+        left, right, top, bottom = goal_rectangle(each, grid)
         x, y = cells % grid.columns, cells // grid.columns
         on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
         cells = cells[: on.argmax() + 1] if on.any() else cells

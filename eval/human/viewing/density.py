@@ -21,7 +21,7 @@ It is negligible against thousands of fixations, but it determines the weight of
 
 
 @dataclass(frozen=True)
-class Weights:
+class DensityWeights:
     """Weights of the terms of a density.
 
     Attributes:
@@ -37,7 +37,7 @@ class Weights:
     bits: float
 
 
-def standardised(maps: Tensor) -> Tensor:
+def standardised_maps(maps: Tensor) -> Tensor:
     """Standardise maps `(E, H, W)` to mean 0 and standard deviation 1; a constant map becomes 0."""
     return over_cells(maps.flatten(-2)).view_as(maps)
 
@@ -58,7 +58,7 @@ def log_densities(terms: Sequence[Tensor], weights: Tensor) -> Tensor:
     return total - total.logsumexp((-1, -2), keepdim=True)
 
 
-def fit(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float = 0.0) -> Weights:
+def fit_density(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float = 0.0) -> DensityWeights:
     """Fit the weights of a density by maximum likelihood (`semfov.gaze.log_linear`).
 
     Args:
@@ -75,10 +75,10 @@ def fit(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float
     features = torch.stack([term.expand(len(bins), -1, -1).flatten(1) for term in terms], -1)
     weights = fit_log_linear(features, bins[:, 1] * width + bins[:, 0], ridge=RIDGE).to(features)
     with torch.no_grad():
-        likelihood = float(at(log_densities(terms, weights), bins).mean())
-    return Weights(tuple(names), weights, blur, (likelihood + math.log(height * width)) / math.log(2))
+        likelihood = float(values_in_bins(log_densities(terms, weights), bins).mean())
+    return DensityWeights(tuple(names), weights, blur, (likelihood + math.log(height * width)) / math.log(2))
 
 
-def at(maps: Tensor, bins: Tensor) -> Tensor:
+def values_in_bins(maps: Tensor, bins: Tensor) -> Tensor:
     """Values `(E,)` of maps `(E, H, W)` in the bins `(E, 2)`."""
     return maps.expand(len(bins), -1, -1)[torch.arange(len(bins)), bins[:, 1], bins[:, 0]]

@@ -19,7 +19,7 @@ from semfov.io.schema import Field, Schema
 from semfov.runs.candidates import Candidate
 from semfov.runs.store import SceneStore, looks_digest
 
-SOURCES = ("semfov.runs.candidates", "semfov.gaze.policies", "semfov.gaze.saliency", "semfov.episode", __name__)
+_SOURCES = ("semfov.runs.candidates", "semfov.gaze.policies", "semfov.gaze.saliency", "semfov.episode", __name__)
 """Modules that the maps depend on, in addition to those of a look."""
 
 
@@ -33,7 +33,7 @@ class MapStore(SceneStore):
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object], cells: int) -> None:
-        super().__init__(folder, what, looks_digest(*SOURCES), Schema({"values": Field(("E", cells))}))
+        super().__init__(folder, what, looks_digest(*_SOURCES), Schema({"values": Field(("E", cells))}))
 
 
 class FineLooks(Looks):
@@ -59,7 +59,7 @@ class FineLooks(Looks):
         return Sight(self._weighed[1][row], lambda: self.detections[row], Stopwatch().seconds)
 
 
-def follow(looks: Looks, candidates: Mapping[str, Candidate], scanpaths: Sequence[Tensor]) -> dict[str, Tensor]:
+def evaluate_along(looks: Looks, candidates: Mapping[str, Candidate], scanpaths: Sequence[Tensor]) -> dict[str, Tensor]:
     """Evaluate policies along given scanpaths.
 
     The scanpaths are given, so policies with the same kind of observer have the same belief: one rollout serves them

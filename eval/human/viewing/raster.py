@@ -55,7 +55,7 @@ def events_of(people: Sequence[Fixations], raster: Grid, grid: Grid, longest: in
     bins, before, visited, number, person, cells, fine = [], [], [], [], [], [], []
     for index, each in enumerate(people):
         points = torch.from_numpy(each.points[:longest])
-        found, cell = places(raster, points), grid.cell_of(points)
+        found, cell = bins_of(raster, points), grid.cell_of(points)
         cells.append(cell)
         fine.append(raster.cell_of(points))
         bins.append(found[1:])
@@ -74,7 +74,7 @@ def events_of(people: Sequence[Fixations], raster: Grid, grid: Grid, longest: in
     )
 
 
-def places(raster: Grid, points: Tensor) -> Tensor:
+def bins_of(raster: Grid, points: Tensor) -> Tensor:
     """Column and row of the bin of each point, `(n, 2)`."""
     bins = raster.cell_of(points)
     return torch.stack([bins % raster.columns, bins // raster.columns], -1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eval.comparison.summary import announce, sensing, write_files
 from eval.human.viewing.rows import PEOPLE, Half
 from eval.human.viewing.run import ViewingRun
-from eval.human.viewing.scores import FIGURES, Scored
+from eval.human.viewing.scores import MEASURES, Scored
 from eval.human.viewing.sequences import drawn_scanpaths
 from semfov.io.files import clean
 from semfov.metrics.averages import standard_error
@@ -21,8 +21,8 @@ from semfov.runs.scene_run import gather
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-Array = NDArray[np.float64]
-Table = Mapping[tuple[str, str], Scored]
+_Array = NDArray[np.float64]
+_Table = Mapping[tuple[str, str], Scored]
 
 GROUPS = {
     "alone": "each map alone; its weight (an inverse temperature) and its blur are fitted",
@@ -33,10 +33,10 @@ FLOORS = {"alone": "centre bias", "with habits": "nearby"}
 """Row of the baseline without any map, by group."""
 
 
-def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], reported: Half) -> None:
+def viewing_report(run: ViewingRun, scored: _Table, sequences: Mapping[str, _Array], reported: Half) -> None:
     """Write all output and print the tables."""
     records, seconds = gather(run)
-    summary = summary_markdown(run, scored, sequences)
+    summary = viewing_summary(run, scored, sequences)
     tables = {
         "summary.md": summary,
         "summary.csv": summary_csv(scored),
@@ -46,11 +46,11 @@ def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], repor
     }
     written = write_files(run, "eval.human", tables, records, seconds)
     written.append(draw_shifts(run, scored))
-    written += draw_scanpaths(run, scored, reported)
+    written += draw_viewings(run, scored, reported)
     announce(summary, written)
 
 
-def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> str:
+def viewing_summary(run: ViewingRun, scored: _Table, sequences: Mapping[str, _Array]) -> str:
     """The tables of both groups and of sequence scores, as Markdown."""
     pictures = len(next(iter(scored.values())).pictures)
     lines = []
@@ -90,11 +90,11 @@ def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Arr
     return "\n".join(lines)
 
 
-def summary_csv(scored: Table) -> str:
+def summary_csv(scored: _Table) -> str:
     """Means and standard errors over pictures of every row, as CSV."""
     lines = [["row", "group", "figure", "mean", "error", "pictures"]]
     for (name, group), each in scored.items():
-        for number, figure in enumerate(FIGURES):
+        for number, figure in enumerate(MEASURES):
             values = each.pictures[:, number]
             lines.append(
                 [name, group, figure, f"{values.mean():.6f}", f"{standard_error(values):.6f}", str(len(values))]
@@ -102,10 +102,10 @@ def summary_csv(scored: Table) -> str:
     return _csv(lines)
 
 
-def pictures_csv(run: ViewingRun, scored: Table) -> str:
+def pictures_csv(run: ViewingRun, scored: _Table) -> str:
     """Scores of every row and picture, as CSV."""
     ids = run.scenes.ids[0 if run.config.swap else 1 :: 2]
-    lines = [["picture", "row", "group", *FIGURES]]
+    lines = [["picture", "row", "group", *MEASURES]]
     for (name, group), each in scored.items():
         lines += [
             [str(i), name, group, *(f"{v:.5f}" for v in values)] for i, values in zip(ids, each.pictures, strict=True)
@@ -113,7 +113,7 @@ def pictures_csv(run: ViewingRun, scored: Table) -> str:
     return _csv(lines)
 
 
-def weights_csv(scored: Table) -> str:
+def weights_csv(scored: _Table) -> str:
     """The fitted weights, and the likelihood of the fitted half under them, as CSV."""
     lines = [["row", "group", "term", "weight", "blur", "bits of the fitted half"]]
     for (name, group), each in scored.items():
@@ -123,7 +123,7 @@ def weights_csv(scored: Table) -> str:
     return _csv(lines)
 
 
-def sequences_csv(sequences: Mapping[str, Array]) -> str:
+def sequences_csv(sequences: Mapping[str, _Array]) -> str:
     """Sequence scores of every row and picture, as CSV."""
     lines = [["row", "picture number", "sequence score"]]
     for name, values in sequences.items():
@@ -131,7 +131,7 @@ def sequences_csv(sequences: Mapping[str, Array]) -> str:
     return _csv(lines)
 
 
-def draw_shifts(run: ViewingRun, scored: Table) -> Path:
+def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
     """Draw NSS after each gaze shift, for rows with habits."""
     from semfov.viz.human import plot_by_shift
 
@@ -155,7 +155,7 @@ def draw_shifts(run: ViewingRun, scored: Table) -> Path:
     return save_figure(figure, run.config.out / "nss_by_shift.png")
 
 
-def draw_scanpaths(run: ViewingRun, scored: Table, reported: Half) -> list[Path]:
+def draw_viewings(run: ViewingRun, scored: _Table, reported: Half) -> list[Path]:
     """Draw scanpaths of four people, of `landing` and of `nearby` in the same pictures."""
     from semfov.viz.human import plot_scanpaths_beside
 
@@ -170,7 +170,7 @@ def draw_scanpaths(run: ViewingRun, scored: Table, reported: Half) -> list[Path]
     return written
 
 
-def _figure(values: Array) -> str:
+def _figure(values: _Array) -> str:
     return f"{values.mean():.3f} ± {standard_error(values):.3f}"
 
 

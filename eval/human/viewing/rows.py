@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from eval.human.viewing.density import Weights, fit, log_densities, standardised
+from eval.human.viewing.density import DensityWeights, fit_density, log_densities, standardised_maps
 from eval.human.viewing.raster import Events, Habits, blurred, enlarged
 from eval.human.viewing.run import ViewingRun
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 HABITS = ("centre bias", "distance", "return")
 """Predictors of fixations in any picture: position, distance from the last fixation, and earlier visits."""
@@ -85,7 +85,7 @@ class Half:
             smooth = blurred(maps, blur)
             if name == PEOPLE:  # a density is used as its logarithm, after a small constant is added
                 smooth = (smooth / smooth.sum((-1, -2), keepdim=True) + 0.1 / (height * width)).log()
-            terms.append(standardised(smooth).expand(len(chosen), -1, -1))
+            terms.append(standardised_maps(smooth).expand(len(chosen), -1, -1))
         known = {
             "centre bias": lambda: self.habits.centre.expand(len(chosen), -1, -1),
             "distance": lambda: self.habits.near(events.before[chosen]),
@@ -103,7 +103,7 @@ def people_maps(events: Events, rows: int, columns: int) -> Tensor:
     return others[events.person].view(-1, rows, columns)
 
 
-def fit_row(row: Row, half: Half) -> Weights:
+def fit_row(row: Row, half: Half) -> DensityWeights:
     """Fit the weights and the blur of a row by maximum likelihood."""
     density = half.run.config.density
     names = [*row.maps, *row.habits]
@@ -118,16 +118,16 @@ def fit_row(row: Row, half: Half) -> Weights:
     parts = [(place, chosen) for place, chosen in parts if len(chosen)]
     bins = torch.cat([half.events[place].bins[chosen] for place, chosen in parts])
     if not names:
-        return Weights((), torch.zeros(0), 0.0, 0.0)
+        return DensityWeights((), torch.zeros(0), 0.0, 0.0)
     blurs = [each for each in density.blurs if not (PEOPLE in row.maps and each == 0)] if row.maps else [0.0]
     fits = []
     for blur in blurs:
         split = [half.terms(row, place, blur, chosen) for place, chosen in parts]
-        fits.append(fit(names, [torch.cat(term) for term in zip(*split, strict=True)], bins, blur))
+        fits.append(fit_density(names, [torch.cat(term) for term in zip(*split, strict=True)], bins, blur))
     return max(fits, key=lambda each: each.bits)
 
 
-def score_row(row: Row, weights: Weights, half: Half, place: int) -> Array:
+def score_row(row: Row, weights: DensityWeights, half: Half, place: int) -> _Array:
     """NSS, AUC and bits above a uniform density for each event of a picture, `(E, 3)`."""
     events = half.events[place]
     every = torch.arange(len(events))

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from eval.comparison.run import Run
 from eval.human.viewing.config import ViewingConfig
-from eval.human.viewing.follow import FineLooks, MapStore, follow
+from eval.human.viewing.follow import FineLooks, MapStore, evaluate_along
 from eval.human.viewing.raster import Events, enlarged, events_of
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Landing
@@ -25,13 +25,13 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Looks, Stopwatch, StoredLooks
 from semfov.errors import DataError, InputError
-from semfov.gaze.policies import Objects, Task
+from semfov.gaze.policies import ObjectSeeking, Task
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import one_thread
-from semfov.runs.results import Record
-from semfov.runs.saliency_store import SALIENCY_MODELS
-from semfov.runs.scene_run import cache_folder, digest_of
+from semfov.runs.results import ResultRecord
+from semfov.runs.saliency_store import SALIENCY_CLASSES
+from semfov.runs.scene_run import digest_of, store_folder
 from semfov.strategy import Strategy
 
 LANDING = "landing"
@@ -52,7 +52,7 @@ class ViewingRun(Run):
     def __init__(self, config: ViewingConfig) -> None:
         super().__init__(config)
         cells, bins = len(self.grid(0)), config.density.columns * config.density.rows
-        cache, common = cache_folder(config.cache) / "viewing", self._what()
+        cache, common = store_folder(config.cache) / "viewing", self._what()
         beliefs = {name: asdict(policy) for name, policy in self.policies.items()}
         self.map_stores = {
             name: MapStore(cache, {**common, "policy": policy}, cells) for name, policy in beliefs.items()
@@ -103,7 +103,7 @@ class ViewingRun(Run):
             person = class_index("person", classes)
         except InputError:
             person = None
-        return Candidate(Strategy(Landing(len(classes), person), Objects()))
+        return Candidate(Strategy(Landing(len(classes), person), ObjectSeeking()))
 
     def raster(self, index: int) -> Grid:
         """The raster of a picture."""
@@ -148,15 +148,15 @@ class ViewingRun(Run):
         if kept is not None:
             return kept["values"]
         with one_thread(), torch.inference_mode():
-            if name in SALIENCY_MODELS:
-                saliency = SALIENCY_MODELS[name]()(self.scenes[index].image[None])
+            if name in SALIENCY_CLASSES:
+                saliency = SALIENCY_CLASSES[name]()(self.scenes[index].image[None])
                 columns, rows = self._raster_size
                 found = {name: F.adaptive_avg_pool2d(saliency, (rows, columns)).flatten(1)}
             else:
                 events = self.events(index)
                 paths = events.fine if name == LANDING else events.cells
                 alike = {each: self.candidate(each, index) for each in self._alike(name)}
-                found = follow(self.looks(name, index), alike, paths)
+                found = evaluate_along(self.looks(name, index), alike, paths)
         if self.config.store:
             for each, values in found.items():
                 self.map_stores[each].write(digest, {"values": values.float().contiguous()})
@@ -179,7 +179,7 @@ class ViewingRun(Run):
         fine = values.shape[-1] == columns * rows
         return enlarged(values, self.raster(index) if fine else self.grid(index), rows, columns)
 
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Compute all maps of a picture; returns its number of events, and the seconds that each stage took."""
         watch = Stopwatch()
         self.detections(index)

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from eval.human.viewing.density import Weights
+from eval.human.viewing.density import DensityWeights
 from eval.human.viewing.raster import Habits
 from eval.human.viewing.rows import Half, Row, fit_row, rows_of, score_row
 from eval.human.viewing.run import ViewingRun
 from semfov.errors import check
 from semfov.metrics.averages import standard_error
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
-FIGURES = ("NSS", "AUC", "log likelihood")
+MEASURES = ("NSS", "AUC", "log likelihood")
 """Conditional scores of each fixation; the log likelihood is in bits above a uniform density."""
 
 
@@ -29,14 +29,14 @@ class Scored:
     Attributes:
         row: the row.
         weights: the fitted weights of its terms.
-        pictures: `(P, 3)`, mean of each of `FIGURES` over the fixations of each picture.
+        pictures: `(P, 3)`, mean of each of `MEASURES` over the fixations of each picture.
         shifts: `(P, N, 3)`, the same over the fixations after 1, 2, … gaze shifts; NaN where a picture has none.
     """
 
     row: Row
-    weights: Weights
-    pictures: Array
-    shifts: Array
+    weights: DensityWeights
+    pictures: _Array
+    shifts: _Array
 
     def difference(self, other: Scored, figure: int = 0) -> tuple[float, float]:
         """Mean difference of a score from that of another row, paired by picture, and its standard error."""
@@ -71,5 +71,5 @@ def score_all(run: ViewingRun, fitted: Half, reported: Half, *, longest: int = 8
     return found
 
 
-def _mean(values: Array) -> Sequence[float]:
+def _mean(values: _Array) -> Sequence[float]:
     return list(values.mean(0)) if len(values) else [float("nan")] * values.shape[1]

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from eval.human.viewing.density import Weights, log_densities, standardised
-from eval.human.viewing.raster import Habits, blurred, enlarged, places
+from eval.human.viewing.density import DensityWeights, log_densities, standardised_maps
+from eval.human.viewing.raster import Habits, bins_of, blurred, enlarged
 from eval.human.viewing.rows import PEOPLE, Half
 from eval.human.viewing.scores import Scored
 from semfov.belief.grid import Grid
@@ -19,10 +19,10 @@ from semfov.gaze.choice import Choice
 from semfov.metrics.scanpath import cluster_labels, sequence_score
 from semfov.runs.seeds import generator_for
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
-class Drawn(Choice):
+class DensityChoice(Choice):
     """Draws the next fixation from a density over the bins.
 
     Args:
@@ -37,7 +37,7 @@ class Drawn(Choice):
 
     def __init__(
         self,
-        weights: Weights,
+        weights: DensityWeights,
         habits: Habits,
         raster: Grid,
         grid: Grid,
@@ -64,7 +64,7 @@ class Drawn(Choice):
             seen.scatter_(1, self.grid.cell_of(points)[:, None], 1.0)
         known = {
             "centre bias": lambda: self.habits.centre.expand(count, -1, -1),
-            "distance": lambda: self.habits.near(places(self.raster, last)),
+            "distance": lambda: self.habits.near(bins_of(self.raster, last)),
             "return": lambda: enlarged(seen, self.grid, height, width),
         }
         terms = []
@@ -72,7 +72,7 @@ class Drawn(Choice):
             if name in known:
                 terms.append(known[name]())
             elif maps is not None:
-                terms.append(standardised(blurred(maps, self.weights.blur)).expand(count, -1, -1))
+                terms.append(standardised_maps(blurred(maps, self.weights.blur)).expand(count, -1, -1))
         flat = torch.zeros(count, height, width)
         density = log_densities(terms, self.weights.values).expand(count, -1, -1) if terms else flat
         bins = density.flatten(1).double().softmax(-1).multinomial(1, generator=self.generator)[:, 0]
@@ -80,7 +80,7 @@ class Drawn(Choice):
         return self.points[-1]
 
 
-def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
+def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[_Array]:
     """Draw one scanpath for each person of a picture, with the same first fixation and the same length."""
     run, index = half.run, half.pictures[place]
     people = run.people[str(run.scenes.ids[index])]
@@ -90,13 +90,13 @@ def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
     raster, grid = run.raster(index), run.grid(index)
     name = scored.row.maps[0] if scored.row.maps else None
     if name is None or name in run.config.models:
-        choice = Drawn(scored.weights, half.habits, raster, grid, raster, start, generator)
+        choice = DensityChoice(scored.weights, half.habits, raster, grid, raster, start, generator)
         maps = None if name is None else run.maps(name, index)
         for _ in range(max(lengths) - 1):
             choice.draw(maps)
     else:
         looks, candidate = run.looks(name, index), run.candidate(name, index)
-        choice = Drawn(scored.weights, half.habits, raster, grid, looks.grid, start, generator)
+        choice = DensityChoice(scored.weights, half.habits, raster, grid, looks.grid, start, generator)
         with torch.inference_mode():
             for _ in rollout(
                 looks,
@@ -111,7 +111,7 @@ def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
     return [path[:length] for path, length in zip(paths, lengths, strict=True)]
 
 
-def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[str, Array]:
+def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[str, _Array]:
     """Sequence scores of the rows that the settings name, of files and of people, as means over pairs of scanpaths.
 
     A drawn scanpath is compared with those of all people except the person whose first fixation it shares. A scanpath
@@ -149,7 +149,7 @@ def _key(name: str, scored: dict[tuple[str, str], Scored]) -> tuple[str, str] | 
     return next((key for key in ((name, "with habits"), (name, "alone")) if key in scored), None)
 
 
-def _words(paths: list[Array], every: Array, bandwidth: float) -> list[list[int]]:
+def _words(paths: list[_Array], every: _Array, bandwidth: float) -> list[list[int]]:
     labels = cluster_labels(np.concatenate(paths), every, bandwidth).tolist()
     ends = np.cumsum([len(path) for path in paths]).tolist()
     return [labels[start:end] for start, end in zip([0, *ends], ends, strict=False)]

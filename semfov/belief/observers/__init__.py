@@ -8,7 +8,7 @@ from semfov.belief.observers.base import Look, Observer
 from semfov.belief.observers.context import Context, ContextBelief
 from semfov.belief.observers.landing import Landing, LandingBelief, LandingLook
 from semfov.belief.observers.learned_map import LearnedMap, MapBelief, MapLook
-from semfov.belief.observers.semantic import Memory, Semantic, SemanticLook
+from semfov.belief.observers.semantic import CellMemory, Semantic, SemanticLook
 from semfov.belief.observers.target import Target, TargetBelief
 
 __all__ = [
@@ -24,7 +24,7 @@ __all__ = [
     "Look",
     "MapBelief",
     "MapLook",
-    "Memory",
+    "CellMemory",
     "Observer",
     "Semantic",
     "SemanticLook",

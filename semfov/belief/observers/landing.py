@@ -14,7 +14,7 @@ from semfov.belief.observers.base import Look, Observer, own
 from semfov.detection.detections import Detections
 from semfov.errors import check
 
-HEAD = 0.18
+_HEAD = 0.18
 """Height of a person's head below the top of the box, in heights of the box."""
 
 
@@ -124,7 +124,7 @@ class Landing(Observer):
             person = torch.zeros_like(mask) if self.person is None else scores.argmax(-1) == self.person - 1
             share = torch.where(person, 0.15, 0.25).to(scores)
             across, down = ((share * side).clamp(min=floor) for side in (x2 - x1, y2 - y1))
-            height = y1 + torch.where(person, HEAD, 0.5).to(scores) * (y2 - y1)
+            height = y1 + torch.where(person, _HEAD, 0.5).to(scores) * (y2 - y1)
             # Coordinates of boxes and of pixel centres differ by half a pixel.
             x = (centres[:, 0] + 0.5 - ((x1 + x2) / 2)[..., None]) / across[..., None]
             y = (centres[:, 1] + 0.5 - height[..., None]) / down[..., None]

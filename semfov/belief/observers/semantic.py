@@ -17,10 +17,10 @@ from semfov.belief.observers.base import Look, Observer, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
 
-Memory = Literal["all", "closest"]
+CellMemory = Literal["all", "closest"]
 
 
-class MissModel(Protocol):
+class MissLikelihood(Protocol):
     """Protocol of a model of miss rates, as `semfov.FovealObservationModel` is one."""
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class Semantic(Observer):
     """
 
     observation: Observation | None
-    misses: MissModel | None
+    misses: MissLikelihood | None
 
     def __init__(
         self,
@@ -112,20 +112,20 @@ class Semantic(Observer):
         fusion: str = "kaplan",
         footprint: Footprint = "overlap",
         tempering: float = 1.0,
-        memory: Memory = "all",
-        misses: MissModel | None = None,
+        memory: CellMemory = "all",
+        misses: MissLikelihood | None = None,
     ) -> None:
         super().__init__()
         check(prior > 0, "prior", "a positive number", prior)
         lookup(fusion, RULES, "fusion rule")
-        lookup(memory, get_args(Memory), "memory")
+        lookup(memory, get_args(CellMemory), "memory")
         self.components = components
         self.observation = observation
         self.prior = prior
         self.fusion = fusion
         self.footprint: Footprint = footprint
         self.tempering = tempering
-        self.memory: Memory = memory
+        self.memory: CellMemory = memory
         self.misses = misses
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.fixations.files import MILLISECONDS, PIXELS, durations_of, points_of, read_json, write_json
-from semfov.data.fixations.record import Box, Fixations
+from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.io.schema import Anything, Array, Maybe, Number, Object, Text
 
 _TRIAL = Object(
@@ -111,7 +111,7 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
     write_json(path, trials)
 
 
-def _edges(box: list[float] | None) -> Box | None:
+def _edges(box: list[float] | None) -> ObjectBox | None:
     if box is None:
         return None
     left, top, width, height = map(float, box)

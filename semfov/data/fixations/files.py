@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semfov.data.fixations.record import Array
+from semfov.data.fixations.record import FixationValues
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, write_text
 from semfov.io.schema import Array as ListOf
@@ -55,14 +55,14 @@ def check_record(kind: Json, path: Path, name: str, value: Any) -> None:
         raise DataError(f"{path}: {str(error).lstrip('.: ') or 'unexpected content'}") from None
 
 
-def points_of(path: Path, name: str, x: list[float], y: list[float]) -> Array:
+def points_of(path: Path, name: str, x: list[float], y: list[float]) -> FixationValues:
     """Points `(n, 2)` from lists of x and y."""
     if len(x) != len(y):
         raise DataError(f"{path}: {name}: expected as many Y as X, got {len(x)} X and {len(y)} Y")
     return np.stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)], axis=1)
 
 
-def durations_of(path: Path, name: str, times: list[float] | None, count: int) -> Array | None:
+def durations_of(path: Path, name: str, times: list[float] | None, count: int) -> FixationValues | None:
     """The first `count` durations; a scanpath that was cut at its target may have more durations, but not fewer."""
     if times is None:
         return None

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from semfov.data.fixations.screen import Letterbox, resized_box, resized_points
 from semfov.errors import check
 
-Array = NDArray[np.float64]
-Box = tuple[float, float, float, float]
+FixationValues = NDArray[np.float64]
+ObjectBox = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class Fixations:
 
     picture: str
     subject: str
-    points: Array
+    points: FixationValues
     size: tuple[int, int]
-    durations: Array | None = None
+    durations: FixationValues | None = None
     target: str | None = None
-    box: Box | None = None
+    box: ObjectBox | None = None
     found: bool | None = None
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from semfov.data.fixations.files import MILLISECONDS, PIXELS, SIDE, durations_of, points_of, read_json, write_json
-from semfov.data.fixations.record import Box, Fixations
+from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Anything, Array, Maybe, Number, Object, Text
 
@@ -163,7 +163,7 @@ def coco_name(name: str) -> str:
     return "0" + name[1:]
 
 
-def _edges(rows_and_columns: list[float] | None, cells: bool) -> Box | None:
+def _edges(rows_and_columns: list[float] | None, cells: bool) -> ObjectBox | None:
     if rows_and_columns is None:
         return None
     top, left, bottom, right = map(float, rows_and_columns)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from semfov.errors import check
 
-Array = NDArray[np.float64]
-Size = tuple[int, int]
+_Array = NDArray[np.float64]
+_Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Letterbox:
     array([[319.5, 239.5]])
     """
 
-    screen: Size
-    picture: Size
+    screen: _Size
+    picture: _Size
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -47,7 +47,7 @@ class Letterbox:
         across, down = (whole - self.scale * part for whole, part in zip(self.screen, self.picture, strict=True))
         return across / 2, down / 2
 
-    def to_picture(self, points: Array) -> Array:
+    def to_picture(self, points: _Array) -> _Array:
         """Convert points from the screen to the picture.
 
         Args:
@@ -58,7 +58,7 @@ class Letterbox:
         """
         return np.asarray((points + 0.5 - self.offset) / self.scale - 0.5)
 
-    def to_screen(self, points: Array) -> Array:
+    def to_screen(self, points: _Array) -> _Array:
         """Convert points from the picture to the screen.
 
         Args:
@@ -93,7 +93,7 @@ class Letterbox:
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
-def resized_points(points: Array, size: Size, new: Size) -> Array:
+def resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
     """Convert points to pixels of the same frame at another size.
 
     Args:
@@ -112,11 +112,11 @@ def resized_points(points: Array, size: Size, new: Size) -> Array:
     return np.asarray((points + 0.5) * (np.array(new) / np.array(size)) - 0.5)
 
 
-def resized_box(box: tuple[float, ...], size: Size, new: Size) -> tuple[float, float, float, float]:
+def resized_box(box: tuple[float, ...], size: _Size, new: _Size) -> tuple[float, float, float, float]:
     """A box `(x1, y1, x2, y2)`, pixel edges, in pixels of the same frame at another size."""
     return _box(np.array(box).reshape(2, 2) * (np.array(new) / np.array(size)))
 
 
-def _box(corners: Array) -> tuple[float, float, float, float]:
+def _box(corners: _Array) -> tuple[float, float, float, float]:
     x1, y1, x2, y2 = corners.reshape(-1).tolist()
     return x1, y1, x2, y2

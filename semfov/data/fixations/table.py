@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semfov.data.fixations.record import Box, Fixations
+from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, write_text
 
@@ -96,7 +96,7 @@ def _record(path: Path, group: list[tuple[int, Mapping[str, str]]]) -> Fixations
     points = np.array([[_number(path, at, row, name) for name in ("x", "y")] for at, row in group])
     times = [_maybe(path, at, row, "duration") for at, row in group]
     edges = [_maybe(path, first, line, name) for name in ("x1", "y1", "x2", "y2")]
-    box: Box | None = None
+    box: ObjectBox | None = None
     if all(edge is not None for edge in edges):
         x1, y1, x2, y2 = (float(edge) for edge in edges if edge is not None)
         box = x1, y1, x2, y2

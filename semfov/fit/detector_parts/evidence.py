@@ -14,17 +14,17 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.decision import decide
 from semfov.episode import Step
 from semfov.errors import DataError
-from semfov.fit.detector_parts.part import SHIFTS, Fitted, PartFit, strategy
-from semfov.fit.detector_words import curves_figure, in_words, mean_percent, section, share
-from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge
-from semfov.fit.evidence import report as judged_report
+from semfov.fit.detector_parts.part import MAP_SHIFTS, Fitted, PartFit, strategy
+from semfov.fit.detector_words import curves_figure, in_words, mean_percent, percent_of, section
+from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge_evidence
+from semfov.fit.evidence import evidence_report as judged_report
 from semfov.fit.evidence_examples import make_examples
 from semfov.fit.held_out import Difference, Rule, by_detection, decisions, search_curves
 from semfov.gaze.policies import NonPredictive
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
-ABSENT = 1000
+_ABSENT = 1000
 """Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
 SUREST, SUREST_OF_FEW = 0.99, 0.9
 """Upper limit of the threshold for reporting a target as found. The second value is for few expected false alarms.
@@ -60,12 +60,12 @@ class EvidenceFit(PartFit):
         config, bench = self.settings, self.bench
         grid = Grid(config.columns, config.rows, (config.columns, config.rows))
         # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
-        each = max(config.classes, min(20, ABSENT // len(bench.held_out)))
+        each = max(config.classes, min(20, _ABSENT // len(bench.held_out)))
         area, scenes = config.max_target_area, bench.held_out
         wide = make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
         expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
         surest = SUREST_OF_FEW if expected < 10 else SUREST
-        return judge(replace(config, surest=surest), model, wide, grid)[1]
+        return judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
 
     def fit(self) -> Fitted:
         """Train, and compare searches and their decisions with those of raw scores."""
@@ -82,7 +82,7 @@ class EvidenceFit(PartFit):
         curves = search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
-        at = min(SHIFTS, protocol.shifts)
+        at = min(MAP_SHIFTS, protocol.shifts)
         gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
@@ -98,7 +98,7 @@ class EvidenceFit(PartFit):
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
         outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
         outcomes += [
-            [name, share(d.found), share(d.false_alarms), share(d.undecided), f"{d.looks:.1f}"]
+            [name, percent_of(d.found), percent_of(d.false_alarms), percent_of(d.undecided), f"{d.looks:.1f}"]
             for name, d in decided.items()
         ]
         report = "\n".join(

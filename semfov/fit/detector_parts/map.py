@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.errors import DataError, InputError
-from semfov.fit.detector_parts.part import SHIFTS, Fitted, PartFit, strategy
+from semfov.fit.detector_parts.part import MAP_SHIFTS, Fitted, PartFit, strategy
 from semfov.fit.detector_words import curves_figure, in_words, mean_percent, section
 from semfov.fit.held_out import Difference, explore_curves
 from semfov.fit.map_evidence import FitMapConfig, fit_map_evidence
@@ -48,7 +48,7 @@ class MapFit(PartFit):
         }
         protocol = bench.protocol
         curves = explore_curves(run, bench.judged, ways, protocol)
-        at = min(SHIFTS, protocol.shifts)
+        at = min(MAP_SHIFTS, protocol.shifts)
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):
             raise DataError("data: none of the held-out photographs contains an object; give more photographs")

@@ -15,7 +15,7 @@ from semfov.fit.observation import fit_model
 from semfov.fit.observation_settings import FitObservationConfig
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.samples import cells_of
+from semfov.runs.samples import whole_photograph
 from semfov.viz.style import save_figure
 
 
@@ -46,7 +46,7 @@ class ObservationFit(PartFit):
             )
         model = fit_model(config, run, samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
-        cells = cells_of(self.config.columns, self.config.rows)
+        cells = whole_photograph(self.config.columns, self.config.rows)
         misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()

@@ -15,7 +15,7 @@ from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.gaze.policies import Policy
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
-from semfov.model_folder import KINDS, Model
+from semfov.model_folder import KINDS, FolderModel
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
@@ -23,9 +23,9 @@ from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
 
-SHIFTS = 5
+MAP_SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
-LONGEST = 15
+_LONGEST = 15
 """Maximum number of gaze shifts in them."""
 
 
@@ -67,10 +67,10 @@ class Bench:
     @property
     def protocol(self) -> ProtocolConfig:
         """The protocol of these searches and explorations."""
-        shifts = min(LONGEST, self.config.columns * self.config.rows - 1)
+        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
         return ProtocolConfig(shifts=shifts, seed=self.config.seed)
 
-    def model(self, name: str) -> Model | None:
+    def model(self, name: str) -> FolderModel | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
         part = self.parts[name].part
         return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
@@ -132,7 +132,7 @@ class PartFit(ABC):
     def fit(self) -> Fitted:
         """Fit the part."""
 
-    def write(self, model: Model, used: bool, why: str) -> Part:
+    def write(self, model: FolderModel, used: bool, why: str) -> Part:
         """Write the model of the part and return its entry in the manifest."""
         file = f"{self.name}.safetensors"
         model.save(self.config.out / file)

@@ -8,7 +8,7 @@ import torch
 
 from semfov.belief.observers import Semantic
 from semfov.fit.detector_parts.part import Fitted, PartFit
-from semfov.fit.detector_words import in_words, section, share
+from semfov.fit.detector_words import in_words, percent_of, section
 from semfov.fit.held_out import Difference
 from semfov.fit.tempering import FitTemperingConfig, hit_rates, means_of
 from semfov.io.manifest import Part
@@ -56,8 +56,11 @@ class TemperingFit(PartFit):
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
             f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
-        rows = [["scores", "exponent", "next fixations that hit, %"], ["raw, every cell of a box", "1", share(before)]]
-        rows += [[way[0], f"{way[1]:g}", share(mean["held_out"])] for way, mean in means.items()]
+        rows = [
+            ["scores", "exponent", "next fixations that hit, %"],
+            ["raw, every cell of a box", "1", percent_of(before)],
+        ]
+        rows += [[way[0], f"{way[1]:g}", percent_of(mean["held_out"])] for way, mean in means.items()]
         report = section(
             f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
             f"photographs; the table shows results on {len(held_out)} held-out photographs.",

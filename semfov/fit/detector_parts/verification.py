@@ -13,18 +13,19 @@ from semfov.errors import DataError
 from semfov.fit.detector_parts.evidence import SUREST_OF_FEW
 from semfov.fit.detector_parts.part import Fitted, PartFit
 from semfov.fit.detector_words import in_words
-from semfov.fit.held_out import Array, Difference
+from semfov.fit.held_out import Difference
 from semfov.fit.outputs import training_of
-from semfov.fit.searches import photographs
+from semfov.fit.searches import open_photographs
 from semfov.fit.verification import (
     FitVerificationConfig,
     SearchEnd,
     VerifiedSearch,
     fit_in_folds,
-    report,
     shipped_mean,
+    verification_report,
 )
 from semfov.io.manifest import Part
+from semfov.metrics.averages import FloatArray
 
 ABSENT = 200
 """The threshold is chosen on about this many searches for absent classes, at most 20 in a photograph."""
@@ -56,7 +57,7 @@ class VerificationFit(PartFit):
         if not isinstance(evidence, TargetEvidence):
             why = "not fitted, since the agent does not use the target evidence"
             return Fitted(Part(None, None, False, why), f"{why.capitalize()}.")
-        seen = photographs(
+        seen = open_photographs(
             run.eye,
             run.scenes,
             judged,
@@ -94,10 +95,13 @@ class VerificationFit(PartFit):
             "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
             "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
-        return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, f"{len(seen)} photographs")[0])
+        return Fitted(
+            self.write(fitted.model, gain.better, why),
+            text + verification_report(fitted, f"{len(seen)} photographs")[0],
+        )
 
 
-def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> Array:
+def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> FloatArray:
     """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
 
     Args:

@@ -19,7 +19,7 @@ from semfov.gaze.policies.exploration import (
     Gain,
     Improvement,
     Negentropy,
-    Objects,
+    ObjectSeeking,
     Peaks,
     Surprise,
 )
@@ -52,7 +52,7 @@ __all__ = [
     "Negentropy",
     "Neighbourhood",
     "NonPredictive",
-    "Objects",
+    "ObjectSeeking",
     "Peaks",
     "Policy",
     "Predictive",

@@ -239,7 +239,7 @@ class Gain(Policy):
         return ExpectedGain(self.model, grid)
 
 
-class Objects(Policy):
+class ObjectSeeking(Policy):
     """Look at objects of any class (`semfov.acquisition.ObjectEvidence`).
 
     With the observer `semfov.observers.Landing` this is where people look.

@@ -12,7 +12,7 @@ from semfov.gaze.saliency.blur import enlarge
 Fusion = Literal["mean", "max"]
 
 
-def fuse(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion = "mean") -> Tensor:
+def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion = "mean") -> Tensor:
     """Mean or maximum of all maps, each enlarged to `size` by cubic interpolation.
 
     Fusion within and then across features gives the same result, because all features have the same number of maps.

@@ -28,7 +28,7 @@ _PEAK = 0.1
 _FLAT = 32
 
 
-def gaussian_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
+def dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     """Dyadic Gaussian pyramid (`cv2.pyrDown`).
 
     Args:
@@ -173,7 +173,7 @@ def conspicuity(image: Tensor) -> Tensor:
         `(B, 3, h, w)`.
     """
     levels = max(CENTRES) + max(DELTAS)
-    pyramid = gaussian_pyramid(anchor(double_opponency(image)), levels)
+    pyramid = dyadic_pyramid(anchor(double_opponency(image)), levels)
     features = [torch.cat([level, orientation_energy(level[:, :1])], 1) for level in pyramid[min(CENTRES) :]]
     total = torch.zeros((), dtype=image.dtype, device=image.device)
     for centre in CENTRES:
@@ -181,7 +181,7 @@ def conspicuity(image: Tensor) -> Tensor:
         around = [features[centre - min(CENTRES) + delta] for delta in DELTAS]
         maps = promote(torch.stack([across_scales(here, surround) for surround in around], 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
-        total = total + gaussian_pyramid(maps, max(CENTRES) - centre)[-1]
+        total = total + dyadic_pyramid(maps, max(CENTRES) - centre)[-1]
     intensity, colour, orientation = total.split([1, 2, len(ORIENTATIONS)], 1)
     parts = [intensity, colour.sum(1, keepdim=True), promote(orientation).sum(1, keepdim=True)]
     return torch.cat(parts, 1)

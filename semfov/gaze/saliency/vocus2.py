@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import gaussian_blur
-from semfov.gaze.saliency.conspicuity import Fusion, fuse, rescale
+from semfov.gaze.saliency.conspicuity import Fusion, combine_maps, rescale
 from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 ColorSpace = Literal["opponent", "lab"]
@@ -146,7 +146,7 @@ def vocus2_saliency(
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
-        saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
+        saliency = combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
     return rescale(saliency, flat) if normalise else saliency

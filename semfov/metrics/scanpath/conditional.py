@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
-def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
+def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     r"""Normalised scanpath saliency (Peters et al., 2005): z-score of the map at each fixation, over its pixels.
 
     .. math:: \frac{s(x, y) - \bar s}{\sigma_s}
@@ -43,7 +43,7 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
     return np.where(even, 0, (at - flat.mean(-1)[..., None]) / deviation)
 
 
-def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
+def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     r"""Area under the ROC for single fixations: the fraction of pixels with a lower value; ties count half.
 
     .. math:: P(s(u) < s(x, y)) + \tfrac12 P(s(u) = s(x, y)), \quad u \text{ uniform over the pixels}
@@ -71,7 +71,7 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
     return np.reshape([share_below(row, each) for row, each in zip(flat, found, strict=True)], at.shape)
 
 
-def share_below(ordered: Array, values: Array) -> Array:
+def share_below(ordered: _Array, values: _Array) -> _Array:
     """Fraction of ascending numbers that are lower than each of `values`; ties count half.
 
     Args:
@@ -88,7 +88,7 @@ def share_below(ordered: Array, values: Array) -> Array:
     return np.asarray(twice / (2 * len(ordered)))
 
 
-def log_density(maps: ArrayLike, floor: float = 0.0) -> Array:
+def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     r"""Natural logarithm of maps that are normalised to densities over their pixels.
 
     .. math:: \ln\left( (1 - \epsilon) \frac{s}{\sum s} + \frac{\epsilon}{HW} \right)
@@ -116,7 +116,7 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> Array:
         return np.asarray(np.log((1 - floor) * values / total + floor / (values.shape[-1] * values.shape[-2])))
 
 
-def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
+def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     r"""Log likelihood of fixations in bits, above that of a uniform density (Kümmerer, Wallis and Bethge, 2015).
 
     .. math:: \log_2 p(x, y) + \log_2 HW
@@ -139,7 +139,7 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
     return np.asarray((at + np.log(values.shape[-1] * values.shape[-2])) / np.log(2))
 
 
-def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
+def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     r"""Information gain over a baseline density, in bits for each fixation (Kümmerer, Wallis and Bethge, 2015).
 
     .. math:: \log_2 p(x, y) - \log_2 p_b(x, y)
@@ -162,7 +162,7 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
 
-def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
+def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
     """Read maps at the pixels of fixations.
 
     Args:

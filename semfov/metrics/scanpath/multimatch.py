@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
 class MultiMatch(NamedTuple):
@@ -103,7 +103,7 @@ def multimatch(
     )
 
 
-def _aligned(cost: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of the cheapest path through a matrix, from its end to its start."""
     rows, columns = cost.shape
     total = np.full((rows + 1, columns + 1), np.inf)

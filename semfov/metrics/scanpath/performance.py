@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from semfov.errors import check
 from semfov.metrics.search import cumulative_performance
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
 def found_at(points: ArrayLike, box: ArrayLike) -> int:
@@ -35,7 +35,7 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     return int(on.argmax()) if on.any() else -1
 
 
-def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: int) -> Array:
+def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: int) -> _Array:
     r"""Fraction of searches that have found their target after each gaze shift, averaged over groups of searches.
 
     .. math:: P(n) = \frac1{|G|} \sum_{g \in G} \frac{|\{i \in g : 0 \le f_i \le n\}|}{|g|}
@@ -164,7 +164,7 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
     return float(min(straight / way, 1.0))
 
 
-def _points(points: ArrayLike) -> Array:
+def _points(points: ArrayLike) -> _Array:
     array = np.asarray(points, dtype=np.float64)
     usable = array.ndim == 2 and array.shape[1] == 2 and len(array) > 0
     check(usable, "points", "an array of shape (n, 2), not empty", array.shape)

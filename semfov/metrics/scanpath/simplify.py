@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 
-def merge_close(points: ArrayLike, size: tuple[float, float]) -> Array:
+def merge_close(points: ArrayLike, size: tuple[float, float]) -> _Array:
     """Merge successive fixations that are closer than half a window.
 
     Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do so to compare people's scanpaths with those

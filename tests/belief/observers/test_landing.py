@@ -9,7 +9,7 @@ from semfov import Detections, Grid
 from semfov.belief.observers import Landing, LandingBelief, Semantic
 from semfov.errors import InputError
 from semfov.gaze.acquisition import ObjectEvidence
-from semfov.gaze.policies import Objects
+from semfov.gaze.policies import ObjectSeeking
 
 
 def draw(looks=3, count=5, classes=4, dtype=torch.float64):
@@ -63,7 +63,7 @@ def test_belief_keeps_the_strongest_evidence_and_the_smallest_distance():
     assert (belief.class_probabilities() >= 0).all()
     values = ObjectEvidence()(belief, torch.zeros(1, 20, dtype=torch.bool))
     torch.testing.assert_close(values, belief.evidence.sum(-1))
-    torch.testing.assert_close(Objects()(None, grid)(belief, belief.closest < 0), values)
+    torch.testing.assert_close(ObjectSeeking()(None, grid)(belief, belief.closest < 0), values)
 
 
 def test_total_evidence_of_an_object_grows_with_its_side_length():

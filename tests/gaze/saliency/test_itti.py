@@ -9,8 +9,8 @@ from semfov.errors import InputError
 from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
 from semfov.gaze.saliency.itti import (
     across_scales,
+    dyadic_pyramid,
     gabor_kernels,
-    gaussian_pyramid,
     local_maxima,
     orientation_energy,
     promote,
@@ -98,7 +98,7 @@ def test_saliency_equals_the_steps_in_opencv(photograph: np.ndarray, dtype: torc
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
 def test_pyramid_equals_opencv(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
     image = np.random.default_rng(1).random((*size, 3))
-    levels = gaussian_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
+    levels = dyadic_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
     assert len(levels) == 9
     for level in levels:
         np.testing.assert_allclose(level[0].permute(1, 2, 0).numpy(), image, atol=tolerance)
@@ -190,7 +190,7 @@ def test_bad_input() -> None:
     with pytest.raises(InputError, match="image"):
         IttiKoch()(torch.zeros(1, 4, 8, 8))
     with pytest.raises(InputError, match="levels"):
-        gaussian_pyramid(torch.zeros(1, 3, 8, 8), -1)
+        dyadic_pyramid(torch.zeros(1, 3, 8, 8), -1)
     with pytest.raises(InputError, match="intensity"):
         orientation_energy(torch.zeros(1, 3, 8, 8))
 

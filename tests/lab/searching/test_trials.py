@@ -9,7 +9,7 @@ import torch
 
 from eval.human.searching.scores import People
 from eval.human.searching.screens import Screens
-from eval.human.searching.trials import drawn_searches, goal_cells, in_cells, read_searches, shift_found
+from eval.human.searching.trials import drawn_searches, goal_rectangle, in_cells, read_searches, shift_found
 from semfov import Grid
 from semfov.data.fixations import Fixations, write_ruarte
 from semfov.errors import DataError
@@ -28,7 +28,7 @@ def test_goal_cells_are_those_that_the_box_overlaps(seed):
     generator = np.random.default_rng(seed)
     corner = generator.uniform(0, 200, 2)
     box = (*corner, *(corner + generator.uniform(1, 40, 2)))
-    left, right, top, bottom = goal_cells(search([[0, 0]], box), GRID)
+    left, right, top, bottom = goal_rectangle(search([[0, 0]], box), GRID)
     covered = GRID.footprint(torch.tensor([box]))[0].view(6, 8)
     expected = torch.zeros(6, 8, dtype=torch.bool)
     expected[top : bottom + 1, left : right + 1] = True
@@ -36,7 +36,7 @@ def test_goal_cells_are_those_that_the_box_overlaps(seed):
 
 
 def test_a_box_that_ends_at_a_cell_border_does_not_cover_the_next_cell():
-    assert goal_cells(search([[0, 0]], (40.0, 40.0, 80.0, 120.0)), GRID) == (1, 1, 1, 2)
+    assert goal_rectangle(search([[0, 0]], (40.0, 40.0, 80.0, 120.0)), GRID) == (1, 1, 1, 2)
 
 
 def test_scanpaths_in_cells_merge_repeated_fixations_and_end_at_the_target():
@@ -58,7 +58,7 @@ def test_random_draws_without_return_find_targets_as_often_as_the_formula():
     trials = [search([[0, 0]], picture=f"{number}.jpg") for number in range(3000)]
     drawn = drawn_searches(trials, GRID, (10, 10), np.ones(48), longest=10, seed=0, name="random")
     found = np.array([len(each) - 1 if each.found else -1 for each in drawn])
-    goal = goal_cells(trials[0], GRID)
+    goal = goal_rectangle(trials[0], GRID)
     cells = (goal[1] - goal[0] + 1) * (goal[3] - goal[2] + 1)
     expected = random_search(cells, 9, cells=48)
     measured = [(found[found >= 0] <= n).sum() / len(found) for n in range(10)]

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
-from eval.human.viewing.density import at, fit, log_densities, standardised
+from eval.human.viewing.density import fit_density, log_densities, standardised_maps, values_in_bins
 from eval.human.viewing.raster import Habits, blurred, enlarged, events_of
 from eval.human.viewing.rows import people_maps
 from semfov import Grid
@@ -30,7 +30,7 @@ def test_fit_recovers_the_weights_that_generated_the_fixations():
     density = log_densities(terms, truth)
     drawn = density.flatten(1).exp().multinomial(1, generator=generator)[:, 0]
     bins = torch.stack([drawn % 8, drawn // 8], -1)
-    found = fit(["a", "b"], terms, bins)
+    found = fit_density(["a", "b"], terms, bins)
     torch.testing.assert_close(found.values, truth, atol=0.06, rtol=0)
     assert found.bits > 0
     # The same optimum as scipy's, which is found without a gradient.
@@ -40,7 +40,7 @@ def test_fit_recovers_the_weights_that_generated_the_fixations():
         score = sum(w * f for w, f in zip(weights, flat, strict=True))
         return float(np.mean(np.log(np.exp(score).sum(1)) - score[np.arange(500), drawn[:500].numpy()]))
 
-    small = fit(["a", "b"], [term[:500] for term in terms], bins[:500])
+    small = fit_density(["a", "b"], [term[:500] for term in terms], bins[:500])
     np.testing.assert_allclose(small.values, minimize(cost, [0, 0]).x, atol=2e-3)
     assert small.bits == pytest.approx((math.log(48) - cost(small.values.tolist())) / math.log(2), abs=1e-4)
 
@@ -49,15 +49,15 @@ def test_densities_sum_to_one_and_terms_are_broadcast():
     terms = [torch.rand(1, 5, 4), torch.rand(3, 5, 4)]
     density = log_densities(terms, torch.tensor([2.0, -1.0]))
     torch.testing.assert_close(density.exp().sum((1, 2)), torch.ones(3))
-    assert at(density, torch.tensor([[3, 4], [0, 0], [1, 2]]))[0] == density[0, 4, 3]
+    assert values_in_bins(density, torch.tensor([[3, 4], [0, 0], [1, 2]]))[0] == density[0, 4, 3]
     with pytest.raises(InputError, match=r"^terms:"):
-        fit([], [], torch.zeros(1, 2).long())
+        fit_density([], [], torch.zeros(1, 2).long())
 
 
 def test_standardised_maps_have_mean_zero_and_deviation_one_or_are_zero_if_uniform():
     maps = torch.rand(3, 5, 4) * 7 + 3
     maps[1] = 0.1
-    found = standardised(maps)
+    found = standardised_maps(maps)
     torch.testing.assert_close(found.mean((1, 2)), torch.zeros(3), atol=1e-5, rtol=0)
     torch.testing.assert_close(found[[0, 2]].std((1, 2), correction=0), torch.ones(2))
     assert found[1].eq(0).all()

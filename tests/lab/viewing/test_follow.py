@@ -2,12 +2,12 @@
 
 import torch
 
-from eval.human.viewing.follow import FineLooks, follow
+from eval.human.viewing.follow import FineLooks, evaluate_along
 from semfov import Detections, Grid
 from semfov.belief.observers import Landing, Semantic
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
-from semfov.gaze.policies import Closer, Objects
+from semfov.gaze.policies import Closer, ObjectSeeking
 from semfov.runs.candidates import Candidate
 from semfov.strategy import Strategy
 
@@ -26,8 +26,10 @@ def test_following_all_people_and_policies_at_once_equals_following_each_alone()
     paths = [torch.tensor([4, 1, 1, 5]), torch.tensor([0, 2]), torch.tensor([5, 4, 3])]
     seen = detections(6)
     observer = Semantic(4)
-    candidates = {name: Candidate(Strategy(observer, policy)) for name, policy in (("a", Objects()), ("b", Closer()))}
-    together = follow(StoredLooks(seen, GRID), candidates, paths)
+    candidates = {
+        name: Candidate(Strategy(observer, policy)) for name, policy in (("a", ObjectSeeking()), ("b", Closer()))
+    }
+    together = evaluate_along(StoredLooks(seen, GRID), candidates, paths)
     for name, candidate in candidates.items():
         expected = []
         for path in paths:
@@ -48,9 +50,9 @@ def test_a_fine_belief_uses_looks_from_the_coarse_cell_of_each_fixation():
     observer = Landing(3)
     looks = FineLooks(seen, GRID, fine)
     # The bins in the corners of the picture lie in the first and the last cell.
-    values = follow(looks, {"landing": Candidate(Strategy(observer, Objects()))}, [torch.tensor([0, 53, 10])])[
-        "landing"
-    ]
+    values = evaluate_along(
+        looks, {"landing": Candidate(Strategy(observer, ObjectSeeking()))}, [torch.tensor([0, 53, 10])]
+    )["landing"]
     assert values.shape == (2, 54)
     said = observer.weigh(seen, GRID.centres, fine).evidence
     torch.testing.assert_close(values[0], said[0].sum(-1))

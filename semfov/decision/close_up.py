@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class CloserLook:
+class CloseUp:
     """A closer look at a place that seems to hold the target.
 
     Attributes:
