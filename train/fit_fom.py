@@ -15,8 +15,7 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 import sys
 from collections.abc import Sequence
 
-from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.runs.command import run_command
 
 

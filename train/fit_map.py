@@ -15,7 +15,7 @@ Use it with `python -m eval.explore --policies [learned-map] --belief.map_model 
 import sys
 from collections.abc import Sequence
 
-from semfov.fit.map_evidence import FitMapConfig, fit_map
+from semfov.fit.map import FitMapConfig, fit_map
 from semfov.runs.command import run_command
 
 

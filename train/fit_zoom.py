@@ -13,8 +13,7 @@ looking is interrupted, repeat the command to continue.
 import sys
 from collections.abc import Sequence
 
-from semfov.fit.zoom import fit_zoom
-from semfov.fit.zoom_settings import FitZoomConfig
+from semfov.fit.windows import FitZoomConfig, fit_zoom
 from semfov.runs.command import run_command
 
 

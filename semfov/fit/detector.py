@@ -12,9 +12,9 @@ import yaml
 
 from semfov.agent import ActivePerception
 from semfov.errors import InputError
-from semfov.fit.detector_parts.workshop import Workshop
 from semfov.fit.detector_report import class_counts, detector_report, next_commands
 from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.parts.folder import FolderFit
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
 from semfov.runs.config import DataConfig, DetectorConfig
@@ -101,25 +101,25 @@ def fit_folder(config: FitDetectorConfig) -> None:
     config = config.named()
     started = time.monotonic()
     run = looking_of(replace(config, out=config.out / "progress"))
-    shop = Workshop(config, run)
-    config = shop.config
+    folder = FolderFit(config, run)
+    config = folder.config
     missing = class_counts(run, range(len(run.scenes)))
     _tell(missing)
-    with WholeBar("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
+    with WholeBar("fitting", {"looking": {"looking": seconds_of_looks(run)}, **folder.stages}) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
         if rank() > 0:
             return
         for part in PARTS:
             with whole.stage(part):
-                shop.fit(part)
-    path = manifest_of(config, run, shop).write(config.out)
-    text = detector_report(config, run, shop.parts, time.monotonic() - started)
+                folder.fit(part)
+    path = manifest_of(config, run, folder).write(config.out)
+    text = detector_report(config, run, folder.parts, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    figures = [figure for fitted in shop.parts.values() for figure in fitted.figures]
-    models = [fitted.part.file for fitted in shop.parts.values() if fitted.part.file]
+    figures = [figure for fitted in folder.parts.values() for figure in fitted.figures]
+    models = [fitted.part.file for fitted in folder.parts.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
     print(f"\nnext:\n{next_commands(config, run)}")
 
@@ -153,13 +153,13 @@ def _tell(counts: dict[str, int]) -> None:
         )
 
 
-def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Manifest:
+def manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> Manifest:
     """Build the manifest of the model folder.
 
     Args:
         config: the settings.
         run: the finished looks.
-        shop: the fitted parts.
+        folder: the fitted parts.
 
     Returns:
         The manifest.
@@ -180,11 +180,11 @@ def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Mani
         },
         sensor=config.sensor.record(),
         grid=(config.columns, config.rows),
-        parts={name: fitted.part for name, fitted in shop.parts.items()},
+        parts={name: fitted.part for name, fitted in folder.parts.items()},
         training={
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),
-            "held_out": len(shop.bench.held_out),
+            "held_out": len(folder.inputs.held_out),
             "settings": {name: getattr(config, name) for name in SETTINGS},
         },
     )

@@ -1,4 +1,4 @@
-"""The report about all models that were fitted to a detector."""
+"""The report about all models that were fitted to a detector: its text, tables and plots."""
 
 from __future__ import annotations
 
@@ -7,10 +7,58 @@ from typing import Any
 
 import torch
 
-from semfov.fit.detector_parts.part import Fitted
+from semfov.fit.comparison import Difference
 from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.parts.base import PartResult
+from semfov.gaze.policies import Task
+from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking
-from semfov.runs.tables import table
+from semfov.runs.tables import percent, table
+
+
+def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
+    """Format a paired difference with its standard error and number of photographs.
+
+    Args:
+        gain: the difference.
+        unit: unit to print after the number.
+        scale: factor from the difference to that unit.
+
+    Returns:
+        The text.
+    """
+    digits = 1 if scale > 1 else 3
+    return (
+        f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
+        f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
+    )
+
+
+def mean_percent(values: FloatArray) -> str:
+    """Format the mean of shares `(P,)` in percent, with its standard error."""
+    return percent(float(values.mean()), float(standard_error(values)))
+
+
+def percent_of(value: float) -> str:
+    """Format a share in percent."""
+    return f"{100 * value:.1f}"
+
+
+def section(text: str, rows: list[list[str]]) -> str:
+    """Return a paragraph of Markdown, followed by a table if there are rows."""
+    return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
+
+
+def curves_figure(curves: dict[str, FloatArray], task: Task) -> Any:
+    """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
+    from semfov.viz import plot_cumulative_performance, plot_success_rate
+
+    means = {name: curve.mean(0) for name, curve in curves.items()}
+    errors = {name: standard_error(curve) for name, curve in curves.items()}
+    title = f"Held-out photographs ({len(curves['raw'])})"
+    plot = plot_cumulative_performance if task == "search" else plot_success_rate
+    return plot(means, errors, title=title)
+
 
 TITLES = {
     "observation": "Observation model",
@@ -33,7 +81,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
     return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
 
 
-def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Fitted], seconds: float) -> str:
+def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, PartResult], seconds: float) -> str:
     """Write the report as Markdown.
 
     Args:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from semfov.errors import InputError
 from semfov.fit.evidence import FitSearchConfig
-from semfov.fit.map_evidence import FitMapConfig
-from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.map import FitMapConfig
+from semfov.fit.observation import FitObservationConfig
 from semfov.fit.settings import FovealFitConfig
 from semfov.fit.tempering import FitTemperingConfig
 from semfov.fit.verification import FitVerificationConfig

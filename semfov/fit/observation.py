@@ -1,23 +1,98 @@
-"""Fit a foveal observation model to labelled detections."""
+"""Fit a foveal observation model to labelled detections, and report on it."""
 
+import csv
+import io
+import json
+import platform
+import sys
 import warnings
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import torch
+import yaml
+from torch import Tensor
 
 from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.fit.misses import count_misses
-from semfov.fit.observation_report import write_report
-from semfov.fit.observation_settings import FitObservationConfig
 from semfov.fit.outputs import model_path
+from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.io.code import commit
+from semfov.io.files import write_text
+from semfov.metrics.calibration import Calibration, calibration
 from semfov.observation import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
+from semfov.runs.config import WorkConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
+from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
+from semfov.runs.setup import plain
+from semfov.runs.tables import table
 from semfov.runs.workers import rank
 from semfov.runs.zoom_samples import MosaicSettings
+from semfov.version import __version__
+from semfov.viz import plot_reliability
+from semfov.viz.style import save_figure
 from semfov.zoom.eye import WindowEye
+
+
+@dataclass(frozen=True)
+class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
+    """Fit p(scores | class, distance to the fovea) on photographs with boxes.
+
+    Args:
+        data: photographs to fit on (by default all of them, however many objects they have).
+        method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
+            and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
+            `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
+            calibration is about.
+        mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
+            input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
+            `width` and `sensor` are ignored.
+        fixations: random fixations in each photograph, or windows of a mosaic at each magnification.
+        levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
+        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
+            with the fovea.
+        minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
+            (0: no level does).
+        shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
+            levels with few detections.
+        enough: a class with at least so many detections at a level is fitted there by maximum likelihood alone, as
+            published, without shrinkage (None: shrinkage everywhere).
+        holdout: one in every n photographs is held out for the evaluation.
+        iou: least overlap (IoU) at which a detection counts as showing an object.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
+        out: folder for the model, the report and the figures.
+        cache: folder for the labelled detections (None: `out`).
+        workers: number of processes (None: one for each CPU core).
+    """
+
+    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    mosaics: Whole = 0
+    fixations: Count = 8
+    levels: Annotated[int, Range(1, 1000)] = 8
+    width: Positive = 50.0
+    minimum: Whole = 100
+    shrinkage: Weight = 10.0
+    enough: Whole | None = None
+    holdout: Annotated[int, Range(2, 10**9)] = 10
+    iou: Share = 0.5
+    shard: Count = 32
+    out: Path = Path("runs/fit_fom")
+
+    @property
+    def edges(self) -> list[float]:
+        """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
+        if self.mosaics:
+            return [n - 0.5 for n in range(1, self.levels)]
+        step = self.width / 100.0 * self.sensor.fovea
+        return [step * n for n in range(1, self.levels)]
 
 
 def fit_fom(config: FitObservationConfig) -> None:
@@ -138,3 +213,158 @@ def fit_all(
     if config.method == "discriminative":
         models["discriminative"] = model
     return models
+
+
+_Models = dict[str, FovealObservationModel]
+
+
+def write_report(
+    config: FitObservationConfig,
+    model: FovealObservationModel,
+    models: _Models,
+    samples: Samples,
+    held_out: torch.Tensor,
+) -> list[Path]:
+    """Evaluate the models on held-out samples, print the tables, and write the report.
+
+    Args:
+        config: the settings.
+        model: the fitted model.
+        models: all models to compare, the fitted one last.
+        samples: all labelled detections.
+        held_out: `(M,)` boolean, which of them are held out.
+
+    Returns:
+        The files that were written.
+    """
+    judged = samples[held_out]
+    with torch.inference_mode():
+        predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
+        likelihood = {
+            name: float(m.log_likelihood(judged.scores, judged.distance).gather(1, judged.labels[:, None]).mean())
+            for name, m in models.items()
+        }
+    figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
+    by_level = figures_by_level(model, predictions, judged)
+    text = report_markdown(config, model, figures, likelihood, by_level, len(samples) - len(judged))
+    print(text)
+    write_text(config.out / "report.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "manifest.json", json.dumps(fit_manifest(model, figures), indent=2) + "\n")
+    last = list(models)[-1]
+    write_text(config.out / "counts.csv", counts_csv(model))
+    figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
+    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
+    return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
+
+
+def report_markdown(
+    config: FitObservationConfig,
+    model: FovealObservationModel,
+    figures: dict[str, Calibration],
+    likelihood: dict[str, float],
+    by_level: list[list[str]],
+    fitted: int,
+) -> str:
+    """Write the report as Markdown: the measures of each model, then counts and measures by level.
+
+    Args:
+        config: the settings.
+        model: the fitted model.
+        figures: calibration of each model on the held-out samples.
+        likelihood: mean log likelihood of the held-out scores under each model.
+        by_level: cells of the table by level (`figures_by_level`).
+        fitted: number of samples to fit on.
+
+    Returns:
+        The text.
+    """
+    judged = next(iter(figures.values())).count
+    head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
+    rows = [
+        [name, f"{likelihood[name]:.2f}", *(f"{value:.3f}" for value in (f.nll, f.brier, f.ece)),
+         f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
+        for name, f in figures.items()
+    ]  # fmt: skip
+    summary = table([head, *rows])
+    counts = torch.tensor(model.metadata["counts"])
+    fallback = model.metadata["fallback"]
+    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
+    levels = [
+        [
+            f"{low} - {high}",
+            str(int(counts[0, n])),
+            str(int(counts[1:, n].sum())),
+            str(fallback.get(str(n), "")),
+            *by_level[n],
+        ]
+        for n, (low, high) in enumerate(pairwise(edges))
+    ]
+    axis = "reduction in octaves" if config.mosaics else "distance"
+    where = (
+        "the number of octaves by which the picture is reduced"
+        if config.mosaics
+        else "distance to the fixation in units of the image's longer side"
+    )
+    head = [axis, "background", "objects", "uses level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
+    return "\n".join(
+        [
+            f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
+            f"{config.holdout}). The log likelihood is that of the scores given the true class. The other measures are "
+            "of the posterior of the class, background included.",
+            "",
+            *summary,
+            "",
+            f"Number of detections in the fit, by {where}. Levels with too few objects use the parameters of another "
+            "level. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
+            "",
+            *table([head, *levels]),
+            "",
+        ]
+    )
+
+
+def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples) -> list[list[str]]:
+    """Compute NLL and ECE of raw scores and of the fitted model at each level.
+
+    Args:
+        model: the fitted model.
+        predictions: class probabilities `(M, K+1)` of each model, raw scores first and the fitted model last.
+        judged: the held-out samples.
+
+    Returns:
+        Cells of a table, one row for each level.
+    """
+    first, *_, last = predictions.values()
+    level = model.level(judged.distance)
+    rows = []
+    for n in range(len(model.edges) + 1):
+        here = level == n
+        if not here.any():
+            rows.append([""] * 4)
+            continue
+        raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
+        rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
+    return rows
+
+
+def counts_csv(model: FovealObservationModel) -> str:
+    """Write the number of detections of each true class at each level in the fit as CSV."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["class", *(f"level {n}" for n in range(len(model.edges) + 1))])
+    for name, counts in zip(("background", *model.classes), model.metadata["counts"], strict=True):
+        rows.writerow([name, *counts])
+    return text.getvalue()
+
+
+def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
+    """Record the command, the commit, the versions and the model that the measures come from."""
+    known = {key: value for key, value in model.metadata.items() if key != "counts"}
+    return {
+        "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
+        "commit": commit(),
+        "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
+        "model": known,
+        "held_out": {name: asdict(figure) for name, figure in figures.items()},
+    }

@@ -24,12 +24,12 @@ from semfov import ActivePerception, DataError, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.detector_parts.part import Bench, Fitted
-from semfov.fit.detector_parts.verification import VerificationFit, scores
+from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
-from semfov.fit.held_out import Difference
+from semfov.fit.parts.base import PartInputs, PartResult
+from semfov.fit.parts.verification import VerificationFit, scores
 from semfov.fit.verification import VerifiedSearch
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
@@ -174,7 +174,7 @@ FITS = {
 def forbid(monkeypatch, *parts):
     """Make the fit of parts fail."""
     for part in parts:
-        monkeypatch.setattr(f"semfov.fit.detector_parts.{part}.{FITS[part]}", None)
+        monkeypatch.setattr(f"semfov.fit.parts.{part}.{FITS[part]}", None)
 
 
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
@@ -357,10 +357,10 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
 def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, monkeypatch):
     config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
     scenes = EmbeddedScenes(("cat", "cup"), count=8)
-    bench = Bench(config, SimpleNamespace(scenes=scenes))
-    bench.parts["evidence"] = Fitted(Part("evidence.safetensors", "0", False, "not better"), "")
+    inputs = PartInputs(config, SimpleNamespace(scenes=scenes))
+    inputs.parts["evidence"] = PartResult(Part("evidence.safetensors", "0", False, "not better"), "")
     forbid(monkeypatch, "verification")
-    fitted = VerificationFit(bench).fit()
+    fitted = VerificationFit(inputs).fit()
     assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")
 
 
@@ -373,7 +373,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.detector_parts.verification.fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.parts.verification.fit_in_folds", fail)
     assert main(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))

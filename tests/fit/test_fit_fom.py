@@ -7,8 +7,7 @@ import torch
 
 from eval.calibration import main as calibrate
 from semfov import FovealObservationModel
-from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.observation import match
 from semfov.runs.config import DataConfig
 from semfov.runs.samples import Sampler, SampleSettings

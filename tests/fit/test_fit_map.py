@@ -14,7 +14,7 @@ from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.map_evidence import FitMapConfig, frequencies, map_objective, train_gain, train_map
+from semfov.fit.map import FitMapConfig, frequencies, map_objective, train_gain, train_map
 from semfov.fit.map_examples import MapExampleLooks, make_map_examples
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given

@@ -13,13 +13,11 @@ from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.observation import fit_fom
-from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.fit.verification import unverified, verify
-from semfov.fit.zoom import fit_zoom
-from semfov.fit.zoom_examples import example_of
-from semfov.fit.zoom_settings import FitZoomConfig
-from semfov.fit.zoom_verification import fit_closer, mosaic_searches
+from semfov.fit.windows import FitZoomConfig, fit_zoom
+from semfov.fit.windows_evidence import example_of
+from semfov.fit.windows_verification import fit_closer, mosaic_searches
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig

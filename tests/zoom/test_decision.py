@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from semfov.agents import ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
-from semfov.fit.zoom_decision import Searches, fit_judge, judge_searches
+from semfov.fit.windows_decision import Searches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import CASE, features

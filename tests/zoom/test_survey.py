@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.fit.zoom_examples import LookedAt, ZoomExample
-from semfov.fit.zoom_survey import CountedLook, SurveyExample, fit_survey, judge_survey
+from semfov.fit.windows_evidence import WindowResult, ZoomExample
+from semfov.fit.windows_survey import LookCounts, SurveyExample, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.gist import Gist
@@ -34,12 +34,14 @@ def survey():
 def example(rule):
     """A mosaic in which a closer look finds as many objects as `rule` gives for its window."""
     objects = 12
-    looks = [LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
+    looks = [WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
     for window in half_steps(LATTICE):
         if window.level == 0:
             continue
         seen = gist(window.level, window.cells[:2]) if window.level < LATTICE.levels - 1 else None
-        looks.append(LookedAt(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window)))
+        looks.append(
+            WindowResult(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window))
+        )
     return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
 
 
@@ -79,7 +81,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
-    glance = LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    glance = WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
     for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
         belief.add(glance)
@@ -112,7 +114,7 @@ def test_loss_equals_the_poisson_loss_window_by_window(survey):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
         terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
-    counted = CountedLook.of(mosaic, overview, overview.found)
+    counted = LookCounts.of(mosaic, overview, overview.found)
     torch.testing.assert_close(counted.loss(survey, logs), torch.stack(terms).mean())
 
 
@@ -120,7 +122,7 @@ def test_objects_that_were_seen_before_are_not_new():
     mosaic = example(lambda look, window: 3)
     overview = mosaic.looks[0]
     for seen, new in ((0, 3), (2, 1), (12, 0)):
-        counts = CountedLook.of(mosaic, overview, torch.arange(12) < seen).counts
+        counts = LookCounts.of(mosaic, overview, torch.arange(12) < seen).counts
         assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
 
 

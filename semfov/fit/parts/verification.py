@@ -10,11 +10,11 @@ import numpy as np
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.fit.detector_parts.evidence import SUREST_OF_FEW
-from semfov.fit.detector_parts.part import Fitted, PartFit
-from semfov.fit.detector_words import in_words
-from semfov.fit.held_out import Difference
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words
 from semfov.fit.outputs import training_of
+from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.parts.evidence import SUREST_OF_FEW
 from semfov.fit.searches import open_photographs
 from semfov.fit.verification import (
     FitVerificationConfig,
@@ -42,21 +42,21 @@ class VerificationFit(PartFit):
     @property
     def settings(self) -> FitVerificationConfig:
         """The settings of the fit."""
-        return self.config.verification(self.bench.components - 1)
+        return self.config.verification(self.inputs.components - 1)
 
     @property
     def tasks(self) -> dict[str, float]:
         """The tasks and their seconds."""
-        judged = len(self.bench.judged)
+        judged = len(self.inputs.judged)
         return {"looking": judged, "verifying": 0.5 * judged}
 
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Fit in folds, and compare decisions with those of the same agent without closer looks."""
-        config, run, judged = self.settings, self.run, self.bench.judged
-        evidence = self.bench.model("evidence")
+        config, run, judged = self.settings, self.run, self.inputs.judged
+        evidence = self.inputs.model("evidence")
         if not isinstance(evidence, TargetEvidence):
             why = "not fitted, since the agent does not use the target evidence"
-            return Fitted(Part(None, None, False, why), f"{why.capitalize()}.")
+            return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
         seen = open_photographs(
             run.eye,
             run.scenes,
@@ -95,7 +95,7 @@ class VerificationFit(PartFit):
             "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
             "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
-        return Fitted(
+        return PartResult(
             self.write(fitted.model, gain.better, why),
             text + verification_report(fitted, f"{len(seen)} photographs")[0],
         )

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from semfov.errors import DataError, InputError
-from semfov.fit.detector_parts.evidence import EvidenceFit
-from semfov.fit.detector_parts.map import MapFit
-from semfov.fit.detector_parts.observation import ObservationFit
-from semfov.fit.detector_parts.part import Bench, Fitted, PartFit
-from semfov.fit.detector_parts.tempering import TemperingFit
-from semfov.fit.detector_parts.verification import VerificationFit
 from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.parts.base import PartFit, PartInputs, PartResult
+from semfov.fit.parts.evidence import EvidenceFit
+from semfov.fit.parts.map import MapFit
+from semfov.fit.parts.observation import ObservationFit
+from semfov.fit.parts.tempering import TemperingFit
+from semfov.fit.parts.verification import VerificationFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
 from semfov.runs.looking import Looking
@@ -24,7 +24,7 @@ FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, Ve
 """The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
 
 
-class Workshop:
+class FolderFit:
     """Fit the parts to a detector.
 
     Args:
@@ -33,33 +33,35 @@ class Workshop:
     """
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
-        self.bench = Bench(config, run)
-        self.fits = {each.name: each(self.bench) for each in FITS}
+        self.inputs = PartInputs(config, run)
+        self.fits = {each.name: each(self.inputs) for each in FITS}
 
     @property
     def config(self) -> FitDetectorConfig:
         """The settings, with defaults that suit the number of photographs."""
-        return self.bench.config
+        return self.inputs.config
 
     @property
-    def parts(self) -> dict[str, Fitted]:
+    def parts(self) -> dict[str, PartResult]:
         """The finished parts by their names."""
-        return self.bench.parts
+        return self.inputs.parts
 
     @property
     def stages(self) -> dict[str, dict[str, float]]:
         """The tasks of each part, with an estimate of their seconds on one core."""
         return {name: each.tasks for name, each in self.fits.items()}
 
-    def fit(self, name: str) -> Fitted:
+    def fit(self, name: str) -> PartResult:
         """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""
-        key = digest_of([self.bench.run.key, self._settings(name)])
+        key = digest_of([self.inputs.run.key, self._settings(name)])
         kept = self._kept(name, key)
         if kept is None:
             try:
                 kept = self.fits[name].fit()
             except (DataError, InputError) as error:
-                kept = Fitted(Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}")
+                kept = PartResult(
+                    Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
+                )
             write_text(self._record(name), json.dumps({"key": key, **asdict(kept)}))
         self.parts[name] = kept
         return kept
@@ -73,7 +75,7 @@ class Workshop:
     def _record(self, name: str) -> Path:
         return self.config.out / "progress" / f"{name}.json"
 
-    def _kept(self, name: str, key: str) -> Fitted | None:
+    def _kept(self, name: str, key: str) -> PartResult | None:
         try:
             record = json.loads(self._record(name).read_text(encoding="utf-8"))
             part = Part(**record["part"])
@@ -82,7 +84,7 @@ class Workshop:
             whole = whole and all((self.config.out / figure).is_file() for figure in record["figures"])
         except Exception:  # a damaged record is no problem, as the part can be fitted again
             return None
-        return Fitted(part, record["report"], record["figures"]) if whole else None
+        return PartResult(part, record["report"], record["figures"]) if whole else None
 
 
 def _plain(settings: dict[str, Any]) -> Any:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.fit.zoom_examples import LookedAt, ZoomExample, closer_windows
-from semfov.fit.zoom_rates import descend_examples, rates_before
+from semfov.fit.windows_evidence import WindowResult, ZoomExample, closer_windows, descend_examples, rates_before
 from semfov.zoom.gist import Gist
 from semfov.zoom.survey import Survey
 
@@ -19,7 +18,7 @@ LATER = 2
 
 
 @dataclass(frozen=True)
-class CountedLook:
+class LookCounts:
     """A look, and how many new objects each of the closer looks inside it found.
 
     Attributes:
@@ -32,7 +31,7 @@ class CountedLook:
     counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
 
     @classmethod
-    def of(cls, example: ZoomExample, looked: LookedAt, seen: Tensor) -> "CountedLook":
+    def of(cls, example: ZoomExample, looked: WindowResult, seen: Tensor) -> "LookCounts":
         """Compare a look with all closer looks inside it.
 
         Args:
@@ -85,18 +84,18 @@ class SurveyExample:
         closer: looks that were closer, and can be followed by closer ones.
     """
 
-    overview: CountedLook
-    closer: tuple[CountedLook, ...]
+    overview: LookCounts
+    closer: tuple[LookCounts, ...]
 
     @classmethod
     def of(cls, example: ZoomExample) -> "SurveyExample":
         """Prepare a mosaic for the fit."""
         overview, *others = (look for look in example.looks if look.gist is not None)
         first = overview.found
-        closer = (CountedLook.of(example, look, first | look.found) for look in others)
-        return cls(CountedLook.of(example, overview, first), tuple(closer))
+        closer = (LookCounts.of(example, look, first | look.found) for look in others)
+        return cls(LookCounts.of(example, overview, first), tuple(closer))
 
-    def losses(self, survey: Survey, closer: Sequence[CountedLook]) -> list[Tensor]:
+    def losses(self, survey: Survey, closer: Sequence[LookCounts]) -> list[Tensor]:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
         first = self.overview.gist
         logs = survey.rates(first)

@@ -155,7 +155,7 @@ def explore_curves(
 
 
 @dataclass(frozen=True)
-class Decided:
+class DecisionRates:
     """The decisions of searches for present and for absent classes.
 
     Attributes:
@@ -180,7 +180,7 @@ def decisions(
     protocol: ProtocolConfig,
     classes: int,
     max_area: float,
-) -> dict[str, Decided]:
+) -> dict[str, DecisionRates]:
     """Evaluate the decisions of search strategies.
 
     Args:
@@ -210,7 +210,7 @@ def decisions(
                 ends = partial(rule, target=target, grid=grid)
                 outcome, count = _search(looks, strategy, target, start, noise, ends)
                 results[name].append((there, outcome, count))
-    return {name: _decided(each) for name, each in results.items()}
+    return {name: _rates(each) for name, each in results.items()}
 
 
 @torch.inference_mode()
@@ -227,12 +227,12 @@ def by_detection(step: Step, target: int, grid: Grid) -> Tensor:
     return confirms(step.detections, grid, step.cell, target, 0.5).long()
 
 
-def _decided(searches: Sequence[tuple[bool, str, int]]) -> Decided:
+def _rates(searches: Sequence[tuple[bool, str, int]]) -> DecisionRates:
     def share(outcome: str, which: Sequence[bool]) -> float:
         chosen = [each[1] == outcome for each in searches if each[0] in which]
         return sum(chosen) / len(chosen) if chosen else math.nan
 
-    return Decided(
+    return DecisionRates(
         share("found", [True]),
         share("found", [False]),
         share("undecided", [True, False]),

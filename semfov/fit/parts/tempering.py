@@ -7,9 +7,9 @@ from typing import ClassVar
 import torch
 
 from semfov.belief.observers import Semantic
-from semfov.fit.detector_parts.part import Fitted, PartFit
-from semfov.fit.detector_words import in_words, percent_of, section
-from semfov.fit.held_out import Difference
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words, percent_of, section
+from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.tempering import FitTemperingConfig, hit_rates, means_of
 from semfov.io.manifest import Part
 
@@ -30,15 +30,15 @@ class TemperingFit(PartFit):
         tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in self.settings.exponents]
         return dict.fromkeys(tried, 0.005 * len(self.run.scenes))
 
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""
-        config, run, bench = self.settings, self.run, self.bench
-        ways = ["raw"] if bench.model("observation") is None else ["raw", "calibrated"]
-        baseline = Semantic(bench.components)
-        raw = hit_rates(config, run.scenes, bench.samples, baseline, "raw")
+        config, run, inputs = self.settings, self.run, self.inputs
+        ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
+        baseline = Semantic(inputs.components)
+        raw = hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
         rates = {
             (scores, exponent): hit_rates(
-                config, run.scenes, bench.samples, bench.fusing(scores, exponent), f"{scores} {exponent:g}"
+                config, run.scenes, inputs.samples, inputs.fusing(scores, exponent), f"{scores} {exponent:g}"
             )
             for scores in ways
             for exponent in config.exponents
@@ -67,4 +67,4 @@ class TemperingFit(PartFit):
             rows,
         )
         settings = {"scores": scores, "exponent": exponent, "footprint": config.footprint}
-        return Fitted(Part(None, None, gain.better, why, settings), report)
+        return PartResult(Part(None, None, gain.better, why, settings), report)

@@ -14,12 +14,12 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.decision import decide
 from semfov.episode import Step
 from semfov.errors import DataError
-from semfov.fit.detector_parts.part import MAP_SHIFTS, Fitted, PartFit, strategy
-from semfov.fit.detector_words import curves_figure, in_words, mean_percent, percent_of, section
+from semfov.fit.comparison import Difference, Rule, by_detection, decisions, search_curves
+from semfov.fit.detector_report import curves_figure, in_words, mean_percent, percent_of, section
 from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge_evidence
 from semfov.fit.evidence import evidence_report as judged_report
 from semfov.fit.evidence_examples import make_examples
-from semfov.fit.held_out import Difference, Rule, by_detection, decisions, search_curves
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.gaze.policies import NonPredictive
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
@@ -42,12 +42,12 @@ class EvidenceFit(PartFit):
     @property
     def settings(self) -> FitSearchConfig:
         """The settings of the training."""
-        return self.config.evidence(self.bench.components - 1)
+        return self.config.evidence(self.inputs.components - 1)
 
     @property
     def tasks(self) -> dict[str, float]:
         """The tasks and their seconds."""
-        judged = len(self.bench.judged)
+        judged = len(self.inputs.judged)
         return {
             "describing looks": 0.05 * len(self.run.scenes),
             "training": 0.1 * self.settings.steps,
@@ -57,28 +57,28 @@ class EvidenceFit(PartFit):
 
     def choose_thresholds(self, model: TargetEvidence) -> Thresholds:
         """Choose the thresholds of decisions on the held-out photographs."""
-        config, bench = self.settings, self.bench
+        config, inputs = self.settings, self.inputs
         grid = Grid(config.columns, config.rows, (config.columns, config.rows))
         # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
-        each = max(config.classes, min(20, _ABSENT // len(bench.held_out)))
-        area, scenes = config.max_target_area, bench.held_out
+        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
+        area, scenes = config.max_target_area, inputs.held_out
         wide = make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
         expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
         surest = SUREST_OF_FEW if expected < 10 else SUREST
         return judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
 
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
-        config, run, bench = self.settings, self.run, self.bench
+        config, run, inputs = self.settings, self.run, self.inputs
         fit = fit_evidence(config, run)
         fit.model.thresholds = thresholds = self.choose_thresholds(fit.model)
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {
             "fitted": learned,
-            "raw": strategy(Semantic(bench.components), NonPredictive()),
-            "fused": strategy(bench.semantic, NonPredictive()),
+            "raw": strategy(Semantic(inputs.components), NonPredictive()),
+            "fused": strategy(inputs.semantic, NonPredictive()),
         }
-        protocol, judged = bench.protocol, bench.judged
+        protocol, judged = inputs.protocol, inputs.judged
         curves = search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
@@ -121,7 +121,7 @@ class EvidenceFit(PartFit):
             ]
         )
         save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
-        return Fitted(self.write(fit.model, gain.better, why), report, ["search.png"])
+        return PartResult(self.write(fit.model, gain.better, why), report, ["search.png"])
 
 
 def _by_thresholds(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> torch.Tensor:

@@ -7,12 +7,11 @@ from typing import ClassVar
 import torch
 
 from semfov.errors import DataError
-from semfov.fit.detector_parts.part import Fitted, PartFit
-from semfov.fit.detector_words import in_words, section
-from semfov.fit.held_out import Difference
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words, section
 from semfov.fit.misses import count_misses
-from semfov.fit.observation import fit_model
-from semfov.fit.observation_settings import FitObservationConfig
+from semfov.fit.observation import FitObservationConfig, fit_model
+from semfov.fit.parts.base import PartFit, PartResult
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.samples import whole_photograph
@@ -34,9 +33,9 @@ class ObservationFit(PartFit):
         """The tasks and their seconds."""
         return {"fitting": 1 + 0.1 * len(self.run.scenes)}
 
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
-        config, run, samples = self.settings, self.run, self.bench.samples
+        config, run, samples = self.settings, self.run, self.inputs.samples
         held_out = samples.scene % config.holdout == 0
         judged = samples[held_out]
         if not len(judged) or len(judged) == len(samples):
@@ -79,4 +78,4 @@ class ObservationFit(PartFit):
             f"detections, evaluated on {len(judged)} detections in {len(photographs)} held-out photographs.",
             rows,
         )
-        return Fitted(self.write(model, gain.better, why), report, ["reliability.png"])
+        return PartResult(self.write(model, gain.better, why), report, ["reliability.png"])

@@ -14,7 +14,7 @@ from semfov.decision import SAME, settle
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import VerificationResult, choose_confirm, examine, fit, verification_report, verify
-from semfov.fit.zoom_decision import searches_of
+from semfov.fit.windows_decision import searches_of
 from semfov.observation.matching import box_iou
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
@@ -130,7 +130,7 @@ class MosaicSearch(TargetSearch[WindowLook]):
 def mosaic_searches(
     model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], config: Limits, title: str
 ) -> Iterator[MosaicSearch]:
-    """Search every mosaic, without closer looks (`semfov.fit.zoom_decision.searches_of`).
+    """Search every mosaic, without closer looks (`semfov.fit.windows_decision.searches_of`).
 
     Args:
         model: the evidence that guides the search, with thresholds.

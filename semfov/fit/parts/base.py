@@ -30,7 +30,7 @@ _LONGEST = 15
 
 
 @dataclass(frozen=True)
-class Fitted:
+class PartResult:
     """A fitted part with its report.
 
     Attributes:
@@ -44,7 +44,7 @@ class Fitted:
     figures: list[str] = field(default_factory=list)
 
 
-class Bench:
+class PartInputs:
     """The looks that all parts are fitted to, and the parts that are finished.
 
     Args:
@@ -57,7 +57,7 @@ class Bench:
         self.components = len(run.scenes.classes) + 1
         self.holdout = self.config.observation.holdout
         self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
-        self.parts: dict[str, Fitted] = {}
+        self.parts: dict[str, PartResult] = {}
 
     @property
     def judged(self) -> Sequence[int]:
@@ -107,7 +107,7 @@ class PartFit(ABC):
     """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it.
 
     Args:
-        bench: the looks and the finished parts.
+        inputs: the looks and the finished parts.
 
     Attributes:
         name: name of the part, one of `semfov.io.manifest.PARTS`.
@@ -115,8 +115,8 @@ class PartFit(ABC):
 
     name: ClassVar[str]
 
-    def __init__(self, bench: Bench) -> None:
-        self.bench, self.config, self.run = bench, bench.config, bench.run
+    def __init__(self, inputs: PartInputs) -> None:
+        self.inputs, self.config, self.run = inputs, inputs.config, inputs.run
 
     @property
     @abstractmethod
@@ -129,7 +129,7 @@ class PartFit(ABC):
         """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
 
     @abstractmethod
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Fit the part."""
 
     def write(self, model: FolderModel, used: bool, why: str) -> Part:

@@ -1,4 +1,4 @@
 """The models that are fitted to a detector, one file for each part of a model folder.
 
-`semfov.fit.detector_parts.workshop.Workshop` fits them in order.
+`semfov.fit.parts.folder.FolderFit` fits them in order.
 """

@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.errors import DataError, InputError
-from semfov.fit.detector_parts.part import MAP_SHIFTS, Fitted, PartFit, strategy
-from semfov.fit.detector_words import curves_figure, in_words, mean_percent, section
-from semfov.fit.held_out import Difference, explore_curves
-from semfov.fit.map_evidence import FitMapConfig, fit_map_evidence
+from semfov.fit.comparison import Difference, explore_curves
+from semfov.fit.detector_report import curves_figure, in_words, mean_percent, section
+from semfov.fit.map import FitMapConfig, fit_map_evidence
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.gaze.policies import Closer, Random
 from semfov.viz.style import save_figure
 
@@ -31,23 +31,23 @@ class MapFit(PartFit):
             "describing looks": 0.05 * len(self.run.scenes),
             "training": 0.25 * self.settings.steps,
             "learning the gain of looks": 0.1 * self.settings.gain_steps,
-            "exploring": len(self.bench.judged),
+            "exploring": len(self.inputs.judged),
         }
 
-    def fit(self) -> Fitted:
+    def fit(self) -> PartResult:
         """Train, and compare explorations with those of raw scores and random gaze."""
-        bench, run = self.bench, self.run
-        if bench.components < 3:
+        inputs, run = self.inputs, self.run
+        if inputs.components < 3:
             raise InputError("detector: a map of all classes needs at least 2 classes, got a detector with 1 class")
         fit = fit_map_evidence(self.settings, run)
         fovea = self.config.sensor.fovea
         ways = {
             "fitted": strategy(LearnedMap(fit.model), Closer(fovea)),
-            "raw": strategy(Semantic(bench.components), Random()),
-            "fused": strategy(bench.semantic, Closer(fovea)),
+            "raw": strategy(Semantic(inputs.components), Random()),
+            "fused": strategy(inputs.semantic, Closer(fovea)),
         }
-        protocol = bench.protocol
-        curves = explore_curves(run, bench.judged, ways, protocol)
+        protocol = inputs.protocol
+        curves = explore_curves(run, inputs.judged, ways, protocol)
         at = min(MAP_SHIFTS, protocol.shifts)
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):
@@ -77,4 +77,4 @@ class MapFit(PartFit):
         )
         save_figure(curves_figure(objects, "exploration"), self.config.out / "explore.png")
         part = self.write(fit.model, gain.better and not loss.better, why)
-        return Fitted(part, "\n".join([head, *sections, fit.report]), ["explore.png"])
+        return PartResult(part, "\n".join([head, *sections, fit.report]), ["explore.png"])

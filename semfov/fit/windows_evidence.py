@@ -1,0 +1,345 @@
+"""Fit evidence by magnification: what closer looks at a window will show, and how many new objects they will find."""
+
+import logging
+import random
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
+from semfov.observation.matching import box_iou
+from semfov.runs.window_looking import LEAST_CONFIDENCE
+from semfov.zoom.belief import before_of
+from semfov.zoom.evidence import GlimpseEvidence, pool
+from semfov.zoom.gist import FOUND, Gist
+from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
+
+
+@dataclass(frozen=True)
+class WindowResult:
+    """A look at a window and its results.
+
+    Attributes:
+        window: the window.
+        gist: summary of the look, for windows that can be looked at closer; None for others.
+        show: `(K,)`, highest score of each class.
+        found: `(M,)` boolean, the objects of the scene that it found.
+    """
+
+    window: Window
+    gist: Gist | None
+    show: Tensor
+    found: Tensor
+
+
+@dataclass(frozen=True)
+class ZoomExample:
+    """A mosaic with looks at many windows.
+
+    Attributes:
+        lattice: the lattice of windows over the mosaic.
+        labels: `(M,)`, classes of its objects.
+        looks: the looks, the overview first.
+    """
+
+    lattice: Lattice
+    labels: Tensor
+    looks: tuple[WindowResult, ...]
+
+
+def closer_windows(
+    example: ZoomExample, looked_at: WindowResult
+) -> Iterator[tuple[WindowResult, int, tuple[int, ...]]]:
+    """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them.
+
+    Args:
+        example: the mosaic.
+        looked_at: the look. Windows inside an overview may reach beyond the picture.
+
+    Yields:
+        The closer look, its octaves from the look, and its window `(x1, y1, x2, y2)` in cells of the gist.
+    """
+    look = looked_at.gist
+    assert look is not None
+    high, wide = look.scores.shape[:2]
+    for closer in example.looks:
+        steps = closer.window.level - look.level
+        corners = zip(closer.window.cells, look.first * 2, strict=True)
+        x1, y1, x2, y2 = ((cell - first) // look.scale for cell, first in corners)
+        inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
+        if closer.window.within is None and 1 <= steps <= STEPS and (inside or look.level == 0):
+            yield closer, steps, (x1, y1, x2, y2)
+
+
+def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: float = 0.5) -> Tensor:
+    """Find the objects that a look shows with a detection of their class.
+
+    Args:
+        glance: the look.
+        annotation: the M objects of the scene.
+        score: least score of the detection.
+        iou: least overlap of the detection with the object.
+
+    Returns:
+        Whether each object is found, `(M,)` boolean.
+    """
+    detections = glance.detections
+    sure = detections.confidence[0] >= score
+    boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
+    hits = (box_iou(boxes, annotation.boxes) >= iou) & (labels[:, None] == annotation.labels)
+    return hits.any(0) if len(boxes) else torch.zeros(len(annotation.boxes), dtype=torch.bool)
+
+
+def windows_of(mosaics: Mosaics, index: int, lattice: Lattice) -> list[Window]:
+    """List the windows of a mosaic at steps of half a window, and one window for each photograph."""
+    slots: Any = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(index)]
+    return [*half_steps(lattice), *(around(lattice, slot) for slot in slots)]
+
+
+def example_of(mosaics: Mosaics, index: int, glances: Glances) -> ZoomExample:
+    """Look at all windows of a mosaic and collect the results."""
+    annotation = mosaics.annotation(index)
+    looks = [
+        WindowResult(glance.window, glance.gist, glance.show, found_by(glance, annotation))
+        for glance in glances.see(windows_of(mosaics, index, glances.lattice))
+    ]
+    return ZoomExample(glances.lattice, annotation.labels, tuple(looks))
+
+
+@dataclass(frozen=True)
+class Windows:
+    """N pairs of a look and a closer window inside it, as one table.
+
+    Attributes:
+        scores: `(N, K)`, highest score of each class that the look shows inside the window.
+        summary: `(N, 3)`, further features of the window in the look (`semfov.zoom.evidence.pool`).
+        steps: `(N,)`, number of octaves by which the window is looked at closer.
+        shown: `(N, K)`, whether the closer look showed the class.
+        before: `(N,)`, row of the overview for the same window; -1 for rows of the overview itself.
+        slot: `(N,)`, whether the window is a photograph of the mosaic.
+        mosaic: `(N,)`, number of the mosaic.
+    """
+
+    scores: Tensor
+    summary: Tensor
+    steps: Tensor
+    shown: Tensor
+    before: Tensor
+    slot: Tensor
+    mosaic: Tensor
+
+
+def pair_windows(examples: list[ZoomExample]) -> Windows:
+    """Pair every look with every closer window inside it."""
+    rows: list[tuple[Tensor, Tensor, int, Tensor, int, bool, int]] = []
+    for number, example in enumerate(examples):
+        first: dict[int, int] = {}
+        for looked_at in example.looks:
+            look = looked_at.gist
+            if look is None:
+                continue
+            high, wide = (n * look.scale for n in look.scores.shape[:2])
+            for place, closer in enumerate(example.looks):
+                steps = closer.window.level - look.level
+                x1, y1, x2, y2 = closer.window.cells
+                x1, y1, x2, y2 = x1 - look.first[0], y1 - look.first[1], x2 - look.first[0], y2 - look.first[1]
+                inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
+                if not 1 <= steps <= STEPS or not (inside or look.level == 0):
+                    continue
+                box = x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale)
+                pooled, summary = pool(look.scores, box)
+                before = -1 if look.level == 0 else first.get(place, -1)
+                if look.level == 0:
+                    first[place] = len(rows)
+                if look.level > 0 and before < 0:
+                    continue
+                slot = closer.window.within is not None
+                rows.append((pooled, summary, steps, closer.show >= LEAST_CONFIDENCE, before, slot, number))
+    columns: list[Any] = [*zip(*rows, strict=True)]
+    whole = [torch.tensor(columns[place]) for place in (2, 4, 5, 6)]
+    return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
+
+
+def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024) -> None:
+    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes.
+
+    Args:
+        model: the model to fit.
+        windows: the training windows.
+        steps: number of steps.
+        batch: rows of the overview in a step; there are half as many rows of later looks.
+    """
+    own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
+    optimizer = torch.optim.AdamW(own, lr=8e-3, weight_decay=1.0)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 8e-3, total_steps=steps)
+    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    for _ in range(steps):
+        model.train()
+        loss = presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
+        if len(later):
+            loss = loss + presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    model.eval()
+
+
+def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
+    """Compute the mean cross-entropy of `presence_log_odds` over rows and classes."""
+    odds = presence_log_odds(model, windows, rows)
+    return F.binary_cross_entropy_with_logits(odds, windows.shown[rows].to(odds))
+
+
+def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
+    """Compute the log-odds that closer looks show each class.
+
+    Args:
+        model: the model.
+        windows: the windows.
+        rows: rows to compute, either all of overviews or all of later looks.
+
+    Returns:
+        Log-odds, one row for each window and one column for each class.
+    """
+    before = None
+    if bool((windows.before[rows] >= 0).all()):
+        training = model.training
+        model.eval()
+        with torch.no_grad():
+            before = presence_log_odds(model, windows, windows.before[rows])
+        model.train(training)
+    return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
+
+
+E = TypeVar("E")
+
+_log = logging.getLogger(__name__)
+
+
+def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
+    """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window.
+
+    Args:
+        model: the model to fit.
+        examples: the training examples.
+        steps: number of steps.
+        batch: examples in a step.
+    """
+    own = [*model.rate.parameters(), model.prior, model.border]
+    descend_examples(
+        own, lambda example: rate_loss(model, example), examples, steps, batch, "expected number of objects"
+    )
+
+
+def descend_examples(
+    parameters: Iterable[nn.Parameter],
+    loss_of: Callable[[E], Tensor],
+    examples: Sequence[E],
+    steps: int,
+    batch: int,
+    title: str,
+    rate: float = 6e-3,
+) -> None:
+    """Minimise the mean loss of random examples.
+
+    Args:
+        parameters: the parameters to fit.
+        loss_of: loss of an example, a scalar.
+        examples: the training examples.
+        steps: number of steps.
+        batch: examples in a step.
+        title: name of the fit in the log.
+        rate: highest learning rate.
+    """
+    own = [*parameters]
+    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
+    for step in range(steps):
+        losses = [loss_of(example) for example in random.sample(examples, min(batch, len(examples)))]
+        loss = torch.stack(losses).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(own, 1.0)
+        optimizer.step()
+        schedule.step()
+        if step % 100 == 99:
+            _log.info("%s: step %d, loss %.4f", title, step + 1, float(loss.detach()))
+
+
+def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
+    """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic.
+
+    Only a few classes enter: random samples of the clearly and of the faintly visible ones.
+
+    Args:
+        model: the model.
+        example: the mosaic.
+
+    Returns:
+        The mean over looks, a scalar.
+    """
+    shown = torch.stack([look.show for look in example.looks]).amax(0)
+    sure, faint = (
+        (shown >= LEAST_CONFIDENCE).nonzero()[:, 0] + 1,
+        ((shown >= 0.02) & (shown < LEAST_CONFIDENCE)).nonzero()[:, 0] + 1,
+    )
+    targets = torch.cat([_some(sure, 8), _some(faint, 4)])
+    if not len(targets):
+        targets = _some(torch.arange(len(shown)) + 1, 1)
+    looks = [look for look in example.looks if look.gist is not None]
+    overview, *others = looks
+    assert overview.gist is not None
+    logs = model.rates(overview.gist, targets)
+    losses = [_likelihood_loss(model, example, overview, logs, targets, overview.found)]
+    for closer in random.sample(others, min(2, len(others))):
+        assert closer.gist is not None
+        before = rates_before(overview.gist, logs.detach(), closer.gist)
+        seen = overview.found | closer.found
+        closer_logs = model.rates(closer.gist, targets, before)
+        losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, seen))
+    return torch.stack(losses).mean()
+
+
+def _some(values: Tensor, most: int) -> Tensor:
+    return values[torch.randperm(len(values))[:most]]
+
+
+def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
+    """Convert the rates of the overview to the cells of a closer look, for windows one octave closer than that look.
+
+    Args:
+        first: gist of the overview.
+        logs: `(T, 3, rows, columns)`, logarithms of its rates.
+        look: gist of the closer look.
+
+    Returns:
+        Logarithms `(T, rows, columns)`, as the prediction before the closer look.
+    """
+    cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
+    rows, columns = (n * look.scale for n in look.scores.shape[:2])
+    part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
+    return torch.stack([before_of(one.numpy(), look) for one in part[:, min(look.level, STEPS - 1)]])
+
+
+def _likelihood_loss(
+    model: GlimpseEvidence, example: ZoomExample, looked_at: WindowResult, logs: Tensor, targets: Tensor, seen: Tensor
+) -> Tensor:
+    """Compute the mean negative log likelihood over the closer windows inside a look."""
+    rates = logs.exp()
+    terms = []
+    for closer, steps, (x1, y1, x2, y2) in closer_windows(example, looked_at):
+        weight = model.taper(x2 - x1)
+        part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
+        expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
+        new = example.labels[closer.found & ~seen]
+        count = (new == targets[:, None]).sum(-1)
+        terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
+    return torch.stack(terms).mean() if terms else logs.sum() * 0
