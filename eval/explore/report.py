@@ -24,7 +24,7 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-_SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+EXPLORATION_SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""
 
 ANSWERS = {
@@ -54,7 +54,7 @@ def exploration_report(run: ExploreRun) -> None:
             curves,
             titles={name: title for name, (_, title) in ANSWERS.items()},
             label="cells with the right class (%)",
-            shifts=_SHIFTS,
+            shifts=EXPLORATION_SHIFTS,
         )
     )
     announce(summary, written)
@@ -72,7 +72,7 @@ def _rate(record: ResultRecord, field: str) -> FloatArray:
 
 def exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
     """The tables that the run prints: success rates with standard errors over images."""
-    shifts = [n for n in _SHIFTS if n <= last]
+    shifts = [n for n in EXPLORATION_SHIFTS if n <= last]
     head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
     lines = []
     for answer, policies in curves.items():

@@ -31,7 +31,7 @@ from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 from semfov.viz.views import foveated_views
 
-_SHIFTS = (1, 5, 10, 15, 30)
+SEARCH_SHIFTS = (1, 5, 10, 15, 30)
 """Gaze shifts at which tables show the cumulative performance."""
 
 AVERAGES = {
@@ -59,7 +59,7 @@ def search_report(run: SearchRun) -> None:
             curves,
             titles=AVERAGES,
             label="targets found (%)",
-            shifts=_SHIFTS,
+            shifts=SEARCH_SHIFTS,
             others={"random, by formula": expected},
         )
     )
@@ -90,7 +90,7 @@ def expected_random(records: list[ResultRecord], shifts: int, cells: int) -> Flo
 
 def search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, sensing: str) -> str:
     """The tables that the run prints: cumulative performance with standard errors over images."""
-    shifts = [n for n in _SHIFTS if n < len(expected)]
+    shifts = [n for n in SEARCH_SHIFTS if n < len(expected)]
     head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
     lines = []
     for average, policies in curves.items():

@@ -74,6 +74,8 @@ class _Look:
         box: the cells of the lattice that it shows, `(x1, y1, x2, y2)`.
         fresh: whether nothing was predicted from it yet.
         left: `(rows, columns)`, share of each cell that is left to see.
+        scores: `(rows, columns, K)`, those of the gist.
+        visible: `(rows, columns, K)`, scores times the share that is left to see.
         tables: the windows of each level.
         facts: `(N, 6)`, `GlimpseEvidence.hint_facts`.
         before: `(N,)`, log odds from coarser looks.
@@ -87,6 +89,7 @@ class _Look:
         self.box: Box = (x, y, x + columns * scale, y + rows * scale)
         self.fresh = True
         self.left = np.ones((rows, columns), np.float32)
+        self.visible = self.scores = gist.scores.numpy()
         self.tables: dict[int, _Table] = {}
         count = 0
         for level in range(gist.level + 1, min(gist.level + STEPS, lattice.levels - 1) + 1):
@@ -114,29 +117,38 @@ class _Look:
         Yields:
             The hints of the windows of each level, the coarsest first.
         """
-        scores, before = self.gist.scores.numpy(), self.left
+        before = self.left
         self.left = self._left_of(left)
         if self.fresh:
-            changed, self.fresh = (0, 0, scores.shape[1], scores.shape[0]), False
+            changed, self.fresh = (0, 0, before.shape[1], before.shape[0]), False
+            differs = self.left != before
         else:
             differs = (self.gist.best.numpy() > 0) & (self.left != before)
             if not differs.any():
                 return
             changed = extent(differs)
+        if differs.any():
+            self._cover(extent(differs))
         if not self.tables:
             return
         places = [table.holding(changed) for table in self.tables.values()]
         # The largest windows, which come first, reach over the cells of all others.
         (below, beside), reach = places[0], next(iter(self.tables.values())).span - 1
         part = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
-        share = self.left[part]
-        visible = torch.from_numpy(scores[part] if (share == 1).all() else scores[part] * share[..., None])
-        pools = pool_spans(visible, [table.span for table in self.tables.values()])
+        pools = pool_spans(torch.from_numpy(self.visible[part]), [table.span for table in self.tables.values()])
         for (level, table), (down, across), maps in zip(self.tables.items(), places, pools, strict=True):
             at = _shifted(down, below.start), _shifted(across, beside.start)
             top, summary = (values[at].flatten(0, 1) for values in maps)
             facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
             yield _Pooled(level - self.gist.level, top, summary, facts, stale)
+
+    def _cover(self, changed: Box) -> None:
+        """Multiply the scores by the share that is left to see, where it has changed."""
+        if self.visible is self.scores:
+            self.visible = self.scores.copy()
+        x1, y1, x2, y2 = changed
+        here = slice(y1, y2), slice(x1, x2)
+        np.multiply(self.scores[here], self.left[here][..., None], out=self.visible[here])
 
     def _left_of(self, left: Cells) -> Cells:
         """Share of each cell of the gist that is left to see, `(rows, columns)`."""

@@ -8,10 +8,10 @@ import pytest
 
 import eval.comparison.page as module
 from eval.comparison.page import choose_episodes, write_run_report
-from eval.explore import exploration_report as explore_report
+from eval.explore import report as explore_report
 from eval.explore.config import ExploreConfig
 from eval.explore.run import ExploreRun
-from eval.search import search_report
+from eval.search import report as search_report
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
@@ -47,7 +47,7 @@ def write_search(run, records, **options):
         curves,
         titles=search_report.AVERAGES,
         label="targets found (%)",
-        shifts=search_report._SHIFTS,
+        shifts=search_report.SEARCH_SHIFTS,
         others={"random, by formula": search_report.expected_random(records, 5, 12)},
         **options,
     )
@@ -91,7 +91,7 @@ def test_the_page_of_an_exploration_run_shows_episodes_as_recorded(settings):
         curves,
         titles={"all classes": "all classes"},
         label="cells with the right class (%)",
-        shifts=explore_report._SHIFTS,
+        shifts=explore_report.EXPLORATION_SHIFTS,
     )
     data = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
     assert [episode["target"] for episode in data["episodes"]] == [None, None]
