@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 import semfov
-from eval.demo_text import columns, path_table, plain_name
+from eval.demo_tables import columns, path_table, plain_name
 from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
 from semfov.agents import ZoomAgent

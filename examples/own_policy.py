@@ -51,7 +51,7 @@ class WideInhibition(policies.Policy):
 
     def forward(self, target: int | Tensor | None, grid: semfov.Grid) -> semfov.acquisition.AcquisitionFunction:
         """Make the acquisition function for a target on a grid."""
-        return InhibitedPosterior(policies.wanted(target, self.name), self.width)
+        return InhibitedPosterior(policies.required_target(target, self.name), self.width)
 
 
 def main() -> None:

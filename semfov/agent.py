@@ -36,7 +36,7 @@ from semfov.io.schema import is_number
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
 from semfov.paths import Ending, Scanpath, Stimulus, trace
-from semfov.presets import published_parts, raw_parts, recommended_parts
+from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 
 PRICE = 0.1
@@ -112,7 +112,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_parts(name, sigma, growth, grid, context, **options))
+        return cls._of(recommended_arguments(name, sigma, growth, grid, context, **options))
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -130,7 +130,7 @@ class ActivePerception(nn.Module):
             DataError: a file is missing or damaged, or the detector is not the one that the models were fitted to.
         """
         folder = open_folder(name)
-        return cls.recommended(fspath(name), **options) if folder is None else cls._of(folder.parts(**options))
+        return cls.recommended(fspath(name), **options) if folder is None else cls._of(folder.arguments(**options))
 
     @classmethod
     def published(
@@ -164,7 +164,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector or this sensor, or the folder has no observation model.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(published_parts(name, sensor, search, calibrated, **options))
+        return cls._of(published_arguments(name, sensor, search, calibrated, **options))
 
     @classmethod
     def raw(cls, name: str = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
@@ -182,7 +182,7 @@ class ActivePerception(nn.Module):
             InputError: the detector or the sensor is unknown.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(raw_parts(name, sensor, **options))
+        return cls._of(raw_arguments(name, sensor, **options))
 
     @classmethod
     def _of(cls, parts: dict[str, Any]) -> Self:

@@ -214,7 +214,7 @@ class ModelFolder:
             return LearnedMap(learned), Closer(self._sensor.width(sensor) / sensor["reference"])
         return Semantic(len(self.manifest.classes) + 1), Random()
 
-    def parts(self, **source: Any) -> dict[str, Any]:
+    def arguments(self, **source: Any) -> dict[str, Any]:
         """Arguments of `semfov.ActivePerception`; takes arguments for `load_detector`."""
         grid = self.manifest.grid
         return {

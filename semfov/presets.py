@@ -28,10 +28,10 @@ PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.publi
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
 
-def recommended_parts(
+def recommended_arguments(
     name: str, sigma: float, growth: float, grid: tuple[int, int], context: bool, **options: Any
 ) -> dict[str, Any]:
-    """Parts of `ActivePerception.recommended`: learned target evidence for search, a learned map for exploration."""
+    """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
     check_shipped_sensor(sigma, growth)
     check_cells(grid)
     detector = load_detector(name, **options)
@@ -54,10 +54,10 @@ def recommended_parts(
     return {"eye": eye, "search": search, "explore": mapping, "verification": verification, "grid": grid}
 
 
-def published_parts(
+def published_arguments(
     name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
-    """Parts of `ActivePerception.published`, by the name of a detector or from a folder of models."""
+    """Arguments of the published agent, by the name of a detector or from a folder of models."""
     lookup(search, ["predictive", "non-predictive"], "published search policy")
     folder = open_folder(name)
     if folder is not None:
@@ -74,8 +74,8 @@ def published_parts(
     return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}
 
 
-def raw_parts(name: str, sensor: str, **options: Any) -> dict[str, Any]:
-    """Parts of `ActivePerception.raw`: raw scores as likelihoods, and random exploration."""
+def raw_arguments(name: str, sensor: str, **options: Any) -> dict[str, Any]:
+    """Arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
     return {"eye": eye, "search": (observer, NonPredictive()), "explore": (observer, Random())}

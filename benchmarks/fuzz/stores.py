@@ -27,9 +27,9 @@ def part_files(data: st.DataObject) -> str:
     """`Parts.load`: exactly the stored outcomes, or None."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
-        parts = SceneResults(Path(folder), "1-2", lambda index: "digest")
-        parts.save(0, RECORDS, SECONDS)
-        path = parts.path(0)
+        results = SceneResults(Path(folder), "1-2", lambda index: "digest")
+        results.save(0, RECORDS, SECONDS)
+        path = results.path(0)
         damage = choose(
             data, ("none", "value", "signed value", "missing", "deep", "bytes", "bit", "cut", "text"), "how"
         )
@@ -38,7 +38,7 @@ def part_files(data: st.DataObject) -> str:
             key = choose(data, list(part), "key")
             part[key] = copy.deepcopy(choose(data, JUNK, "junk"))
             if damage == "signed value":
-                part["sha256"] = parts._sha256(0, part["records"], part["seconds"])
+                part["sha256"] = results._sha256(0, part["records"], part["seconds"])
             if damage == "missing":
                 del part[key]
             path.write_text(json.dumps(part))
@@ -46,7 +46,7 @@ def part_files(data: st.DataObject) -> str:
             path.write_text("[" * 10_000 + "]" * 10_000)
         elif damage != "none":
             path.write_bytes(changed(path.read_bytes(), damage, rng))
-        found = parts.load(0)
+        found = results.load(0)
     if found is None:
         assert damage != "none"
         return "missing"

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from eval.comparison.page import write_run_report
+from eval.comparison.report_page import write_run_report
 from eval.comparison.summary import (
     LAST_COLUMN,
     Curve,

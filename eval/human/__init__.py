@@ -15,8 +15,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from eval.human.searching.compare import compare
-from eval.human.searching.config import PeopleSearchConfig
+from eval.human.search.compare import compare
+from eval.human.search.config import PeopleSearchConfig
 from eval.human.viewing.config import ViewingConfig
 from eval.human.viewing.report import viewing_report
 from eval.human.viewing.run import ViewingRun

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from eval.comparison.page import write_run_report
 from eval.comparison.replay import replay
+from eval.comparison.report_page import write_run_report
 from eval.comparison.summary import (
     LAST_COLUMN,
     Curve,

@@ -11,7 +11,7 @@ from typing import Any
 
 from semfov.errors import DataError
 from semfov.io.files import check_regular
-from semfov.io.schema import is_number, is_plain, shown
+from semfov.io.schema import excerpt, is_number, is_plain
 
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
 
@@ -148,4 +148,4 @@ def _kind(value: object) -> str:
 
 def _show(entry: dict[str, Any], key: str) -> str:
     """A value as error messages print it: on one line and short."""
-    return shown(entry[key]) if key in entry else "nothing"
+    return excerpt(entry[key]) if key in entry else "nothing"

@@ -9,7 +9,7 @@ from torch import nn
 from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
 from semfov.errors import DataError
-from semfov.io.schema import shown
+from semfov.io.schema import excerpt
 
 # YOLOv3 has 62 million parameters and a map of 12 million numbers; the limits keep a typing error from filling memory.
 _MOST_PARAMETERS = 3 * 10**8
@@ -91,8 +91,8 @@ class Builder:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
         if here.channels % groups or filters % groups:
             raise DataError(
-                f"{section.where}: expected groups that divide {shown(here.channels)} input channels and "
-                f"{shown(filters)} filters, got {shown(groups)}"
+                f"{section.where}: expected groups that divide {excerpt(here.channels)} input channels and "
+                f"{excerpt(filters)} filters, got {excerpt(groups)}"
             )
         size, stride = section.integer("size", 1), section.integer("stride", 1)
         # Parameters are counted before the layer is made, because making it allocates them.
@@ -136,10 +136,10 @@ class Builder:
         if len({shape.step for shape in shapes}) != 1:
             raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
         if group >= groups or any(shape.channels % groups for shape in shapes):
-            counts = shown([shape.channels for shape in shapes])
+            counts = excerpt([shape.channels for shape in shapes])
             raise DataError(
                 f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
-                f"{counts}, got group_id={shown(group)} and groups={shown(groups)}"
+                f"{counts}, got group_id={excerpt(group)} and groups={excerpt(groups)}"
             )
         self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
         return Route(groups, group)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from semfov.errors import DataError
 from semfov.io.files import check_regular
-from semfov.io.schema import shown
+from semfov.io.schema import excerpt
 
 _MOST_BYTES = 2**20
 
@@ -65,7 +65,9 @@ class Section:
         return [part for part in self.text(key, default).split(",") if part.strip()]
 
     def _refuse(self, key: str, expected: str) -> DataError:
-        return DataError(f"{self.where}: [{self.kind}] {key}: expected {expected}, got {shown(self.options.get(key))}")
+        return DataError(
+            f"{self.where}: [{self.kind}] {key}: expected {expected}, got {excerpt(self.options.get(key))}"
+        )
 
 
 def parse_cfg(text: str, source: str = "cfg") -> list[Section]:

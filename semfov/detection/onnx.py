@@ -25,7 +25,7 @@ from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import sha256
-from semfov.io.schema import shown
+from semfov.io.schema import excerpt
 
 ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name."""
@@ -260,7 +260,7 @@ def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tup
         return width, height
     sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
     whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
-    check(whole, "input_size", "(width, height) in pixels", shown(sizes))
+    check(whole, "input_size", "(width, height) in pixels", excerpt(sizes))
     check_canvas("input_size", (sizes[0], sizes[1]))
     fits = width in (None, sizes[0]) and height in (None, sizes[1])
     check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)

@@ -7,7 +7,7 @@ from typing import Any
 
 from semfov.errors import DataError
 from semfov.io.files import check_regular, inside
-from semfov.io.schema import shown
+from semfov.io.schema import excerpt
 
 MOST_ELEMENTS = 2**28
 """Largest number of elements of a tensor in a model; 1 GiB as float32."""
@@ -59,7 +59,7 @@ def check_elements(name: str, sizes: Iterable[int]) -> None:
     """Raise `DataError` for a tensor of more than `MOST_ELEMENTS` numbers."""
     sizes = list(sizes)
     if min(sizes, default=0) < 0 or math.prod(sizes) > MOST_ELEMENTS:
-        raise DataError(f"{name}: expected at most {MOST_ELEMENTS:,} numbers, got sizes {shown(sizes)}")
+        raise DataError(f"{name}: expected at most {MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
 
 
 def check_canvas(name: str, size: tuple[int, int]) -> None:
@@ -70,7 +70,7 @@ def check_canvas(name: str, size: tuple[int, int]) -> None:
 
 def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> None:
     for name, dims in tensors:
-        check_elements(f"ONNX model {str(path)!r}: tensor {shown(name)}", dims)
+        check_elements(f"ONNX model {str(path)!r}: tensor {excerpt(name)}", dims)
 
 
 def _dims(value: Any) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 from semfov.detection.onnx_file import MOST_METADATA
 from semfov.errors import DataError
 from semfov.io.files import check_regular
-from semfov.io.schema import is_number, is_plain, shown
+from semfov.io.schema import excerpt, is_number, is_plain
 
 METADATA_KEY = "semfov"
 """Key of the settings, as JSON, in the metadata of models that semfov exports."""
@@ -70,20 +70,20 @@ def _parse(text: str, where: str) -> dict[str, Any]:
     except (ValueError, RecursionError):  # integers too long, lists too deep
         raise DataError(f"{where}: expected JSON, got numbers that are too long or lists that are too deep") from None
     if not isinstance(settings, dict):
-        raise DataError(f"{where}: expected an object, got {shown(settings)}")
+        raise DataError(f"{where}: expected an object, got {excerpt(settings)}")
     unknown = sorted(set(settings) - set(KEYS))
     if unknown:
         raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
     for key, value in settings.items():
         if not isinstance(value, KEYS[key]):
             kinds = " or ".join(kind.__name__ for kind in KEYS[key])
-            raise DataError(f"{where}: {key}: expected {kinds}, got {shown(value)}")
+            raise DataError(f"{where}: {key}: expected {kinds}, got {excerpt(value)}")
     names, size = settings.get("classes", []), settings.get("input_size", 1)
     if not all(isinstance(name, str) and is_plain(name) for name in names):
-        raise DataError(f"{where}: classes: expected names without control characters, got {shown(names)}")
+        raise DataError(f"{where}: classes: expected names without control characters, got {excerpt(names)}")
     for number in size if isinstance(size, list) else [size]:
         if not is_number(number, whole=True):
-            raise DataError(f"{where}: input_size: expected whole numbers, got {shown(size)}")
+            raise DataError(f"{where}: input_size: expected whole numbers, got {excerpt(size)}")
     return settings
 
 

@@ -22,12 +22,12 @@ class SceneLook(Look):
 
     Attributes:
         pose: number of the head's pose.
-        said: evidence about the cells of the view.
+        inner: evidence about the cells of the view.
         gaze: `(1,)`, the fixated cell of the scene.
     """
 
     pose: int
-    said: Look
+    inner: Look
     gaze: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> "SceneLook":
@@ -136,9 +136,9 @@ class SceneObserver(Observer):
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SceneLook:
         """Evidence of a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
         pose, point = self.views.action_of(fixation[0])
-        said = self.inner.weigh(detections, point[None], self.views.view_grid, target)
+        inner = self.inner.weigh(detections, point[None], self.views.view_grid, target)
         action = self.views.grid.cell_of(fixation)
-        return SceneLook(pose, said, self.views.gaze_cell[action])
+        return SceneLook(pose, inner, self.views.gaze_cell[action])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         """The belief after one more look."""
@@ -146,10 +146,10 @@ class SceneObserver(Observer):
         views, grid, pose = self.views, self.views.view_grid, seen.pose
         values = known.values
         if not bool(known.looks):
-            values = self._unseen(seen.said, values)
+            values = self._unseen(seen.inner, values)
         before = known.views[pose]
-        view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, seen.said)
-        told = views.spread(self._told(view), pose).mT
+        view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, seen.inner)
+        probabilities = views.spread(self._probabilities(view), pose).mT
         cells = views.seen[pose].cells
         nearest = torch.minimum(
             self._distance(pose, seen),
@@ -158,18 +158,18 @@ class SceneObserver(Observer):
         mine = (nearest <= known.closest[0, cells]) | (known.owner[0, cells] == pose)
         at = cells[mine]
         values, closest, owner = values.clone(), known.closest.clone(), known.owner.clone()
-        values[0, at], closest[0, at], owner[0, at] = told[mine], nearest[mine], pose
+        values[0, at], closest[0, at], owner[0, at] = probabilities[mine], nearest[mine], pose
         examined = known.examined.scatter(-1, seen.gaze[:, None], True)
         after = (*known.views[:pose], view, *known.views[pose + 1 :])
         return SceneBelief(values, closest, owner, examined, known.looks + 1, after)
 
     def _distance(self, pose: int, look: SceneLook) -> Tensor:
         """Distances from the gaze to the cells that its view shows, `(V,)`."""
-        said = look.said
-        assert isinstance(said, TargetLook | MapLook)
-        return self.views.distances[pose][int(said.fixated)]
+        inner = look.inner
+        assert isinstance(inner, TargetLook | MapLook)
+        return self.views.distances[pose][int(inner.fixated)]
 
-    def _told(self, view: Belief) -> Tensor:
+    def _probabilities(self, view: Belief) -> Tensor:
         """Belief about the cells of a view, `(C, cells)`."""
         if isinstance(self.inner, Target):
             return torch.cat([view.probability(0), view.chance(0)])
@@ -182,6 +182,6 @@ class SceneObserver(Observer):
         assert isinstance(look, TargetLook | MapLook)
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
         blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
-        told = self._told(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))
+        probabilities = self._probabilities(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))
         # The median leaves out the one cell that counts as fixated.
-        return told.median(-1).values.expand_as(like).clone()
+        return probabilities.median(-1).values.expand_as(like).clone()

@@ -102,11 +102,11 @@ class Number(Json):
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
         whole = self.whole or self.size is not None
-        check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", shown(value))
+        check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", excerpt(value))
         if self.size is not None:
-            check(value >= 1 and _fits(self.size, value, sizes), name, f"{self.size}, at least 1", shown(value))
+            check(value >= 1 and _fits(self.size, value, sizes), name, f"{self.size}, at least 1", excerpt(value))
         inside = self.low <= value <= self.high and value > self.above
-        check(inside, name, interval(self.low, self.high, self.above), shown(value))
+        check(inside, name, interval(self.low, self.high, self.above), excerpt(value))
 
 
 class Flag(Json):
@@ -114,7 +114,7 @@ class Flag(Json):
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
-        check(isinstance(value, bool), name, "true or false", shown(value))
+        check(isinstance(value, bool), name, "true or false", excerpt(value))
 
 
 @dataclass(frozen=True)
@@ -137,14 +137,14 @@ class Array(Json):
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
-        check(isinstance(value, list | tuple), name, "a list", shown(value))
+        check(isinstance(value, list | tuple), name, "a list", excerpt(value))
         fits = self.size is None or _fits(self.size, len(value), sizes)
         check(fits, name, f"{self.size} items", f"{len(value)} with {sizes}")
         check(len(value) >= self.least, name, f"at least {self.least} items", len(value))
         for place, item in enumerate(value):
             self.of.check(f"{name}[{place}]", item, sizes)
         grows = not self.ascending or all(a < b for a, b in pairwise(value))
-        check(grows, name, "ascending numbers", shown(value))
+        check(grows, name, "ascending numbers", excerpt(value))
         check(not self.distinct or len(set(value)) == len(value), name, "items that differ", "repeated items")
 
 
@@ -161,7 +161,7 @@ class Pair(Json):
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
         fits = isinstance(value, list | tuple) and len(value) == len(self.items)
-        check(fits, name, f"a list of {len(self.items)} items", shown(value))
+        check(fits, name, f"a list of {len(self.items)} items", excerpt(value))
         for place, (item, kind) in enumerate(zip(value, self.items, strict=True)):
             kind.check(f"{name}[{place}]", item, sizes)
 
@@ -179,8 +179,8 @@ class Text(Json):
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
         fits = isinstance(value, str) and (value in self.options or not self.options)
-        check(fits, name, f"one of {', '.join(self.options)}" if self.options else "text", shown(value))
-        check(is_plain(value), name, "text without control characters", shown(value))
+        check(fits, name, f"one of {', '.join(self.options)}" if self.options else "text", excerpt(value))
+        check(is_plain(value), name, "text without control characters", excerpt(value))
 
 
 @dataclass(frozen=True)
@@ -199,12 +199,12 @@ class Object(Json):
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
-        check(isinstance(value, Mapping), name, "an object", shown(value))
+        check(isinstance(value, Mapping), name, "an object", excerpt(value))
         for key in self.required:
             check(key in value, f"{name}.{key}", "a value", "nothing")
         for key, item in value.items():
             kind = self.known.get(key, self.others)
-            check(kind is not None, name, f"no other keys than {', '.join(self.known)}", shown(key))
+            check(kind is not None, name, f"no other keys than {', '.join(self.known)}", excerpt(key))
             if kind is not None:
                 kind.check(f"{name}.{key}", item, sizes)
 
@@ -262,7 +262,7 @@ class Schema:
             check(name in values or isinstance(kind, Maybe), name, "a value", "nothing")
             kind.check(name, values.get(name), sizes)
         for name in tensors:
-            check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", shown(name))
+            check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", excerpt(name))
         for name, each in self.tensors.items():
             check(name in tensors or each.optional, name, "a tensor", "nothing")
             if name in tensors:
@@ -329,7 +329,7 @@ def is_plain(text: str) -> bool:
     return not re.search("[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text)
 
 
-def shown(value: object) -> str:
+def excerpt(value: object) -> str:
     """A value as error messages print it: on one line and short."""
     try:
         text = ascii(value)

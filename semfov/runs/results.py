@@ -38,14 +38,14 @@ class SceneResults:
         path = self.path(index)
         try:
             check_regular(path)
-            part = json.loads(path.read_text(encoding="utf-8"))
-            records, seconds = part["records"], part["seconds"]
-            whole = part["key"] == self.key and part["sha256"] == self._sha256(index, records, seconds)
+            result = json.loads(path.read_text(encoding="utf-8"))
+            records, seconds = result["records"], result["seconds"]
+            whole = result["key"] == self.key and result["sha256"] == self._sha256(index, records, seconds)
             formed = isinstance(records, list) and all(isinstance(record, dict) for record in records)
             formed = formed and isinstance(seconds, dict) and all(map(is_number, seconds.values()))
         except Exception:  # whatever is wrong with the file, the scene can be run again
             return None
-        return part if whole and formed else None
+        return result if whole and formed else None
 
     def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
         """Store the outcomes of a scene."""

@@ -73,7 +73,7 @@ class SceneRun(ABC):
         return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
-    def parts(self) -> SceneResults:
+    def results(self) -> SceneResults:
         """The outcomes of finished scenes."""
         return SceneResults(self.config.out / "parts", self.key, self.digest)
 
@@ -97,9 +97,9 @@ def store_folder(chosen: Path | None) -> Path:
 
 def finish(run: SceneRun, title: str) -> None:
     """Run this rank's share of the scenes that are not finished yet, and wait for the other ranks."""
-    parts = run.parts
-    todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
-    older = parts.by_other_code()
+    results = run.results
+    todo = [index for index in mine(range(len(run.scenes))) if results.load(index) is None]
+    older = results.by_other_code()
     if todo and older:
         _log.warning(
             "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
@@ -118,7 +118,7 @@ def finish(run: SceneRun, title: str) -> None:
     )
     for _ in done:
         pass
-    wait_for_others(range(len(run.scenes)), lambda index: parts.load(index) is not None)
+    wait_for_others(range(len(run.scenes)), lambda index: results.load(index) is not None)
 
 
 def complete(run: SceneRun, title: str) -> list[ResultRecord] | None:
@@ -140,11 +140,11 @@ def gather(run: SceneRun) -> tuple[list[ResultRecord], dict[str, float]]:
     records: list[ResultRecord] = []
     seconds: dict[str, float] = defaultdict(float)
     for index in range(len(run.scenes)):
-        part = run.parts.load(index)
-        if part is None:
-            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
-        records += part["records"]
-        for stage, value in part["seconds"].items():
+        result = run.results.load(index)
+        if result is None:
+            raise DataError(f"{run.results.path(index)} is missing or damaged; run the same command again")
+        records += result["records"]
+        for stage, value in result["seconds"].items():
             seconds[stage] += value
     return records, dict(seconds)
 
@@ -167,5 +167,5 @@ def finish_scene(index: int) -> int:
     """Run all episodes of a scene and store their outcomes; returns the index of the scene."""
     run = _process["run"]
     records, seconds = run.outcomes(index)
-    run.parts.save(index, records, seconds)
+    run.results.save(index, records, seconds)
     return index

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from semfov.errors import check
-from semfov.io.schema import interval, is_number, shown
+from semfov.io.schema import excerpt, interval, is_number
 
 
 @dataclass(frozen=True)
@@ -113,13 +113,13 @@ def _check(hint: Any, value: Any, name: str) -> None:
     if value is None or isinstance(value, Mapping):
         return
     if isinstance(value, str | Path):
-        check("\0" not in str(value), name, "text without NUL", shown(str(value)))
+        check("\0" not in str(value), name, "text without NUL", excerpt(str(value)))
     if origin is Annotated:
         base, *more = options
         for allowed in more:
             if isinstance(allowed, Range | FileName):
                 what = f"{_WORDS[base]} {allowed}"
-                check(allowed.holds(value, whole=base is int), name, what, shown(value))
+                check(allowed.holds(value, whole=base is int), name, what, excerpt(value))
     elif origin is tuple and isinstance(value, list | tuple):
         for place, item in enumerate(value):
             _check(options[0 if options[-1] is Ellipsis else place], item, f"{name}[{place}]")

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 import eval.demo as program
-from eval import demo_text
+from eval import demo_tables
 from semfov import ActivePerception, FovealObservationModel, observers, policies, read_image
 from semfov.belief import MapEvidence, Verification
 from semfov.belief.observers import Semantic
@@ -229,7 +229,7 @@ def test_the_stages_of_every_look_are_timed(agent, photo):
 def test_the_duration_of_every_look_is_printed(agent, photo):
     picture = Picture("photo", read_image(photo))
     scanpath = program.look_at(agent, picture, program.DemoConfig(explore=True, start=40, shifts=2))
-    lines = demo_text.path_table("photo", scanpath).splitlines()
+    lines = demo_tables.path_table("photo", scanpath).splitlines()
     assert lines[1].endswith("ms")
     milliseconds = [f"{1000 * sum(look.values()):.0f}" for look in scanpath.seconds]
     assert [line.split()[-1] for line in lines[2 : lines.index("")]] == milliseconds

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-import eval.comparison.page as module
-from eval.comparison.page import choose_episodes, write_run_report
+import eval.comparison.report_page as module
+from eval.comparison.report_page import choose_episodes, write_run_report
 from eval.explore import report as explore_report
 from eval.explore.config import ExploreConfig
 from eval.explore.run import ExploreRun

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval.comparison import page as run_report
+from eval.comparison import report_page as run_report
 from eval.comparison.summary import Curve
 from eval.search.config import SearchConfig
 from semfov import Detections, Grid, Scanpath

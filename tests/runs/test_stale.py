@@ -53,7 +53,7 @@ def threads():
 def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, monkeypatch, caplog):
     first = SearchRun(config)
     finish(first, "searching")
-    assert first.parts.load(0) is not None
+    assert first.results.load(0) is not None
     finish(SearchRun(config), "searching")
     assert not caplog.records
     monkeypatch.setattr(scene_run, "package_digest", lambda: "0" * 64)
@@ -61,12 +61,12 @@ def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, mon
     assert second.settings_key == first.settings_key
     assert second.key != first.key
     assert second.store.key == first.store.key, "stored looks do not depend on the code of the search"
-    assert second.parts.load(0) is None
+    assert second.results.load(0) is None
     with caplog.at_level(logging.WARNING):
         finish(second, "searching")
     (record,) = caplog.records
     assert "1 scenes were finished with these settings by another version of the code" in record.getMessage()
-    assert second.parts.load(0) is not None
+    assert second.results.load(0) is not None
 
 
 def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, monkeypatch):
@@ -90,11 +90,11 @@ def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, 
 
 def test_a_part_of_another_image_is_not_loaded(tmp_path):
     digest = {"now": "a" * 64}
-    parts = SceneResults(tmp_path, "1-2", lambda index: digest["now"])
-    parts.save(3, [{"policy": "random"}], {"look": 0.5})
-    assert parts.load(3)["records"] == [{"policy": "random"}]
+    results = SceneResults(tmp_path, "1-2", lambda index: digest["now"])
+    results.save(3, [{"policy": "random"}], {"look": 0.5})
+    assert results.load(3)["records"] == [{"policy": "random"}]
     digest["now"] = "b" * 64
-    assert parts.load(3) is None
+    assert results.load(3) is None
 
 
 @pytest.mark.parametrize(
@@ -111,25 +111,25 @@ def test_a_part_of_another_image_is_not_loaded(tmp_path):
     ],
 )
 def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
-    parts = SceneResults(tmp_path, "1-2", lambda index: "a")
-    parts.save(0, [{"policy": "random"}], {"look": 0.5})
-    part = damage(json.loads(parts.path(0).read_text()))
+    results = SceneResults(tmp_path, "1-2", lambda index: "a")
+    results.save(0, [{"policy": "random"}], {"look": 0.5})
+    part = damage(json.loads(results.path(0).read_text()))
     if isinstance(part, dict) and {"records", "seconds"} <= part.keys():
-        part["sha256"] = parts._sha256(0, part["records"], part["seconds"])
-    parts.path(0).write_text(json.dumps(part))
-    assert parts.load(0) is None
+        part["sha256"] = results._sha256(0, part["records"], part["seconds"])
+    results.path(0).write_text(json.dumps(part))
+    assert results.load(0) is None
 
 
 def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
-    parts = SceneResults(tmp_path, "1-2", lambda index: "a")
-    parts.folder.mkdir()
+    results = SceneResults(tmp_path, "1-2", lambda index: "a")
+    results.folder.mkdir()
     for content in (b"[" * 100_000, b"\xff\xfe", b"", b'{"key": 1' * 9):
-        parts.path(0).write_bytes(content)
-        assert parts.load(0) is None
-    os.mkfifo(parts.path(1))
-    assert parts.load(1) is None
-    parts.path(2).mkdir()
-    assert parts.load(2) is None
+        results.path(0).write_bytes(content)
+        assert results.load(0) is None
+    os.mkfifo(results.path(1))
+    assert results.load(1) is None
+    results.path(2).mkdir()
+    assert results.load(2) is None
 
 
 @pytest.mark.slow
@@ -187,4 +187,4 @@ def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
     assert gather(run)[0]
     monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
     other = SearchRun(config)
-    assert other.parts.load(0) is None
+    assert other.results.load(0) is None

@@ -6,11 +6,11 @@ screen, in pixels of a picture, or in cells. `Letterbox` and `Fixations.resized`
 
 from semfov.data.fixations.cocosearch import read_cocosearch, write_cocosearch
 from semfov.data.fixations.osie import read_osie, write_osie
+from semfov.data.fixations.pysaliency import from_pysaliency, to_pysaliency
 from semfov.data.fixations.record import Fixations, by_picture
 from semfov.data.fixations.ruarte import coco_name, read_ruarte, write_ruarte
 from semfov.data.fixations.screen import Letterbox
 from semfov.data.fixations.table import read_table, write_table
-from semfov.data.fixations.trains import from_pysaliency, to_pysaliency
 
 __all__ = [
     "Fixations",

@@ -9,7 +9,7 @@ from semfov.gaze.policies.base import (
     Task,
     named_policy,
     policy_names,
-    wanted,
+    required_target,
 )
 from semfov.gaze.policies.exploration import (
     KL,
@@ -65,5 +65,5 @@ __all__ = [
     "TemplateSearch",
     "named_policy",
     "policy_names",
-    "wanted",
+    "required_target",
 ]

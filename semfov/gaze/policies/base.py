@@ -201,7 +201,7 @@ def named_policy(name: str, task: Task, means: Means | None = None) -> Policy:
     return kind.make(means)
 
 
-def wanted(target: int | Tensor | None, name: str) -> int | Tensor:
+def required_target(target: int | Tensor | None, name: str) -> int | Tensor:
     """Return the target, or raise an error where there is none.
 
     A search policy calls it in `forward`.
@@ -216,7 +216,7 @@ def wanted(target: int | Tensor | None, name: str) -> int | Tensor:
     Raises:
         InputError: `target` is None.
 
-    >>> wanted(3, "non-predictive")
+    >>> required_target(3, "non-predictive")
     3
     """
     if target is None:

@@ -15,7 +15,7 @@ from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
-from semfov.gaze.policies.base import ModelPolicy, Policy, Task, wanted
+from semfov.gaze.policies.base import ModelPolicy, Policy, Task, required_target
 
 
 class Random(Policy):
@@ -47,7 +47,7 @@ class NonPredictive(Policy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The posterior of the target."""
-        return TargetPosterior(wanted(target, self.name))
+        return TargetPosterior(required_target(target, self.name))
 
 
 class Predictive(ModelPolicy):
@@ -68,7 +68,7 @@ class Predictive(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The predicted posterior of the target."""
-        return PredictedTargetPosterior(wanted(target, self.name), self.model)
+        return PredictedTargetPosterior(required_target(target, self.name), self.model)
 
 
 class Neighbourhood(ModelPolicy):
@@ -89,7 +89,7 @@ class Neighbourhood(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The predicted posterior of the target in the neighbourhood."""
-        return NeighbourhoodPosterior(wanted(target, self.name), self.model, grid)
+        return NeighbourhoodPosterior(required_target(target, self.name), self.model, grid)
 
 
 class FovealHits(ModelPolicy):
@@ -111,7 +111,7 @@ class FovealHits(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The probability of a detection."""
-        return FovealHit(wanted(target, self.name), self.model, grid)
+        return FovealHit(required_target(target, self.name), self.model, grid)
 
 
 class InformationOnPlace(ModelPolicy):
@@ -133,7 +133,7 @@ class InformationOnPlace(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The expected information about the place."""
-        return PlaceInformation(wanted(target, self.name), self.model, grid)
+        return PlaceInformation(required_target(target, self.name), self.model, grid)
 
 
 class EntropyLimitMinimisation(ModelPolicy):
@@ -156,7 +156,7 @@ class EntropyLimitMinimisation(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The limit of the decrease of the entropy."""
-        return EntropyLimit(wanted(target, self.name), self.model, grid)
+        return EntropyLimit(required_target(target, self.name), self.model, grid)
 
 
 class IdealObserver(ModelPolicy):
@@ -180,4 +180,4 @@ class IdealObserver(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The probability of a correct localisation."""
-        return CorrectLocalisation(wanted(target, self.name), self.model, grid)
+        return CorrectLocalisation(required_target(target, self.name), self.model, grid)

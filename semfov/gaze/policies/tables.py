@@ -11,7 +11,7 @@ from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.static import Static
 from semfov.gaze.acquisition.templates import TemplateAttention
-from semfov.gaze.policies.base import Means, Policy, Task, wanted
+from semfov.gaze.policies.base import Means, Policy, Task, required_target
 
 
 class TablePolicy(Policy):
@@ -83,7 +83,7 @@ class TemplateSearch(TablePolicy):
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
     ) -> AcquisitionFunction:
         """The attention to the target, accumulated over the fixated cells."""
-        return TemplateAttention(wanted(target, self.name), given(table, self), grid, self.fovea)
+        return TemplateAttention(required_target(target, self.name), given(table, self), grid, self.fovea)
 
 
 def given(table: Tensor | None, policy: Policy) -> Tensor:

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from eval.human.searching.trials import in_cells, read_searches, shift_found
+from eval.human.search.trials import in_cells, read_searches, shift_found
 from semfov import Grid
 from semfov.data.fixations import by_picture
 from semfov.metrics.scanpath import mean_performance, multimatch, performance_area, tfp_auc

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from eval.human.searching.config import PeopleSearchConfig
-from eval.human.searching.report import searching_report
-from eval.human.searching.run import PeopleSearchRun
-from eval.human.searching.scores import Beside, People
-from eval.human.searching.trials import drawn_searches, read_searches
+from eval.human.search.config import PeopleSearchConfig
+from eval.human.search.report import people_report
+from eval.human.search.run import PeopleSearchRun
+from eval.human.search.scores import Beside, People
+from eval.human.search.trials import drawn_searches, read_searches
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
 from semfov.errors import DataError, check
@@ -63,7 +63,7 @@ def compare(config: PeopleSearchConfig) -> None:
         few = {name: searches for name, searches in few.items() if searches}
         title = f"the {len(here)} available pictures"
         tables[title] = _scored({**few, **policies}, few["people"], grid, config)
-    searching_report(config, tables, {**floors, **policies})
+    people_report(config, tables, {**floors, **policies})
 
 
 def _scored(

@@ -13,8 +13,8 @@ from dataclasses import asdict
 import yaml
 
 from eval.comparison.summary import announce
-from eval.human.searching.config import PeopleSearchConfig
-from eval.human.searching.scores import DIMENSIONS, Beside
+from eval.human.search.config import PeopleSearchConfig
+from eval.human.search.scores import DIMENSIONS, Beside
 from semfov.data.fixations import Fixations, write_table
 from semfov.io.code import commit
 from semfov.io.files import clean, sha256, write_text
@@ -36,7 +36,7 @@ _HEAD = (
 )
 
 
-def searching_report(
+def people_report(
     config: PeopleSearchConfig, tables: Mapping[str, Rows], scanpaths: Mapping[str, list[Fixations]]
 ) -> None:
     """Write all output and print the tables.

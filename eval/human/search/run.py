@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from eval.comparison.run import Run
-from eval.human.searching.config import PeopleSearchConfig
-from eval.human.searching.screens import Screens
-from eval.human.searching.trials import goal_rectangle, read_searches
+from eval.human.search.config import PeopleSearchConfig
+from eval.human.search.screens import Screens
+from eval.human.search.trials import goal_rectangle, read_searches
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from eval.human.searching.scores import People
-from eval.human.searching.screens import Screens
-from eval.human.searching.trials import drawn_searches, goal_rectangle, in_cells, read_searches, shift_found
+from eval.human.search.scores import People
+from eval.human.search.screens import Screens
+from eval.human.search.trials import drawn_searches, goal_rectangle, in_cells, read_searches, shift_found
 from semfov import Grid
 from semfov.data.fixations import Fixations, write_ruarte
 from semfov.errors import DataError

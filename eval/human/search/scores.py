@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eval.human.searching.trials import in_cells, shift_found
+from eval.human.search.trials import in_cells, shift_found
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
 from semfov.metrics.averages import standard_error
