@@ -161,7 +161,7 @@ def best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Ten
         The number m, and the overlaps o (intersection over union), `(L,)`.
 
     >>> boxes = torch.tensor([[0.0, 0.0, 8.0, 9.0], [30.0, 0.0, 39.0, 9.0]])
-    >>> match(boxes, torch.tensor([0.5, 0.9]), torch.tensor([0.0, 0.0, 9.0, 9.0]))[0]
+    >>> best_detection(boxes, torch.tensor([0.5, 0.9]), torch.tensor([0.0, 0.0, 9.0, 9.0]))[0]
     0
     """
     overlap = box_iou(boxes, box[None])[:, 0]

@@ -282,7 +282,7 @@ def follow_target(box: Tensor, seen: Detections, target: int) -> Tensor:
         The box `(4,)`, unmoved if no detection overlaps it by `MATCHED`.
 
     >>> seen = Detections(torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
-    >>> follow(torch.tensor([0.0, 0.0, 8.0, 8.0]), seen, 1)
+    >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), seen, 1)
     tensor([ 3.,  0., 11.,  8.])
     """
     shown = seen.mask[0]

@@ -21,7 +21,7 @@ def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, .
     Returns:
         The names that stand for a class, and their positions in `classes`.
 
-    >>> named(["__background__", "cat", "N/A", "dog"])
+    >>> named_outputs(["__background__", "cat", "N/A", "dog"])
     (('cat', 'dog'), (1, 3))
     """
     places = tuple(index for index, name in enumerate(classes) if name not in PLACEHOLDERS)

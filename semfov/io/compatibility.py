@@ -38,7 +38,7 @@ def recommended_model(detector: str, growth: float) -> str:
     Returns:
         The name of the model.
 
-    >>> recommended("yolov3-tiny", 2.0), recommended("yolov3-tiny", 1.0)
+    >>> recommended_model("yolov3-tiny", 2.0), recommended_model("yolov3-tiny", 1.0)
     ('yolov3-tiny', 'yolov3-tiny-sharp')
     """
     return f"{detector}-sharp" if growth == 1 else detector

@@ -37,7 +37,7 @@ class WholeBar:
         stages: for each stage, in order, the approximate durations of its tasks by their titles. Only their ratios
             matter. A task with another title does not move the bar.
 
-    >>> with Whole("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
+    >>> with WholeBar("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
     ...     with whole.stage("one"):
     ...         _ = list(track(range(5), "half", "unit"))
     ...         half = whole.done

@@ -244,7 +244,7 @@ class ObjectSeeking(Policy):
 
     With the observer `semfov.observers.Landing` this is where people look.
 
-    >>> Objects()(None, Grid(4, 3, (40, 30)))
+    >>> ObjectSeeking()(None, Grid(4, 3, (40, 30)))
     ObjectEvidence()
     """
 

@@ -28,7 +28,7 @@ def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion =
     Raises:
         InputError: there is no map, their shapes do not fit together, or there is no such `fusion`.
 
-    >>> fuse([torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 3)], (4, 6)).mean()
+    >>> combine_maps([torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 3)], (4, 6)).mean()
     tensor(0.5000)
     """
     lookup(fusion, get_args(Fusion), "fusion")

@@ -41,7 +41,7 @@ def dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     Raises:
         InputError: `levels` is negative.
 
-    >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 9, 12), 3)]
+    >>> [tuple(level.shape[-2:]) for level in dyadic_pyramid(torch.rand(1, 3, 9, 12), 3)]
     [(9, 12), (5, 6), (3, 3), (2, 2)]
     """
     check(levels >= 0, "levels", "0 or more", levels)
