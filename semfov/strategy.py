@@ -1,4 +1,4 @@
-"""Observer and policy of a task."""
+"""A strategy: the observer and the policy for one task."""
 
 from collections.abc import Mapping, Sequence
 

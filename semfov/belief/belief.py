@@ -203,7 +203,7 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
 
 
 def pick(values: Tensor, target: Tensor) -> Tensor:
-    """Select the component of a class.
+    """Select the values of one class along the last dimension.
 
     Args:
         values: `(B, ..., K+1)`.

@@ -297,7 +297,7 @@ def presence_of(detections: Detections, grid: Grid) -> Tensor:
 
 
 def reaches(presence: Tensor, grid: Grid, edges: Sequence[float]) -> Iterator[Tensor]:
-    r"""Probability of each class within the distance of each edge from a cell.
+    r"""Probability that each class occurs within a distance of every cell, for each distance in `edges`.
 
     .. math:: R_{jn}(x) = \max_{y : d(x, y) \le e_n} p_j(y), \qquad q_{jn} = R_{jn} - R_{j,n-1}
 

@@ -21,7 +21,7 @@ _REACH = 1 / 6
 
 @dataclass(frozen=True)
 class Gathered:
-    """Evidence of all looks of an episode so far about one class.
+    """Accumulated evidence about one class from all looks of an episode so far.
 
     Attributes:
         nearest: `(B, X·Y)`, evidence of the closest look at each cell.

@@ -1,4 +1,4 @@
-"""Features of a look for a target in each cell: a few numbers whose meaning does not depend on the class."""
+"""Features of looks for a target in each cell: the inputs of learned evidence, with the same meaning for any class."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""The scenes of a set that hold most objects."""
+"""A subset of a set of scenes: those with the most objects."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ from semfov.errors import check
 
 
 class Crowded:
-    """The share of a set's scenes that hold most objects; of scenes with as many, the first ones.
+    """The given share of a set's scenes, those with the most objects; among equals the first scenes count.
 
     Args:
         scenes: the set.

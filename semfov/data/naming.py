@@ -1,4 +1,4 @@
-"""Matching of classes with the names of other tables, in any spelling or by synonyms."""
+"""Matching of class names with the names in other tables, by spelling or by synonyms."""
 
 from collections.abc import Sequence
 

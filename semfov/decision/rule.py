@@ -143,7 +143,7 @@ def conclude(
 
 
 def surely(confirm: float) -> float:
-    """Probability of a place from which a search ends at once: halfway between the threshold `confirm` and 1."""
+    """Threshold on a place's probability at which a search ends at once: halfway between `confirm` and 1."""
     return (1 + confirm) / 2
 
 

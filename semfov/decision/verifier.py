@@ -26,7 +26,7 @@ _FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a closer look has shown, some frames ago.
+    """A closer look at a place, and the number of frames since then.
 
     Attributes:
         look: the closer look; its box and its cell follow the target (`follow_target`).

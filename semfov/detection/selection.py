@@ -115,7 +115,7 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
 
 
 def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
-    """Which boxes survive, of boxes that stand with the most confident first."""
+    """Indices of the boxes that survive suppression, among boxes in descending order of confidence."""
     from torchvision.ops import batched_nms, nms
 
     def first(count: int) -> Tensor:

@@ -97,7 +97,7 @@ def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | None:
-    """The function above for a kind of model, and whether its scores are a softmax; None for an unknown kind."""
+    """The function that decodes a kind of model, and whether its scores are a softmax; None for an unknown kind."""
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.ssd import SSD
 

@@ -1,4 +1,4 @@
-"""Episodes side by side that begin, move from look to look, and are observed and scored: what environments play."""
+"""Batches of episodes that environments step through: starts, gaze shifts, observations and rewards."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Arrays = dict[str, Any]
 
 @dataclass(frozen=True)
 class Score:
-    """What a gaze shift brings in n episodes.
+    """Reward and end of n episodes after a gaze shift.
 
     Attributes:
         reward: `(n,)`, reward for what the look found, minus its price.

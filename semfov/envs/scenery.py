@@ -1,4 +1,4 @@
-"""What environments share: scenes, the eye that looks at them, and the belief that it keeps."""
+"""The parts that environments share: scenes, the eye that looks at them, and the belief about them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What environments with large pictures share: the pictures, and looks at their windows, computed once and kept."""
+"""The parts that environments with large pictures share: the pictures, and looks at their windows, each made once."""
 
 from __future__ import annotations
 

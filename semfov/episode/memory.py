@@ -1,4 +1,4 @@
-"""State of episodes between two looks, and how it is forgotten."""
+"""The state of episodes between two looks: belief, visited cells and their ages, and forgetting."""
 
 import math
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ class Forgetting:
 
 @dataclass(frozen=True)
 class Memory:
-    """State of A episodes between two looks.
+    """State of A episodes between two looks: the belief, and the cells that were fixated.
 
     Attributes:
         belief: the belief.

@@ -223,7 +223,7 @@ def _search(
 
 
 def by_detection(step: Step, target: int, grid: Grid) -> Tensor:
-    """Apply the rule of agents without fitted models: a detection with a score of 0.5 in the fixated cell is a find."""
+    """Decide as agents without fitted models: the target is found by a detection with score 0.5 in the fixated cell."""
     return confirms(step.detections, grid, step.cell, target, 0.5).long()
 
 

@@ -1,4 +1,4 @@
-"""Searches that a verification is fitted to, and those of photographs, whose looks are made once, and remembered."""
+"""Searches that a verification is fitted to; all searches of a photograph share its looks, each made only once."""
 
 from __future__ import annotations
 

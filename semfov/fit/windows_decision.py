@@ -108,7 +108,7 @@ def search_mosaics(
     seed: int,
     title: str,
 ) -> Searches:
-    """Take down all searches of `searches_of`, whose arguments these are.
+    """Run all searches of `searches_of`, with the same arguments, and collect them.
 
     Returns:
         The searches.

@@ -1,4 +1,4 @@
-"""Fitting how many objects of any class closer looks find (`semfov.zoom.survey`)."""
+"""Fit the survey: how many objects of any class closer looks find (`semfov.zoom.survey`)."""
 
 import random
 from collections import defaultdict

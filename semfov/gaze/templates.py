@@ -1,4 +1,4 @@
-"""What objects of each class look like to a detector: class templates among its own features."""
+"""Class templates: the mean features that a detector computes at objects of each class, and attention by them."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -69,7 +69,7 @@ def live(eye: Eye, views: Views) -> Detect:
 
 @dataclass(frozen=True)
 class HeadStep:
-    """One look.
+    """One step of an episode: a look, the time it ends, its detections, and the belief after it.
 
     Attributes:
         action: number of the pose and cell (`Views`).

@@ -223,7 +223,7 @@ class Scan(AcquisitionFunction):
 
 
 class Anywhere(AcquisitionFunction):
-    """Any pose and any fixation, at random.
+    """Baseline: a pose of the head and a fixation of the eye, drawn at random.
 
     Args:
         views: the possible views and fixations.

@@ -1,4 +1,4 @@
-"""All possible views of a head and fixations of its eye, as one grid of cells."""
+"""All poses of a head and all fixations of its eye, numbered as the actions of an episode."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

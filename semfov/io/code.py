@@ -1,4 +1,4 @@
-"""Digests of code, so that a stored result is never taken for the result of other code."""
+"""Digests of code, which tell whether a stored result was computed by the present code."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def _place(number: int) -> str:
 
 
 def _scripted(episode: Data, number: int) -> Data:
-    """The part of an episode that the script needs."""
+    """The data of an episode that the page's script reads, as JSON values."""
     if "looks" not in episode:
         return episode
     looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]

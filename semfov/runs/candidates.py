@@ -1,4 +1,4 @@
-"""From the settings of a policy to its observer and its acquisition function."""
+"""Policies under comparison: loads their models, and builds observer and policy from the settings."""
 
 from __future__ import annotations
 

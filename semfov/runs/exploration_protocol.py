@@ -60,7 +60,7 @@ def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolCo
 
 
 def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: ProtocolConfig) -> Tensor:
-    """Random numbers that break an exploration's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
     return noise_for(protocol, cells, scenes.ids[episode.scene], "exploration", episode.repetition)
 
 

@@ -17,7 +17,7 @@ from semfov.runs.store import cell_store
 
 
 class Looking(SceneRun):
-    """Scenes, and an eye that looks at each of them from every cell; what it detects is stored.
+    """Scenes, and an eye that looks at each of them from every cell; its detections are stored.
 
     Its outcomes are the looks themselves. A subclass that compares policies adds the records of their episodes.
 

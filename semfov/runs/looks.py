@@ -74,6 +74,6 @@ def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Calla
 
 
 def tight(look: Detections) -> Detections:
-    """Remove the padding of a batch of one."""
+    """Remove the padding from the detections of a single look."""
     mask = look.mask[0]
     return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])

@@ -1,4 +1,4 @@
-"""Looks at one scene that are made once, whoever asks for them: remembered in memory and, with a store, on disk."""
+"""A cache of looks at one scene, in memory and, with a store, on disk: each look is made only once."""
 
 from collections.abc import Callable
 from typing import Generic

@@ -1,4 +1,4 @@
-"""Work over scenes that any process can build from its settings; a stopped run continues where it stopped."""
+"""The base of runs over many scenes, which several processes share and which continue after an interruption."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BESIDES = ("out", "cache", "store", "workers", "data", "detector")
 
 
 class SceneRun(ABC):
-    """Base of runs that any process can build from the settings and that go through scenes one by one.
+    """Base of runs over many scenes, one after the other; any process can build the run from its settings.
 
     Attributes:
         config: the settings.

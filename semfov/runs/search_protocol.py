@@ -135,7 +135,7 @@ def choose_classes(
 
 
 def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
-    """Random numbers that break an episode's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
     return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
 
 

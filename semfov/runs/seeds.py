@@ -1,4 +1,4 @@
-"""Random numbers that depend only on their purpose, such as one episode of one protocol."""
+"""Random generators seeded by their purpose, such as one episode of one protocol."""
 
 import hashlib
 

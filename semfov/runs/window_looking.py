@@ -64,7 +64,7 @@ class WindowLookingConfig(WorkConfig):
 
 
 class WindowLooking:
-    """Large pictures, an eye that looks at windows of them, and evidence; what it detects is stored.
+    """Large pictures, an eye that looks at their windows, and learned evidence; the detections are stored.
 
     Args:
         config: the settings.

@@ -103,7 +103,7 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
 
 
 def raw(glance: Glance, window: Window, target: int | None, *, most: bool) -> float:
-    """Highest score, or sum of the scores, of a look's gist in a window."""
+    """Raw value of a window: the highest score, or the sum of the scores, that a look's gist has in it."""
     look = glance.gist
     assert look is not None
     x1, y1, x2, y2 = window.cells

@@ -1,4 +1,4 @@
-"""Belief about a large picture: what looks at it predict for closer looks."""
+"""The belief about a large picture: what the looks so far predict that closer looks will show."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -277,7 +277,7 @@ class ZoomBelief:
 
 
 def before_of(rate: Cells, look: Gist) -> Tensor:
-    """Logarithms of the rates that earlier looks gave, in the cells of a look, for looks one octave closer than it.
+    """Logarithms of the rates that earlier looks predicted for a look's cells, one octave closer than the look.
 
     Args:
         rate: `(rows, columns)`, the rates in the lattice cells that the look shows.

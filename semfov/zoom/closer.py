@@ -51,7 +51,7 @@ def look_closely(glances: Glances, box: Tensor) -> Glance:
 
 
 class WindowLook(NamedTuple):
-    """A look of a search, with what is known after it.
+    """One look of a search, and what is known of the target after it.
 
     Attributes:
         detections: its detections, a batch of one, boxes in picture pixels.

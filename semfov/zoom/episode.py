@@ -15,7 +15,7 @@ Order = Callable[[Sequence[Glance], set[Window]], Sequence[Choice]]
 
 
 class Turn(Generic[_Belief]):
-    """A turn of an episode: one look.
+    """One step of an episode: a look, its value when it was chosen, and the belief after it.
 
     Attributes:
         glance: result of the look.

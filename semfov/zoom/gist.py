@@ -21,7 +21,7 @@ FOUND = 0.1
 
 @dataclass(frozen=True)
 class Gist:
-    """A look at a window, cell by cell.
+    """The summary of a look at a window: the strongest hint of every class in each cell.
 
     The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
     form one cell of the gist.

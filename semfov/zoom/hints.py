@@ -1,4 +1,4 @@
-"""Hints: candidates of a look, also such that are too weak to be detections, which show where a closer look pays."""
+"""Hints: a detector's candidates in a look, also those below the detection threshold; they show where to zoom in."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ FAINT = 0.002
 
 @dataclass(frozen=True)
 class Hints:
-    """The hints of a look, in no order. Several may be of one object.
+    """The hints of one look: boxes with class scores, in no order; several may be of one object.
 
     Attributes:
         boxes: `(N, 4)`, `(x1, y1, x2, y2)`.

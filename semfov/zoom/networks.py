@@ -1,4 +1,4 @@
-"""Small networks over the hints of a look, and maps that they read."""
+"""Small networks of the evidence by magnification, and the maps of hints that are their inputs."""
 
 import torch
 from torch import Tensor, nn
@@ -89,7 +89,7 @@ def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> T
 
 
 def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
-    """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
+    """Compute selected outputs of a network without calls of modules, which cost most of the time in one so small."""
     last = len(network) - 1
     for place, layer in enumerate(network):
         if isinstance(layer, nn.Linear):

@@ -53,7 +53,7 @@ def intersection(x1: Column, y1: Column, x2: Column, y2: Column, first: Index, s
 
 
 def survivors(count: int, better: Index, worse: Index) -> Index:
-    """Boxes that stay when each one that stays removes the worse ones that it is paired with.
+    """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
 
     Args:
         count: number of boxes, the best first.

@@ -71,14 +71,14 @@ class WindowSums:
 
 
 def union(box: Box, other: Box | None) -> Box:
-    """The box about two boxes, or about one."""
+    """The smallest box that contains both boxes; the first one if there is no other."""
     if other is None:
         return box
     return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
 
 
 def extent(marked: NDArray[np.bool_]) -> Box:
-    """Find the box about marked cells.
+    """Find the smallest box that contains all marked cells.
 
     Args:
         marked: `(rows, columns)`; at least one cell is marked.

@@ -140,5 +140,5 @@ class PartFit(ABC):
 
 
 def strategy(observer: Observer, policy: Policy) -> Strategy:
-    """Return a strategy without gradients."""
+    """Make a strategy in evaluation mode, whose parameters need no gradients."""
     return Strategy(observer, policy).eval().requires_grad_(False)

@@ -232,7 +232,7 @@ def divergence(outlook: Outlook) -> Tensor:
 
 
 def lead(mean: Tensor) -> Tensor:
-    """Difference of the largest and the second largest probability.
+    """Margin of the most probable class: its probability minus the second largest one.
 
     Args:
         mean: `(..., K+1)`, probabilities.

@@ -136,7 +136,7 @@ class Lookahead(AcquisitionFunction):
 
 
 def seen_from(values: Tensor, levels: Tensor) -> Tensor:
-    """Look up values of every cell and level for each fixation.
+    """Select the value of every cell at its level of distance from each fixation.
 
     Args:
         values: `(..., X·Y, N)`, for every cell and level.

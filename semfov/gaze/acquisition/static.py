@@ -22,7 +22,7 @@ class Uniform(AcquisitionFunction):
 
 
 class Static(AcquisitionFunction):
-    """Given values of the cells, such as a saliency map, whatever the belief.
+    """Fixed values of the cells, such as a saliency map, which do not depend on the belief.
 
     Args:
         values: `(..., X·Y)`.

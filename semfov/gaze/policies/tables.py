@@ -87,14 +87,14 @@ class TemplateSearch(TablePolicy):
 
 
 def given(table: Tensor | None, policy: Policy) -> Tensor:
-    """The table that a policy needs, or an error where there is none."""
+    """Return the table that a policy needs, or raise an error where there is none."""
     if table is None:
         raise InputError(f"policy {policy.name!r}: expected the {policy.table} of the scene, got none")
     return table
 
 
 def salient_from(saliency: Tensor, cell: Tensor) -> Tensor:
-    """Saliency of all cells in episodes that fixate `cell`.
+    """Saliency of all cells in the view from the fixated `cell` of each episode.
 
     Args:
         saliency: `(X·Y, X·Y)`, a row for the view from each cell, or `(1, X·Y)`, the same for all of them.
