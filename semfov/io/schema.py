@@ -25,7 +25,7 @@ _FLOATS = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class Field:
-    """Requirements of a tensor.
+    """Requirements of a tensor in a file.
 
     Attributes:
         shape: size of each dimension.
@@ -83,7 +83,7 @@ class Json(ABC):
 
 @dataclass(frozen=True)
 class Number(Json):
-    """A finite number.
+    """Requirement of a JSON value: a finite number.
 
     Attributes:
         low: smallest value allowed.
@@ -110,7 +110,7 @@ class Number(Json):
 
 
 class Flag(Json):
-    """True or false."""
+    """Requirement of a JSON value: true or false."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
@@ -119,7 +119,7 @@ class Flag(Json):
 
 @dataclass(frozen=True)
 class Array(Json):
-    """A list.
+    """Requirement of a JSON value: a list.
 
     Attributes:
         of: requirements of every item.
@@ -150,7 +150,7 @@ class Array(Json):
 
 @dataclass(frozen=True)
 class Pair(Json):
-    """A list of a fixed number of items.
+    """Requirement of a JSON value: a list of a fixed number of items.
 
     Attributes:
         items: requirements of each item.
@@ -168,7 +168,7 @@ class Pair(Json):
 
 @dataclass(frozen=True)
 class Text(Json):
-    """A string without control characters.
+    """Requirement of a JSON value: a string without control characters.
 
     Attributes:
         options: the strings allowed; any string where there are none.
@@ -185,7 +185,7 @@ class Text(Json):
 
 @dataclass(frozen=True)
 class Object(Json):
-    """A JSON object.
+    """Requirement of a JSON value: an object.
 
     Attributes:
         known: requirements of the values under these keys.
@@ -211,7 +211,7 @@ class Object(Json):
 
 @dataclass(frozen=True)
 class Maybe(Json):
-    """A value or null.
+    """Requirement of a JSON value: null, or a value that meets another requirement.
 
     Attributes:
         of: requirements of a value that is not null.
@@ -226,7 +226,7 @@ class Maybe(Json):
 
 
 class Anything(Json):
-    """Any JSON value."""
+    """Requirement that any JSON value meets."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""

@@ -1,4 +1,4 @@
-"""Positions for labels, so that none covers another."""
+"""Placement of labels in figures, so that no label covers another."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""The path of the gaze: numbered fixations, coloured by time."""
+"""Drawing of the gaze's path: numbered fixations, coloured by time."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ def found_box(scanpath: Scanpath) -> Tensor | None:
 
 
 def dismissed(scanpath: Scanpath) -> list[CloseUp]:
-    """The closer looks at places other than that of a target that was found."""
+    """The closer looks of a scanpath, without the one at the target that was found."""
     decision = scanpath.decision
     found = None if decision is None else decision.box
     return [look for look in scanpath.closer if found is None or not look.box.equal(found)]

@@ -73,7 +73,7 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
 
 
 def teach_notebook() -> None:
-    """Let a notebook show a figure as a cell's last value, which otherwise only figures of pyplot do."""
+    """Register figures with IPython, so that a notebook shows one that is the last value of a cell."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None:
@@ -131,7 +131,7 @@ def make_figure(
 
 
 def only(ax: Axes | None) -> list[Axes] | None:
-    """A single `ax` as the list that `make_figure` takes."""
+    """Wrap a single `ax` in the list that `make_figure` takes."""
     return None if ax is None else [ax]
 
 

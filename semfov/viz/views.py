@@ -1,4 +1,4 @@
-"""The views of the eye during an episode."""
+"""The foveated views that the detector was given during an episode."""
 
 from torch import Tensor
 
