@@ -38,7 +38,7 @@ class ZoomScenery:
         eye: the eye that looks at windows.
         evidence: learned evidence by magnification.
         shifts: largest number of looks of an episode after the first one.
-        known: whether the objects in the pictures are annotated.
+        annotated: whether the objects in the pictures are annotated.
 
     Example::
 
@@ -48,7 +48,7 @@ class ZoomScenery:
 
     def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
         self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
-        self.known = not isinstance(self.pictures, Pictures)
+        self.annotated = not isinstance(self.pictures, Pictures)
         names = self.eye.detector.classes
         self._wanted = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
         # Looks are kept for as long as an environment uses this scenery.
@@ -88,7 +88,7 @@ class ZoomScenery:
         Raises:
             InputError: the pictures have no annotations, and no targets were given.
         """
-        if not self.known:
+        if not self.annotated:
             if self._wanted is None:
                 raise InputError("targets: expected classes to search for in pictures without annotations, got none")
             return self._wanted
@@ -127,7 +127,7 @@ class ZoomScenery:
         for _ in range(_TRIES):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
             if task != "search":
-                if not self.known or len(self.pictures.annotation(picture).boxes):
+                if not self.annotated or len(self.pictures.annotation(picture).boxes):
                     return picture, 0
             elif targets := self.episodes(picture):
                 return picture, targets[random.integers(len(targets))]
@@ -146,7 +146,7 @@ class ZoomScenery:
         Returns:
             Whether it was found.
         """
-        if not self.known:
+        if not self.annotated:
             return any(float(glance.show[target - 1]) >= LEAST_CONFIDENCE for glance in looks)
         return bool(found_in(looks, self._of(scene, target), target).any())
 
@@ -160,7 +160,7 @@ class ZoomScenery:
         Returns:
             From 0 to 1; the number of objects found where there are no annotations.
         """
-        if not self.known:
+        if not self.annotated:
             return float(len(merge(looks, None, score=LEAST_CONFIDENCE)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 

@@ -150,7 +150,7 @@ class SceneObserver(Observer):
         before = known.views[pose]
         view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, seen.inner)
         probabilities = views.spread(self._probabilities(view), pose).mT
-        cells = views.seen[pose].cells
+        cells = views.visible[pose].cells
         nearest = torch.minimum(
             self._distance(pose, seen),
             torch.where(known.owner[0, cells] == pose, known.closest[0, cells], torch.inf),

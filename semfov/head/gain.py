@@ -88,7 +88,7 @@ class SearchGain(LookGain):
         here_found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
         gains = torch.zeros_like(here_found)
         for pose in poses:
-            cells = views.seen[pose].cells
+            cells = views.visible[pose].cells
             aside = (self._acuity[pose] - known[cells]).clamp(min=0) @ wanted[cells]
             rows = slice(pose * views.cells, (pose + 1) * views.cells)
             gains[rows] = here_found[rows] + self.foresight * aside
@@ -133,7 +133,7 @@ class ExploreGain(LookGain):
         worth = torch.where(known, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
-            cells = views.seen[pose].cells
+            cells = views.visible[pose].cells
             rows = torch.arange(views.cells) if pose == here else self._landings
             total = self._acuity[pose][rows] @ worth[cells]
             some = known[cells]

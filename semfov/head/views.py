@@ -49,7 +49,7 @@ class Views:
         view_grid: the cells of one view.
         gaze: `(A, D)`, point of the scene that each action fixates.
         gaze_cell: `(A,)`, cell of the scene that contains this point.
-        seen: for each pose, the cells of the scene that its view shows.
+        visible: for each pose, the cells of the scene that its view shows.
 
     Raises:
         InputError: `fields` is empty or not ascending, or `fovea` is not positive.
@@ -79,13 +79,13 @@ class Views:
         self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.cell_of(self.gaze)
-        self.seen = [self._seen(pose) for pose in self.poses]
+        self.visible = [self._visible(pose) for pose in self.poses]
 
     def __len__(self) -> int:
         """Number of poses."""
         return len(self.poses)
 
-    def _seen(self, pose: Tensor) -> VisibleCells:
+    def _visible(self, pose: Tensor) -> VisibleCells:
         points, inside = self.world.to_view(self.world.centres, pose)
         return VisibleCells(inside.nonzero()[:, 0], points[inside])
 
@@ -98,7 +98,7 @@ class Views:
     def reachable(self) -> Tensor:
         """Cells of the scene that at least one view shows, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
-        reachable[torch.cat([seen.cells for seen in self.seen])] = True
+        reachable[torch.cat([each.cells for each in self.visible])] = True
         return reachable
 
     def places(self, pose: int) -> Tensor:
@@ -110,7 +110,7 @@ class Views:
         Returns:
             `(V, 2)`, from -1 to 1 over the view.
         """
-        return 2 * (self.seen[pose].points + 0.5) / self.view_grid.extent - 1
+        return 2 * (self.visible[pose].points + 0.5) / self.view_grid.extent - 1
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
         """Interpolate values of a view's cells at the scene's cells that the view shows.
@@ -136,9 +136,9 @@ class Views:
         """
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []
-        for pose, seen in zip(self.poses, self.seen, strict=True):
+        for pose, visible in zip(self.poses, self.visible, strict=True):
             ratio = float(pose[2]) / self.fields[0]
-            result.append(ratio * (self.fovea + torch.cdist(centres, seen.points) / side) - self.fovea)
+            result.append(ratio * (self.fovea + torch.cdist(centres, visible.points) / side) - self.fovea)
         return result
 
     def acuity(self, distance: Tensor) -> Tensor:

@@ -188,12 +188,12 @@ class Object(Json):
     """Requirement of a JSON value: an object.
 
     Attributes:
-        known: requirements of the values under these keys.
+        keys: requirements of the values under these keys.
         others: requirements of the values under all other keys; None allows no other keys.
         required: keys that must be present.
     """
 
-    known: Mapping[str, Json] = field(default_factory=dict)
+    keys: Mapping[str, Json] = field(default_factory=dict)
     others: Json | None = None
     required: tuple[str, ...] = ()
 
@@ -203,8 +203,8 @@ class Object(Json):
         for key in self.required:
             check(key in value, f"{name}.{key}", "a value", "nothing")
         for key, item in value.items():
-            kind = self.known.get(key, self.others)
-            check(kind is not None, name, f"no other keys than {', '.join(self.known)}", excerpt(key))
+            kind = self.keys.get(key, self.others)
+            check(kind is not None, name, f"no other keys than {', '.join(self.keys)}", excerpt(key))
             if kind is not None:
                 kind.check(f"{name}.{key}", item, sizes)
 

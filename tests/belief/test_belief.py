@@ -227,7 +227,7 @@ def test_context_fades_with_the_inner_belief(monkeypatch):
     inner = observer.observer.fade(belief.inner, look.inner, 0.25, visited)
     assert torch.equal(faded.inner.beta, inner.beta)
     assert torch.equal(faded.closest, inner.closest)
-    torch.testing.assert_close(faded.shown, belief.shown / 4)
+    torch.testing.assert_close(faded.scores, belief.scores / 4)
     assert torch.equal(faded.present, belief.present)
     with pytest.raises(InputError, match=r"^belief: expected ContextBelief"):
         observer.fade(belief.inner, look, 0.25, visited)

@@ -160,7 +160,7 @@ def test_belief_before_the_first_look_has_even_odds_and_shows_nothing(prior, kin
     even = torch.full((2, 20), 0.5, dtype=torch.float64)
     assert torch.equal(belief.probability(1), even)
     assert torch.equal(belief.chance(1), even)
-    assert torch.equal(belief.shown, torch.zeros(2, 20, 4, dtype=torch.float64))
+    assert torch.equal(belief.scores, torch.zeros(2, 20, 4, dtype=torch.float64))
 
 
 def test_log_odds_of_certain_cells_are_finite():

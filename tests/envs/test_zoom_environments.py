@@ -142,7 +142,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
     Image.fromarray(picture).save(tmp_path / "a.png")
     Image.fromarray(picture[:900, :1100]).save(tmp_path / "b.png")
     scenery = open_zoom_scenery(tmp_path, passes=5, targets=["cat", "person"], cache=cache)
-    assert not scenery.known
+    assert not scenery.annotated
     env = ZoomSearch(scenery)
     for seed in range(3):
         env.reset(seed=seed)

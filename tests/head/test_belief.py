@@ -54,7 +54,7 @@ def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, 
     for cell in cells:
         point = views.view_grid.centres[cell][None]
         alone = inner(alone, eye.look(view, point), point, views.view_grid, 3)
-    seen = views.seen[pose]
+    seen = views.visible[pose]
     for number in range(0, len(seen.cells), 7):
         # Bilinear interpolation by hand, between the four cells around the point.
         at = (seen.points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
@@ -77,7 +77,7 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
     for count, (belief, action) in enumerate(zip(beliefs, actions, strict=True), 1):
         place, cell = divmod(action, 100)
         centre = views.view_grid.centres[cell]
-        for number, point in zip(views.seen[place].cells.tolist(), views.seen[place].points, strict=True):
+        for number, point in zip(views.visible[place].cells.tolist(), views.visible[place].points, strict=True):
             distance = torch.linalg.vector_norm(point - centre) / 64
             distances[place, number] = torch.minimum(distances[place, number], distance)
         nearest, owner = distances.amin(0), belief.owner[0]
@@ -174,7 +174,7 @@ def test_explore_gain_equals_brute_force(views, eye, models):
             continue
         place, cell = divmod(action, 100)
         value = 0.0
-        for x, point in zip(views.seen[place].cells.tolist(), views.seen[place].points, strict=True):
+        for x, point in zip(views.visible[place].cells.tolist(), views.visible[place].points, strict=True):
             distance = torch.linalg.vector_norm(point - views.view_grid.centres[cell]) / 64
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)

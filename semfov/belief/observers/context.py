@@ -52,7 +52,7 @@ class ContextBelief(Belief):
         following: `(B, X·Y)`, probability that a cell holds the target, given that no fixated cell holds it.
         closest: `(B, X·Y)`, see `Belief`.
         inner: belief of the inner observer, without context.
-        shown: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
+        scores: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
 
     >>> from semfov.belief.observers import Semantic
     >>> prior = ContextPrior(["cup"], torch.zeros(2, 1, 1), torch.zeros(2, 2, 1), [])
@@ -64,7 +64,7 @@ class ContextBelief(Belief):
     following: Tensor
     closest: Tensor
     inner: Belief
-    shown: Tensor
+    scores: Tensor
 
     def probability(self, target: int | Tensor) -> Tensor:
         """Probability that each cell holds the target of the search, `(B, X·Y)`; `target` is ignored."""
@@ -82,7 +82,7 @@ class ContextBelief(Belief):
         """Apply a function to every tensor of the belief and of the inner belief."""
         inner = self.inner.map(function)
         return ContextBelief(
-            function(self.present), function(self.following), function(self.closest), inner, function(self.shown)
+            function(self.present), function(self.following), function(self.closest), inner, function(self.scores)
         )
 
 
@@ -148,13 +148,13 @@ class Context(Observer):
         """Fade the belief of the inner observer and the scores of the shown classes."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
         inner = self.observer.fade(known.inner, said.inner, keep, visited)
-        return replace(known, inner=inner, closest=inner.closest, shown=keep * known.shown)
+        return replace(known, inner=inner, closest=inner.closest, scores=keep * known.scores)
 
     def update(self, belief: Belief, look: Look) -> ContextBelief:
         """Update the inner belief and the shown classes, and add the context."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
         inner = self.observer.update(known.inner, said.inner)
-        presence = torch.maximum(known.shown, said.presence)
+        presence = torch.maximum(known.scores, said.presence)
 
         def in_context(alone: Tensor, shown: Tensor, target: Tensor) -> Tensor:
             return (log_odds(alone) + self.prior(shown, said.grid, target, self.weights)).sigmoid()
