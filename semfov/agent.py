@@ -311,7 +311,7 @@ class ActivePerception(nn.Module):
             return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)[0]
         explored = outcome_by_gain(ExpectedGain(observer.model, grid), PRICE if until is None else until)
         scanpath, ended, _ = self._gaze(image, grid, self.exploring, None, start, shifts, seed, explored)
-        return replace(scanpath, ending="price") if ended else scanpath
+        return replace(scanpath, ending="worth") if ended else scanpath
 
     def live(
         self,

@@ -71,7 +71,7 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     for price in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
         part = agent.explore(image, start=0, shifts=12, until=price, seed=1)
         last = next((number for number, value in enumerate(expected) if value < price), None)
-        assert part.ending == ("shifts" if last is None else "price")
+        assert part.ending == ("shifts" if last is None else "worth")
         assert len(part) == (13 if last is None else last + 1)
         assert torch.equal(part.cells, whole.cells[: len(part)])
         assert torch.equal(part.probabilities, whole.probabilities[: len(part)])
@@ -88,7 +88,7 @@ def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, i
     """After the last look every gain is below the price; after every earlier look at least one is not."""
     agent = agent_of(model, Gain(model))
     scanpath = agent.explore(image, start=7, shifts=19, until=0.25)
-    assert scanpath.ending == "price"
+    assert scanpath.ending == "worth"
     for number, values in enumerate(scanpath.values):
         left = values.clone()
         left[scanpath.cells[: number + 1]] = -math.inf
@@ -101,7 +101,7 @@ def test_until_none_means_the_default_price(model, image):
     model.worth[-1].bias.fill_(PRICE / 3.5)
     free, default, same = (agent.explore(image, start=0, shifts=19, until=until, seed=3) for until in (0, None, PRICE))
     assert free.ending == "cells"
-    assert default.ending == same.ending == "price"
+    assert default.ending == same.ending == "worth"
     assert torch.equal(default.cells, same.cells)
     assert 1 < len(default) < len(free) == 20
 
@@ -126,7 +126,7 @@ def test_exploration_with_a_low_price_ends_after_all_cells(model, image, until):
 
 def test_exploration_without_gaze_shifts(model, image):
     assert agent_of(model).explore(image, start=0, shifts=0, until=0.1).ending == "shifts"
-    assert agent_of(model).explore(image, start=0, shifts=0, until=1e3).ending == "price"
+    assert agent_of(model).explore(image, start=0, shifts=0, until=1e3).ending == "worth"
 
 
 def test_the_map_of_a_search_is_the_learned_map(model, image):

@@ -316,7 +316,7 @@ def find_all(
     """
     seen: list[Glance] = []
     values: list[float] = []
-    ending: Ending = "price"
+    ending: Ending = "worth"
     with torch.inference_mode():
         for turn in find_everything(glances, evidence, target, batch=batch, worth=worth):
             seen.append(turn.glance)

@@ -60,7 +60,7 @@ _FORMAT = Format.of(
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
         "settings": Maybe(_SETTINGS),
     },
-    endings=("box", "decision", "price", "shifts", "cells"),
+    endings=("box", "decision", "worth", "shifts", "cells", "passes", "seconds", "stopped"),
     closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of scanpaths."""
