@@ -1,4 +1,4 @@
-"""Limits that all agents share: passes of the detector, time on this machine, and what the caller says."""
+"""EpisodeLimits that all agents share: passes of the detector, time on this machine, and what the caller says."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,8 +15,8 @@ OnLook = Callable[[Any], object]
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of one episode. It ends at the first one that is reached.
+class EpisodeLimits:
+    """EpisodeLimits of one episode. It ends at the first one that is reached.
 
     Args:
         passes: largest number of passes of the detector, closer looks included, 1 to 1,000,000; None for no limit.
@@ -27,7 +27,7 @@ class Limits:
     Raises:
         InputError: a limit is out of range, or `on_look` cannot be called.
 
-    >>> limits = Limits(passes=3, on_look=lambda record: record != "enough")
+    >>> limits = EpisodeLimits(passes=3, on_look=lambda record: record != "enough")
     >>> [limits.reached(1, lambda: "more"), limits.reached(1, lambda: "enough"), limits.reached(3, lambda: "more")]
     [None, 'stopped', 'passes']
     """
