@@ -221,7 +221,7 @@ class HeadAgent(nn.Module):
                 found = decision.outcome == "found"
             if found:
                 break
-        ending: Ending = "decision" if found else "passes" if len(actions) == passes else "seconds"
+        ending: Ending = "decision" if found else "passes" if len(actions) == passes else "duration"
         if not found and len(actions) == len(views.grid):
             ending = "cells"
         return HeadPath(

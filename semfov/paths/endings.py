@@ -7,16 +7,25 @@ from typing import Literal
 
 from semfov.decision import Outcome
 
-Ending = Literal["box", "decision", "price", "shifts", "cells", "passes", "windows", "seconds"]
-"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, no look was worth
-its price, all gaze shifts were made, every cell was fixated, the passes were used up, no window was left that can show
-the target, or the time was over."""
+Ending = Literal[
+    "box", "decision", "detection", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
+]
+"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, a detection
+showed the target at the gaze in a search whose belief has no thresholds, no look was worth it, all gaze shifts were
+made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
+machine was over, the time of the scene was over, or the caller stopped it."""
+
+RENAMED: Mapping[str, Ending] = {"price": "worth"}
+"""Endings that files of earlier versions call by another name."""
 
 FIXATIONS = {
     "box": "The gaze is on a box of the target.",
-    "price": "No look is expected to classify enough more cells correctly.",
+    "detection": "A detection shows the target at the gaze.",
+    "worth": "No look is expected to classify enough more cells correctly.",
     "cells": "Every cell was fixated.",
-    "seconds": "The next look would end after the time limit.",
+    "duration": "The next look would end after the time limit of the scene.",
+    "seconds": "The time was over.",
+    "stopped": "It was stopped.",
     "found": "The target is probable enough, and was looked at closely enough.",
     "absent": "No remaining cell is worth a look, and the target is probably absent.",
     "undecided": "No remaining cell is worth a look, but the target is probably there.",
@@ -26,7 +35,9 @@ FIXATIONS = {
 """Sentences for looks of a fovea, by the ending, or by the outcome of the decision that ended the search."""
 
 WINDOWS = {
-    "price": "No remaining look is expected to show enough new objects.",
+    "worth": "No remaining look is expected to show enough new objects.",
+    "seconds": "The time was over.",
+    "stopped": "It was stopped.",
     "windows": "No remaining look can show the target.",
     "found": "The probability is high enough, and a detection shows the target.",
     "absent": "No remaining look is worth a pass, and the target is probably absent.",

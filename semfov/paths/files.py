@@ -15,7 +15,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Size, Text
 from semfov.io.storage import read, write_file
-from semfov.paths.endings import Ending
+from semfov.paths.endings import RENAMED, Ending
 from semfov.version import __version__
 
 WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
@@ -86,7 +86,7 @@ class Format:
             # Files of earlier versions have neither `place` nor `closer`.
             "decision": Maybe(Object(_DECISION, None, ("outcome", "probability", "cell"))),
             "closer": Maybe(Array(Object({name: _CLOSER[name] for name in closer}, None, tuple(closer)))),
-            "ending": Maybe(Text(tuple(endings))),
+            "ending": Maybe(Text((*endings, *(old for old, new in RENAMED.items() if new in endings)))),
         }
         boxes = {name: Field(shape, mixed=True, optional=True) for name, shape in _BOXES.items()}
         return cls(kind, Schema({**tensors, **_DETECTIONS, **boxes}, shared | dict(record)), tuple(closer))
@@ -178,5 +178,5 @@ class Format:
                 CloseUp(**{"fixation": None, "cell": None} | look, box=box)
                 for look, box in zip(closer, boxes, strict=True)
             ),
-            "ending": record.get("ending"),
+            "ending": RENAMED.get(str(record.get("ending")), record.get("ending")),
         }

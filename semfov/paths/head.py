@@ -42,7 +42,7 @@ _FORMAT = Format.of(
         "fovea": POSITIVE,
         "seconds": Array(Number(low=0), "n"),
     },
-    endings=("decision", "passes", "seconds", "cells"),
+    endings=("decision", "worth", "passes", "seconds", "duration", "cells", "stopped"),
     closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of paths of eye and head."""

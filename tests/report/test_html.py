@@ -177,7 +177,7 @@ def test_the_page_contains_the_outcome(scanpath, image):
     assert data["outcome"] == {"why": searched.why_it_ended(), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
     assert data["presence"] == [0.25, 0.5, 0.97]
     assert data["outcome"]["why"] != replace(searched, decision=Decision("absent", 0.1)).why_it_ended() != ""
-    for ending in ("box", "price", "shifts", "cells"):
+    for ending in ("box", "worth", "shifts", "cells"):
         ended = replace(scanpath, ending=ending)
         data = episode_data(ended, image, [image] * 3, Pool(), name="other")
         assert data["outcome"] == {"why": ended.why_it_ended(), "cell": None, "box": None}

@@ -142,7 +142,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
         (Decision("undecided", 0.2), "windows", "0.20. No remaining look can show the target.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
         (None, "passes", "^0 × cat found. All 3 passes were used.$"),
-        (None, "price", "^0 × cat found. No remaining look is expected to show enough new objects.$"),
+        (None, "worth", "^0 × cat found. No remaining look is expected to show enough new objects.$"),
         (None, None, "^0 × cat found.$"),
     ],
 )

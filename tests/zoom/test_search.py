@@ -69,7 +69,7 @@ def test_a_path_tells_why_it_ended(agent, picture):
     assert (everything.ending, everything.decision.outcome) == ("windows", "undecided")
     assert everything.why_it_ended() == "No remaining look can show the target."
     assert agent.explore(picture, passes=1).why_it_ended() == "The only pass was used."
-    assert agent.find_all(picture, "blue", worth=1e9).ending == "price"
+    assert agent.find_all(picture, "blue", worth=1e9).ending == "worth"
     assert agent.find_all(picture, "blue", passes=3, worth=0.0).ending == "passes"
     assert replace(found, ending=None).why_it_ended() == ""
 

@@ -1,0 +1,67 @@
+"""EpisodeLimits that all agents share: passes of the detector, time on this machine, and what the caller says."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any, Literal
+
+from semfov.errors import check, check_number, check_whole
+
+MOST_PASSES = 1_000_000
+"""Largest number of passes that can be asked for."""
+
+OnLook = Callable[[Any], object]
+"""Function that is called after each look with the record so far; the episode ends if it returns False."""
+
+
+@dataclass(frozen=True)
+class EpisodeLimits:
+    """EpisodeLimits of one episode. It ends at the first one that is reached.
+
+    Args:
+        passes: largest number of passes of the detector, closer looks included, 1 to 1,000,000; None for no limit.
+        seconds: time in seconds that looks may take on this machine, from the making of this object; a look that has
+            begun is finished, so there is at least one. None for no limit.
+        on_look: called after each look with the record so far; returning False ends the episode.
+
+    Raises:
+        InputError: a limit is out of range, or `on_look` cannot be called.
+
+    >>> limits = EpisodeLimits(passes=3, on_look=lambda record: record != "enough")
+    >>> [limits.reached(1, lambda: "more"), limits.reached(1, lambda: "enough"), limits.reached(3, lambda: "more")]
+    [None, 'stopped', 'passes']
+    """
+
+    passes: int | None = None
+    seconds: float | None = None
+    on_look: OnLook | None = None
+    _began: float = field(default_factory=perf_counter, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.passes is not None:
+            check_whole(self.passes, "passes", 1, MOST_PASSES)
+        if self.seconds is not None:
+            check_number(self.seconds, "seconds", 0, float("inf"))
+        check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
+
+    def reached(self, passes: int, record: Callable[[], Any]) -> Literal["stopped", "passes", "seconds"] | None:
+        """The limit that is reached after a look. Call it once after each look.
+
+        Args:
+            passes: number of passes so far.
+            record: makes the record so far; it is called only if `on_look` was given.
+
+        Returns:
+            The reason for the end; None if the episode goes on.
+        """
+        if self.on_look is not None and self.on_look(record()) is False:
+            return "stopped"
+        if self.passes is not None and passes >= self.passes:
+            return "passes"
+        if self.seconds is not None and perf_counter() - self._began >= self.seconds:
+            return "seconds"
+        return None
+
+    def room(self, passes: int) -> float:
+        """Number of passes that are left after some; infinite without a limit."""
+        return float("inf") if self.passes is None else self.passes - passes
