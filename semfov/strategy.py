@@ -28,7 +28,7 @@ class Strategy(nn.Module):
         """Prepare the search for a target.
 
         Args:
-            target: a class by name or index, or several with weights.
+            target: a class by name or index, several, or several with weights.
             classes: names of the classes, background first.
 
         Returns:
@@ -37,6 +37,8 @@ class Strategy(nn.Module):
         Raises:
             InputError: a class is unknown, or the policy cannot search for several classes.
         """
+        if isinstance(target, Sequence) and not isinstance(target, str):
+            target = dict.fromkeys(target, 1.0)
         if not isinstance(target, Mapping):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
