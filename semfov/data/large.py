@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
-from semfov.data.inputs import ImageLike, as_image, channels_first, pixels_of
+from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.reduction import FIRST, LARGE, PixelBox, ReducedCopies, bytes_of, reduction_for
-from semfov.errors import DataError, SemfovError, check, check_pixels
+from semfov.errors import DataError, SemfovError, check, check_pixels, lookup
 from semfov.io.files import check_regular
 
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
@@ -112,16 +112,17 @@ class MemoryPicture(ArrayPicture):
 
     Args:
         image: the picture.
+        color: order of the channels of arrays and tensors (`semfov.as_image`).
     """
 
-    def __init__(self, image: ImageLike) -> None:
+    def __init__(self, image: ImageLike, color: Color = "rgb") -> None:
         if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
             # Bytes are not converted to floats in between, which would take four times the memory.
             pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
-            super().__init__(to_bytes(pixels[0]))
+            super().__init__(to_bytes(in_rgb(pixels, image, color)[0]))
         else:
-            super().__init__(to_bytes(as_image(image, argument="picture").detach()))
+            super().__init__(to_bytes(as_image(image, color=color, argument="picture").detach()))
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
@@ -259,7 +260,7 @@ class TiffPicture(LargePicture):
         return window
 
 
-def open_large(source: LargePicture | ImageLike) -> LargePicture:
+def open_large(source: LargePicture | ImageLike, color: Color = "rgb") -> LargePicture:
     """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
     Files `.tif` and `.tiff` are read tile by tile. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the
@@ -267,6 +268,7 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
 
     Args:
         source: the picture.
+        color: order of the channels of arrays and tensors (`semfov.as_image`).
 
     Returns:
         The opened picture.
@@ -276,11 +278,12 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
     """
     if isinstance(source, LargePicture):
         return source
+    lookup(color, get_args(Color), "color")
     if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.size and _by_rows(source.shape):
-        return ArrayPicture(source)
+        return ArrayPicture(source if color == "rgb" or source.ndim == 2 else source[..., ::-1])
     if not isinstance(source, str | PathLike):
-        return MemoryPicture(source)
-    check("://" not in str(source), "picture", "a file on this machine", f"{str(source)!r}; download it first")
+        return MemoryPicture(source, color)
+    check_local(source, "picture")
     if Path(source).suffix.lower() in (".tif", ".tiff"):
         return TiffPicture(source)
     return PhotographPicture(source)
