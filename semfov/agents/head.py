@@ -1,5 +1,6 @@
 """An agent that moves its eye and turns its head."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -162,7 +163,7 @@ class HeadAgent(nn.Module):
     def find_all(
         self,
         scene: SceneLike,
-        target: str | int | None = None,
+        target: str | int | Sequence[str | int] | None = None,
         *,
         passes: int | None = None,
         seconds: float | None = None,
@@ -173,11 +174,11 @@ class HeadAgent(nn.Module):
         seed: int = 0,
         color: Color = "rgb",
     ) -> HeadPath:
-        """Find all objects of a class, or of all classes: an exploration whose record is about them.
+        """Find all objects of a class, of several, or of all: an exploration whose record is about them.
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
-            target: name or index (1..K) of the class; None for all classes.
+            target: name or index (1..K) of the class, or several of them; None for all classes.
             passes: largest number of looks; None takes 40.
             seconds: time in seconds that looks may take on this machine; None for no limit.
             duration: time limit of the scene in seconds, as for `search`.
@@ -194,10 +195,10 @@ class HeadAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        index = None if target is None else class_index(target, self.classes[1:], "target")
-        return self._explore(
-            self.views(scene, color), index, start, self._limits(passes, seconds, on_look), duration, worth, seed
-        )
+        wanted = [] if target is None else [target] if isinstance(target, str | int) else [*target]
+        indices = tuple(dict.fromkeys(class_index(each, self.classes[1:], "target") for each in wanted))
+        limits = self._limits(passes, seconds, on_look)
+        return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
 
     def explore(
         self,
@@ -232,9 +233,8 @@ class HeadAgent(nn.Module):
             InputError: an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        return self._explore(
-            self.views(scene, color), None, start, self._limits(passes, seconds, on_look), duration, worth, seed
-        )
+        limits = self._limits(passes, seconds, on_look)
+        return self._explore(self.views(scene, color), (), start, limits, duration, worth, seed)
 
     def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
         return EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
@@ -242,7 +242,7 @@ class HeadAgent(nn.Module):
     def _explore(
         self,
         views: Views,
-        target: int | None,
+        targets: tuple[int, ...],
         start: int | None,
         limits: EpisodeLimits,
         duration: float,
@@ -251,6 +251,7 @@ class HeadAgent(nn.Module):
     ) -> HeadPath:
         check_number(worth, "worth", 0, float("inf"))
         gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
+        target = targets[0] if len(targets) == 1 else None
         return self._look(observer, gain, target, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()

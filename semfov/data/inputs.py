@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 ImageLike: TypeAlias = Union[Tensor, NDArray[Any], str, PathLike[str], "Image"]
 """A picture: the path of its file, a Pillow image, an array or a tensor; see `as_image`."""
 
+Color = Literal["rgb", "bgr"]
+"""Order of the channels of arrays and tensors; OpenCV reads BGR."""
+
 PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
-
-Color = Literal["rgb", "bgr"]
-"""Order of the channels of arrays and tensors: RGB, or BGR as OpenCV reads them. It does not concern files."""
 
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
 STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")
@@ -31,15 +31,15 @@ STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
-def as_image(image: ImageLike, *, like: Tensor | None = None, color: Color = "rgb", argument: str = "image") -> Tensor:
+def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb") -> Tensor:
     """Convert a picture of any common type to RGB in [0, 1].
 
     - A path: a file that Pillow reads (`semfov.read_image`).
     - A Pillow image of any mode: it is turned upright, and transparent pixels are blended with white.
     - A NumPy array or a tensor of shape `(3, H, W)` or `(H, W, 3)`, or grey of shape `(H, W)`, `(1, H, W)` or
       `(H, W, 1)`, or a batch of one such picture. Floats must lie in [0, 1]; bytes and 16-bit numbers are divided by
-      their largest value. Channels are in the order of `color`; OpenCV reads BGR. A tensor of shape `(3, H, 3)` is
-      taken as channels first.
+      their largest value. Channels are RGB, or with `color="bgr"` as OpenCV reads them. A tensor of shape `(3, H, 3)`
+      is taken as channels first.
 
     Gradients flow through tensors.
 
@@ -47,38 +47,35 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, color: Color = "rg
         image: the picture.
         like: a tensor with the dtype and device of the result; None keeps the dtype of floats, converts other numbers
             to float32, and leaves the picture on its device.
-        color: order of the channels of arrays and tensors, `rgb`, or `bgr` for those of OpenCV. Files and Pillow images
-            are RGB in any case.
         argument: name of the argument, for the message.
+        color: order of the channels of arrays and tensors. Files and Pillow images know their own.
 
     Returns:
-        `(3, H, W)`.
+        `(3, H, W)`, RGB.
 
     Raises:
-        InputError: it is not a picture, there are several, its values are not in [0, 1], or `color` is neither of the
-            two; the message tells the remedy.
+        InputError: it is not a picture, there are several, or its values are not in [0, 1]; the message tells the
+            remedy.
         DataError: the file cannot be read.
 
     >>> as_image(np.zeros((48, 64, 3), np.uint8)).shape
     torch.Size([3, 48, 64])
-    >>> as_image(torch.tensor([1.0, 0.5, 0]).view(3, 1, 1), color="bgr").flatten()
-    tensor([0.0000, 0.5000, 1.0000])
     """
-    images = as_images(image, like=like, color=color, argument=argument)
+    images = as_images(image, like=like, argument=argument, color=color)
     check(len(images) == 1, argument, "one picture", f"a batch of {len(images)}; give them one by one")
     return images[0]
 
 
 def as_images(
-    images: ImageLike, *, like: Tensor | None = None, color: Color = "rgb", argument: str = "image"
+    images: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb"
 ) -> Tensor:
     """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`.
 
     Args:
         images: the picture or pictures.
         like: a tensor with the dtype and device of the result, as for `as_image`.
-        color: order of the channels of arrays and tensors, as for `as_image`.
         argument: name of the argument, for the message.
+        color: order of the channels, as for `as_image`.
 
     Returns:
         `(B, 3, H, W)`.
@@ -86,30 +83,29 @@ def as_images(
     >>> as_images(torch.rand(2, 3, 8, 9)).shape
     torch.Size([2, 3, 8, 9])
     """
-    pixels = in_rgb(
-        channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor)), images, color
-    )
+    pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
+    pixels = in_rgb(pixels, images, color)
     pixels = _in_unit(pixels, like, argument)
     check_pixels(pixels, argument)
     return pixels
 
 
-def in_rgb(pixels: Tensor, image: ImageLike, color: Color) -> Tensor:
-    """Pixels `(B, 3, H, W)` of a picture in the order RGB.
+def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
+    """Pixels with channels in the order red, green, blue.
 
     Args:
-        pixels: the pixels of the picture.
-        image: the picture as it was given; `color` is only that of arrays and tensors.
-        color: order of their channels.
+        pixels: `(B, 3, H, W)`, made from the source.
+        source: the picture. Files and Pillow images are RGB already.
+        color: order of the channels of arrays and tensors.
 
     Returns:
-        The pixels, with the channels reversed for arrays and tensors in BGR.
+        The pixels.
 
     Raises:
-        InputError: `color` is neither `rgb` nor `bgr`.
+        InputError: the order is unknown.
     """
-    lookup(color, get_args(Color), "color")
-    return pixels.flip(1) if color == "bgr" and isinstance(image, Tensor | np.ndarray) else pixels
+    swap = lookup(color, get_args(Color), "order of channels") == "bgr"
+    return pixels.flip(1) if swap and isinstance(source, Tensor | np.ndarray) else pixels
 
 
 def is_batch(image: object) -> bool:

@@ -215,7 +215,7 @@ def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
         return scene
     if is_scene(scene):
         return CameraScene(cast(PanTiltCamera, scene), color)
-    opened = open_large(cast(LargePicture | ImageLike, scene), color)
+    opened = open_large(cast(LargePicture | ImageLike, scene), color=color)
     width, height = opened.size
     if width % 2 or abs(width - 2 * height) > 1:
         return Flat(opened)

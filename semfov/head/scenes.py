@@ -178,7 +178,7 @@ class Flat(World):
     ) -> None:
         self.opened: LargePicture | None = None
         if not isinstance(picture, tuple):
-            self.opened = open_large(picture, color)
+            self.opened = open_large(picture, color=color)
             picture = self.opened.size
         self.picture = width, height = picture
         if degree is None:
