@@ -6,7 +6,7 @@ from semfov.paths.head import HeadPath
 from semfov.paths.moment import Moment
 from semfov.paths.scanpath import Scanpath
 from semfov.paths.stimulus import Stimulus, sensor_in_words
-from semfov.paths.trace import trace
+from semfov.paths.trace import Trace, trace
 from semfov.paths.windows import ZoomPath
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Record",
     "Scanpath",
     "Stimulus",
+    "Trace",
     "ZoomPath",
     "detections_in_words",
     "sensor_in_words",

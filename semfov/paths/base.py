@@ -148,6 +148,11 @@ class GazeRecord(Record):
         """Number of looks, the first included."""
         return len(self.detections)
 
+    @property
+    def passes(self) -> int:
+        """Number of passes of the detector, closer looks included."""
+        return len(self.detections) + len(self.closer)
+
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended.
 
@@ -157,7 +162,8 @@ class GazeRecord(Record):
         if self.closer and self.found:
             return self._sentences["closer found"]
         outcome = None if self.decision is None else self.decision.outcome
-        return sentence(self._sentences, self.ending, outcome, len(self), closer=bool(self.closer))
+        looks = self.passes if self.ending == "passes" else len(self)
+        return sentence(self._sentences, self.ending, outcome, looks, closer=bool(self.closer))
 
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
