@@ -1,6 +1,7 @@
 """A strategy: the observer and the policy for one task."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from torch import nn
 
@@ -37,12 +38,11 @@ class Strategy(nn.Module):
         Raises:
             InputError: a class is unknown, or the policy cannot search for several classes.
         """
-        if isinstance(target, Sequence) and not isinstance(target, str):
-            target = dict.fromkeys(target, 1.0)
-        if not isinstance(target, Mapping):
+        if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
-        wanted, policy = weights_by_class(target, classes[1:]), self.policy
+        given: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
+        wanted, policy = weights_by_class(given, classes[1:]), self.policy
         suits = isinstance(policy, NonPredictive | Random) or policy.by_place
-        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(target))
+        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(given))
         return Strategy(AnyOf(self.observer, wanted), policy), max(wanted, key=wanted.__getitem__), wanted
