@@ -11,15 +11,19 @@ import torch
 from torch import Tensor
 
 from semfov.errors import InputError, check
+from semfov.head.camera import CameraScene
+from semfov.head.scenes import Flat, Panorama
+from semfov.head.sphere import Sphere
 from semfov.head.views import Views
-from semfov.head.world import Flat, Panorama, Places, World
+from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
 
-_WORLDS: dict[str, tuple[type[Panorama] | type[Flat], tuple[str, ...]]] = {
+_WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
     "panorama": (Panorama, ("picture", "size", "cell", "reach")),
     "flat": (Flat, ("picture", "size", "cell", "degree")),
+    "camera": (Sphere, ("picture", "size", "cell", "pan", "tilt")),
 }
 _WORLD = {
     "kind": Text(tuple(_WORLDS)),
@@ -28,6 +32,8 @@ _WORLD = {
     "cell": POSITIVE,
     "reach": Number(0, 90),
     "degree": POSITIVE,
+    "pan": pair(Number()),
+    "tilt": pair(Number(-90, 90)),
 }
 
 _FORMAT = Format.of(
@@ -92,7 +98,7 @@ class HeadPath(GazeRecord):
             look: number of the look; negative numbers count from the end.
 
         Returns:
-            `(3,)`, as `World` defines it: the position of the window, and its field of view in degrees.
+            `(3,)`, pan to the right, tilt up, and field of view, in degrees.
         """
         return self.views.poses[self.actions[look] // self.views.cells]
 
@@ -200,10 +206,12 @@ class HeadPath(GazeRecord):
 
 def _settings(world: World) -> dict[str, Any]:
     """The geometry of a scene as JSON values."""
+    what = Sphere if isinstance(world, CameraScene) else type(world)
     for kind, (made, names) in _WORLDS.items():
-        if type(world) is made:
+        if what is made:
             return {"kind": kind, **{name: getattr(world, name) for name in names}}
-    raise InputError(f"views: expected a scene that files can describe, Panorama or Flat, got {type(world).__name__}")
+    expected = "a scene that files can describe, Panorama, Flat or that of a camera"
+    raise InputError(f"views: expected {expected}, got {type(world).__name__}")
 
 
 def _world(settings: Mapping[str, Any]) -> World:
@@ -211,5 +219,5 @@ def _world(settings: Mapping[str, Any]) -> World:
     made, names = _WORLDS[settings["kind"]]
     for name in names:
         check(name in settings, f"world.{name}", "a value", "nothing")
-    picture, size = tuple(settings["picture"]), tuple(settings["size"])
-    return made(picture, size, **{name: settings[name] for name in names[2:]})
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    return made(values["picture"], values["size"], **{name: values[name] for name in names[2:]})
