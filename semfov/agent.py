@@ -259,11 +259,8 @@ class ActivePerception(nn.Module):
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            return (
-                "windows"
-                if pays(picture_size(cast(ImageLike | LargePicture, picture)), self.eye.detector.input_size)
-                else "fovea"
-            )
+            size = picture_size(cast(ImageLike | LargePicture, picture))
+            return "windows" if pays(size, self.eye.detector.input_size) else "fovea"
         return "fovea"
 
     def search(
