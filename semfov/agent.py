@@ -37,10 +37,10 @@ from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 KindOfLook = Literal["fovea", "windows", "head"]
-"""KindOfLook of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
+"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
 How = Literal["auto", "fovea", "windows", "head"]
-"""KindOfLook of look, or `auto` for the one that suits the picture."""
+"""Kind of look, or `auto` for the one that suits the picture."""
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
