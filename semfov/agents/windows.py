@@ -283,7 +283,7 @@ def search_windows(
         target=target,
         glances=tuple(seen),
         values=tuple(values),
-        objects=merge(seen, target),
+        candidates=merge(seen, target),
         decision=decision,
         ending=ending,
         closer=() if verifier is None else tuple(verifier.looks),
@@ -330,6 +330,6 @@ def find_all(
         target=target,
         glances=tuple(seen),
         values=tuple(values),
-        objects=merge(seen, target),
+        candidates=merge(seen, target),
         ending=ending,
     )

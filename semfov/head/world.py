@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -48,6 +48,7 @@ class World(ABC):
         size: `(w, h)` of a view in pixels.
         centres: `(S, D)`, centres of the cells.
         area: `(S,)`, relative areas of the cells, 1 on average.
+        closed: whether the left and the right border of the picture meet.
 
     >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
     >>> isinstance(world, World), [len(row) for row in world.poses(40.0)]
@@ -58,6 +59,7 @@ class World(ABC):
     size: tuple[int, int]
     centres: Tensor
     area: Tensor
+    closed: ClassVar[bool] = False
 
     @abstractmethod
     def view(self, pose: Tensor) -> Tensor:
@@ -164,6 +166,19 @@ class World(ABC):
             One region for each box.
         """
 
+    @abstractmethod
+    def picture_boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """The smallest boxes in the scene's picture around the regions that boxes in the view from a pose cover.
+
+        Args:
+            boxes: `(M, 4)`, in pixels of the view.
+            pose: `(3,)`, of the head.
+
+        Returns:
+            `(M, 4)`, in pixels of the picture. In a closed scene a box that crosses the seam ends beyond the right
+            border.
+        """
+
 
 class Panorama(World):
     """A panorama around the viewer, seen by a perspective camera (`semfov.sensor.sphere.Camera`).
@@ -184,6 +199,8 @@ class Panorama(World):
     >>> world.view(torch.tensor([0.0, 0.0, 60.0])).shape, len(world.scene)
     (torch.Size([3, 30, 40]), 1800)
     """
+
+    closed = True
 
     def __init__(
         self,
@@ -259,6 +276,10 @@ class Panorama(World):
     def places(self, boxes: Tensor, pose: Tensor) -> Regions:
         """Regions of the sphere."""
         return Regions(Camera(pose.expand(len(boxes), 3), self.size), boxes)
+
+    def picture_boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """Boxes of the panorama."""
+        return self.places(boxes, pose).panorama_boxes(self.picture)
 
 
 @dataclass(frozen=True)
@@ -416,5 +437,8 @@ class Flat(World):
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         """Boxes of the picture."""
-        corners = self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5
-        return Boxes(corners.view(-1, 4))
+        return Boxes(self.picture_boxes(boxes, pose))
+
+    def picture_boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """Boxes of the picture."""
+        return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
