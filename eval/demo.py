@@ -305,12 +305,16 @@ def look_at(
     with torch.inference_mode():
         if config.target is None:
             shifts = 20 if config.shifts is None else config.shifts
-            return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
+            explored = agent.explore(picture.image, how="fovea", shifts=shifts, worth=config.until, **common)
+            assert isinstance(explored, Scanpath)
+            return explored
         shifts = 30 if config.shifts is None else config.shifts
         common |= {"confirm": config.confirm, "give_up": config.give_up}
         common["closer"] = config.closer
         target = wanted if wanted and len(wanted) > 1 else config.target
-        return agent.search(picture.image, target, shifts=shifts, **common)
+        searched = agent.search(picture.image, target, how="fovea", shifts=shifts, **common)
+        assert isinstance(searched, Scanpath)
+        return searched
 
 
 def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:

@@ -13,7 +13,7 @@ import numpy as np
 import skimage
 import torch
 
-from semfov import ActivePerception, EmbeddedScenes, ZoomAgent
+from semfov import ActivePerception, EmbeddedScenes, Scanpath, ZoomAgent
 from semfov.data.mosaics import Mosaics
 from semfov.io.files import replacing
 from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_zoom_path
@@ -29,6 +29,7 @@ def make_picture(path: Path) -> None:
     agent = ActivePerception.recommended("yolov3-tiny")
     with torch.inference_mode():
         scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
+    assert isinstance(scanpath, Scanpath)
     seen = plot_foveated_strip(scanpath, most=3)
     believed = plot_belief_strip(scanpath, most=3)
     write_picture(stacked(render([seen, believed], dpi=105)), path)

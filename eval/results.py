@@ -1,14 +1,16 @@
-"""Regenerate docs/results.md and docs/tables.md: `python -m eval.results` runs the experiments and fills in both.
+"""Regenerate the tables of docs/results.md and docs/tables.md: `python -m eval.results` runs the experiments.
 
     python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
         --fit_root fit --fit_annotations instances_fit.json
 
 Results are measured on the photographs listed in configs/results_photographs.txt; settings are chosen on the
-photographs of the fit set. The text of the findings is docs/results.template.md, and that of all other tables
-docs/tables.template.md; a line `@@ table` or `@@ experiment table` stands for a table. Detections are computed once and
-shared by all experiments. To continue a stopped run, give the same command again.
+photographs of the fit set. In the pages a table stands between the comments `<!-- table NAME -->` or
+`<!-- table EXPERIMENT NAME -->` and `<!-- end -->`; the command replaces what is between them, and leaves the text
+unchanged. Detections are computed once and shared by all experiments. To continue a stopped run, give the same command
+again.
 """
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -21,7 +23,6 @@ from eval.decide import search_and_decide
 from eval.decide.config import DecideConfig
 from eval.explore import explore
 from eval.explore.config import ExploreConfig
-from eval.page import paper
 from eval.page.curves import OBJECTS
 from eval.page.experiments import STUDIES, ResultsConfig, experiments
 from eval.page.figures import draw_figures
@@ -31,12 +32,10 @@ from eval.page.tables import (
     agreement,
     beside_paper,
     finished,
-    first_fixations,
     paired,
     paired_maps,
     photographs,
     readings,
-    run_summary,
     study_table,
     told_table,
 )
@@ -48,6 +47,10 @@ from semfov.runs.command import run_command
 
 NOT_RUN = ["*Not run yet.*"]
 
+END = "<!-- end -->"
+PLACE = re.compile(rf"(<!-- table (.+?) -->).*?{END}", re.DOTALL)
+"""A table of a page, between the comment that names it and the one that ends it."""
+
 
 def results(config: ResultsConfig) -> None:
     """Run the experiments and write the pages."""
@@ -56,28 +59,25 @@ def results(config: ResultsConfig) -> None:
     for name in chosen:
         print(f"\n== {name}")
         HANDLERS[type(runs[name])](runs[name])
-    pages = {config.page: config.template, config.tables: config.tables_template}
-    texts = {page: read_template(template) for page, template in pages.items()}
-    for page, template in texts.items():
-        write_text(page, fill_page(template, runs))
+    pages = (config.page, config.tables)
+    texts = [read_page(page) for page in pages]
+    for page, text in zip(pages, texts, strict=True):
+        write_text(page, fill_page(text, runs))
     for path in [*pages, *draw_figures(config.pictures, runs)]:
         print(f"written: {path}")
 
 
-def read_template(path: Path) -> str:
-    """The text of a page, with lines that stand for tables."""
+def read_page(path: Path) -> str:
+    """The text of a page with tables."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise DataError(f"template: {path} cannot be read ({error.strerror}); check the path") from None
+        raise DataError(f"page: {path} cannot be read ({error.strerror}); check the path") from None
 
 
-def fill_page(template: str, runs: Runs) -> str:
-    """Replace every line `@@ …` of the template by the table that it names."""
-    lines: list[str] = []
-    for line in template.splitlines():
-        lines += fill_line(line.removeprefix("@@ "), runs) if line.startswith("@@ ") else [line]
-    return "\n".join(lines) + "\n"
+def fill_page(text: str, runs: Runs) -> str:
+    """Replace every table of a page by that of the runs; raises InputError where a comment names no table."""
+    return PLACE.sub(lambda found: "\n\n".join((found[1], "\n".join(fill_line(found[2], runs)), END)), text)
 
 
 def fill_line(line: str, runs: Runs) -> list[str]:
@@ -93,15 +93,17 @@ def fill_line(line: str, runs: Runs) -> list[str]:
 
 
 WHOLE: dict[str, Callable[[Runs], list[str]]] = {
-    "table-1": partial(beside_paper, paper.TABLE_I),
-    "table-2": partial(beside_paper, paper.TABLE_II),
+    "paper": beside_paper,
     "findings": findings,
     "photographs": photographs,
     "readings": readings,
 }
 """Tables made from several experiments, or from none."""
 
-EXPLORED = (1, 2, 3, 4, 10, 20)
+SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
+EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
+BELIEVED = ["belief", "NLL", "ECE", "mean probability", "share that hold it"]
+"""Columns of the tables of runs that the pages show."""
 
 HANDLERS: dict[type, Callable[[Any], None]] = {
     SearchConfig: search,
@@ -112,19 +114,17 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
 """Functions that run an experiment, by the class of its settings."""
 
 TABLES: dict[str, Callable[[Path], list[str]]] = {
-    "all": run_summary,
-    "first": partial(run_summary, section=0),
-    "second": partial(run_summary, section=1),
+    "search": partial(told_table, "summary.md", 0, columns=SEARCHED),
+    "explore": partial(told_table, "summary.md", 0, columns=EXPLORED),
+    "explore-objects": partial(told_table, "summary.md", 1, columns=EXPLORED),
+    "explore-cells": partial(told_table, "summary.md", 2, columns=EXPLORED),
     "agreement": agreement,
-    "first-fixations": first_fixations,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
-    "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
-    "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
     "presence": partial(told_table, "decisions.md", 0),
     "decisions": partial(told_table, "decisions.md", 1),
     "landings": partial(told_table, "decisions.md", 2),
-    "by-looks": partial(told_table, "beliefs.md", 0),
-    "by-distance": partial(told_table, "beliefs.md", 1),
+    "by-looks": partial(told_table, "beliefs.md", 0, columns=BELIEVED),
+    "by-distance": partial(told_table, "beliefs.md", 1, columns=BELIEVED),
     "paired-map": paired_maps,
     "paired-map-objects": partial(paired_maps, field=OBJECTS),
 }

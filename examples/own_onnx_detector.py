@@ -72,7 +72,7 @@ def main() -> None:
     search, explore = semfov.policies.Predictive(model), semfov.policies.KL(model)
     agent = semfov.ActivePerception(eye, (observer, search), (observer, explore)).eval()
     scanpath = agent.search(others[0].image, "person", start=0)
-    print(f"person {'found' if scanpath.found else 'not found'} after {scanpath.shifts} gaze shifts")
+    print(f"person {'found' if scanpath.found else 'not found'} after {len(scanpath)} looks")
 
 
 if __name__ == "__main__":

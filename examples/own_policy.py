@@ -68,7 +68,7 @@ def main() -> None:
             scene = scenes[index]
             for target in scenes.targets(index):
                 boxes = scene.boxes[scene.labels == target]
-                shifts += [agent.search(scene.image, target, start=start, boxes=boxes).shifts for start in (0, 99)]
+                shifts += [len(agent.search(scene.image, target, start=start, boxes=boxes)) - 1 for start in (0, 99)]
         print(f"{name}: {sum(shifts) / len(shifts):.1f} gaze shifts on average, {len(shifts)} searches")
 
 

@@ -25,10 +25,10 @@ def main() -> None:
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image
     scanpath = agent.search(image, arguments.target, start=0)
 
-    for number, (x, y) in enumerate(scanpath.fixations.tolist()):
+    for number, (x, y) in enumerate(scanpath.as_fixations("photograph").points.tolist()):
         print(f"fixation {number} at ({x:.0f}, {y:.0f})")
     print(scanpath.describe())
-    viz.plot_scanpath(scanpath, image).savefig(arguments.out, dpi=150)
+    viz.save_figure(scanpath.plot(), arguments.out)
 
 
 if __name__ == "__main__":

@@ -1,69 +1,79 @@
-"""The agent: with a foveal sensor, it searches an image for a class or explores it."""
+"""The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
+from contextlib import suppress
 from os import PathLike, fspath
-from typing import Any, Self
+from typing import Any, Literal, Self, get_args
 
-import torch
 from torch import Tensor, nn
 
-from semfov.belief.grid import Grid, check_cells
-from semfov.belief.observers import LearnedMap, Observer
-from semfov.belief.observers.any_of import TargetLike, class_meant
+from semfov.agents.fovea import MOST_SHIFTS, FoveaAgent, Start
+from semfov.agents.head import HeadAgent
+from semfov.agents.limits import EpisodeLimits, OnLook
+from semfov.agents.windows import ZoomAgent, pays
+from semfov.belief.grid import check_cells
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
-from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import (
-    MOST_CLOSER,
-    OUTCOMES,
-    CandidateCells,
-    Verifier,
-    check_thresholds,
-    conclude,
-    goal_cells,
-    outcome_by_gain,
-    outcome_of,
-)
-from semfov.episode import LiveLooks, Step, rollout
-from semfov.errors import InputError, check, check_whole
+from semfov.data.inputs import Color, ImageLike, as_image
+from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.decision import MOST_CLOSER, check_thresholds
+from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
-from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
+from semfov.head.world import World
+from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
-from semfov.paths import Ending, Scanpath, Stimulus, trace
+from semfov.observation.foveal import FovealObservationModel
+from semfov.paths import GazeRecord
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
+from semfov.zoom import GlimpseEvidence, WindowEye
 
-PRICE = 0.1
-"""Default price of a look in an exploration by a learned map: the least expected increase in the number of correctly
-classified cells for which the exploration continues."""
+KindOfLook = Literal["fovea", "windows", "head"]
+"""KindOfLook of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
-MOST_SHIFTS = 10_000
-"""Largest number of gaze shifts that can be asked for."""
+How = Literal["auto", "fovea", "windows", "head"]
+"""KindOfLook of look, or `auto` for the one that suits the picture."""
+
+PictureLike = ImageLike | LargePicture | World
+"""A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene."""
+
+Targets = str | int | Sequence[str | int] | None
+"""A class by name or index, several of them, or None for all classes."""
 
 
 class ActivePerception(nn.Module):
-    """An agent that moves its gaze over an image to find a target, or to learn which classes are where.
+    """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
+
+    The picture decides how the agent looks (`how="auto"`). In a photograph it moves the gaze of a fovea over a grid of
+    cells (`fovea`). In a picture with two octaves or more to zoom in, at least four times as long as the detector's
+    input, it looks at windows and chooses their places and magnifications (`windows`). In a scene, such as a
+    `semfov.Panorama`, it moves eye and head (`head`). `record.how` says which it was.
 
     Args:
         eye: sensor and detector.
         search: observer and policy for search.
         explore: observer and policy for exploration; during a search this observer keeps the map of all classes.
         verification: probabilities after closer looks (`semfov.belief.Verification`); None searches without them.
+        windows: evidence for large pictures (`semfov.zoom.GlimpseEvidence`); None looks at slices in the order of what
+            the overview shows.
         grid: `(columns, rows)` of the belief, 1 to 200 each.
 
     Raises:
-        InputError: `grid` is out of range.
+        InputError: `grid` is out of range, or a model was fitted for another detector, sensor or grid.
 
     Example::
 
         agent = ActivePerception.recommended("yolov3-tiny")
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        agent.search("kitchen.jpg", "cup").decision
+        agent.find_all("harbour.jpg", "boat", passes=16).objects
+        agent.search(semfov.Panorama("street.jpg"), "bicycle").plot()
     """
 
     def __init__(
@@ -73,6 +83,7 @@ class ActivePerception(nn.Module):
         explore: tuple[Observer, Policy],
         *,
         verification: Verification | None = None,
+        windows: GlimpseEvidence | None = None,
         grid: tuple[int, int] = (10, 10),
     ) -> None:
         super().__init__()
@@ -80,8 +91,10 @@ class ActivePerception(nn.Module):
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
         self.verification = verification
+        self.windows = windows
         check_cells(grid)
         self.columns, self.rows = grid
+        self._check_parts()
 
     @classmethod
     def recommended(
@@ -191,31 +204,90 @@ class ActivePerception(nn.Module):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first, in the order of the belief's components."""
+        """Names of the classes, background first."""
         return ("background", *self.eye.detector.classes)
+
+    @property
+    def fovea(self) -> FoveaAgent:
+        """The part of the agent that moves a gaze over photographs."""
+        return FoveaAgent(self.eye, self.searching, self.exploring, self.verification, (self.columns, self.rows))
+
+    @property
+    def zoom(self) -> ZoomAgent:
+        """The part of the agent that looks at windows of large pictures."""
+        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)  # type: ignore[arg-type]
+
+    @property
+    def head(self) -> HeadAgent:
+        """The part of the agent that turns a head in a scene.
+
+        Raises:
+            InputError: the agent has no learned evidence and map for its sensor.
+        """
+        search, explore = self.searching.observer, self.exploring.observer
+        if not (isinstance(search, Target) and isinstance(explore, LearnedMap)):
+            raise InputError(
+                f"how: expected an agent with learned evidence and a learned map for a head, got one with "
+                f"{type(search).__name__} and {type(explore).__name__}; use ActivePerception.recommended, or fit them "
+                "to your detector (semfov fit)"
+            )
+        return HeadAgent(self.eye, search.model, explore.model)
+
+    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> KindOfLook:
+        """How the agent looks at a picture.
+
+        Args:
+            picture: as for `search`.
+            how: `auto` chooses by the picture; another kind is returned as it is, if it suits the picture.
+            every: whether all objects are wanted, of which the overview of a photograph shows most.
+
+        Returns:
+            `fovea`, `windows` or `head`.
+
+        Raises:
+            InputError: the kind is unknown, or does not suit a scene.
+        """
+        how = lookup(how, get_args(How), "kind of look")
+        if isinstance(picture, World):
+            check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
+            return "head"
+        if how != "auto":
+            return how
+        if every:
+            return "windows"
+        # What cannot be opened is refused where it is read.
+        with suppress(SemfovError):
+            return "windows" if pays(picture_size(picture), self.eye.detector.input_size) else "fovea"
+        return "fovea"
 
     def search(
         self,
-        image: ImageLike,
+        picture: PictureLike,
         target: TargetLike,
         *,
-        start: int | None = None,
-        shifts: int = 30,
+        how: How = "auto",
+        passes: int | None = None,
+        shifts: int | None = None,
+        seconds: float | None = None,
+        duration: float | None = None,
+        on_look: OnLook | None = None,
+        start: Start = None,
         seed: int = 0,
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST_CLOSER,
-    ) -> Scanpath:
-        """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
+        closer: int | None = None,
+        color: Color = "rgb",
+    ) -> GazeRecord:
+        """Search a picture for a target class, and decide whether it is there (`record.decision`).
 
         The recommended agent looks closely at places that seem to hold the target: it enlarges a window around them to
         the detector's input (`semfov.decision.Verifier`). The search ends with `found` when the target is probable
-        enough at such a place. It ends without the target when no remaining cell is probable enough to be worth a look,
-        and after `shifts` gaze shifts.
+        enough at such a place. It ends without the target when no remaining look is worth a pass, and at the first
+        limit that is reached.
 
-        Without closer looks the search ends with `found` when the image holds the target with enough probability, and a
-        fixated cell is nearly as probable as the most probable one (`semfov.decision.decide`).
+        Without closer looks the search ends with `found` when the picture holds the target with enough probability, and
+        a fixated cell is nearly as probable as the most probable one (`semfov.decision.decide`).
 
         The belief by Kaplan's rule has no calibrated thresholds, so it never gives up. Such a search finds the target
         when a detection that overlaps the fixated cell has the target as its best class, with a score of at least
@@ -225,93 +297,181 @@ class ActivePerception(nn.Module):
         protocol of the paper.
 
         Args:
-            image: a picture of any common kind (`semfov.as_image`): a path, a Pillow image, an array or a tensor.
-            target: class by name or index 1..K; or several, each with the probability that it is meant (`AnyOf`,
-                `semfov.data.spread`). The target of the scanpath is then the most probable of them.
-            start: first cell; None draws one at random.
-            shifts: largest number of gaze shifts, 0 to 10,000.
+            picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
+                tensor; a `semfov.data.large.LargePicture`; or a scene, such as `semfov.Panorama` or `semfov.Flat`.
+            target: class by name or index 1..K; in a photograph also several, each with the probability that it is
+                meant (`AnyOf`, `semfov.data.spread`). The target of the record is then the most probable of them.
+            how: the kind of look, `fovea`, `windows` or `head`; `auto` chooses it by the picture.
+            passes: largest number of passes of the detector, closer looks included; None takes 24 for windows and 40
+                for a head.
+            shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 30, or with `passes` no limit.
+            seconds: longest time in seconds on this machine.
+            duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
+            on_look: called after each look with the record so far; returning False ends the search.
+            start: first cell of a fovea, by its number or as `(column, row)`, or first action of a head
+                (`semfov.head.Views`); None draws the cell at random, and looks straight ahead.
             seed: seed of the generator that draws the start and breaks ties.
-            boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of the image.
+            boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of a photograph.
             confirm: least probability for `found`: with closer looks, that the target is at the place; otherwise, that
-                the image holds it. None takes the threshold that was chosen when the model was fitted, or a score of
+                the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
                 0.5 for a belief without thresholds.
-            give_up: probability below which a cell is not worth a look; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. 0 decides from
-                the foveated looks alone, as does an agent without a model of verification.
+            give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
+            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes the
+                usual number. 0 decides without them, as does an agent without a model of verification.
+            color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
-            The scanpath, with its decision.
+            The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
 
         Raises:
-            InputError: the class is unknown (the message suggests the nearest names), or an argument does not fit.
-            DataError: the file of the image cannot be read.
+            InputError: the class is unknown (the message suggests the nearest names), or an argument does not fit the
+                kind of look.
+            DataError: the file of the picture cannot be read.
         """
-        strategy, index, wanted = self.searching.sought(target, self.classes)
         check_thresholds(confirm, give_up)
-        check_whole(closer, "closer", 0, 100)
-        image, grid = self._frame(image)
-        goal = None if boxes is None else goal_cells(boxes, grid, image)
-        chosen = strategy.observer.thresholds
-        thresholds = None if chosen is None else chosen.changed(confirm, give_up)
-        outcome: Callable[[Step], Tensor]
-        verifier, model = None, self._verification(closer)
-        if model is not None and model.thresholds is not None and goal is None:
-            at = model.thresholds.changed(confirm, give_up)
-            places, close_up = CandidateCells(grid, index), partial(self.eye.close_up, image)
-            outcome = verifier = Verifier(model, places, close_up, at, closer)
-        else:
-            outcome = outcome_of(wanted, grid, goal, thresholds, 0.5 if confirm is None else confirm)
-        scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
-        index = class_meant(last.belief, index)
-        scanpath = replace(scanpath, found=OUTCOMES[ended] == "found", target=index)
-        if goal is not None:
-            return replace(scanpath, ending="box") if ended else scanpath
-        if ended:
-            scanpath = replace(scanpath, ending="decision")
-        if verifier is not None:
-            decision = verifier.conclude()
-            found = decision.outcome == "found"
-            index = verifier.best.target if found else index
-            return replace(scanpath, found=found, target=index, decision=decision, closer=tuple(verifier.looks))
-        # Without thresholds the target was found in the fixated cell.
-        cell = None if thresholds is not None else int(last.cell)
-        return replace(scanpath, decision=conclude(ended, last.belief, scanpath.detections, grid, index, cell))
+        if closer is not None:
+            check_whole(closer, "closer", 0, 100)
+        kind = self.kind_of_look(picture, how)
+        _only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
+        _only_for(kind, "head", "seconds", duration=duration)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        if kind == "fovea":
+            usual = 30 if passes is None else MOST_SHIFTS
+            return self.fovea.search(
+                self._photograph(picture, color),
+                target,
+                EpisodeLimits(**limits),
+                shifts=usual if shifts is None else shifts,
+                closer=MOST_CLOSER if closer is None else closer,
+                start=start,
+                seed=seed,
+                boxes=boxes,
+                confirm=confirm,
+                give_up=give_up,
+            )
+        index = _one_class(target, self.classes)
+        if kind == "head":
+            given = _given(start=start, confirm=confirm, **limits, duration=duration)
+            _only_for(kind, "fovea", "confirm", give_up=give_up, closer=closer)
+            return self.head.search(_scene(picture, color), index, seed=seed, **given)
+        _only_for(kind, "fovea", "passes", start=start)
+        given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
+        return self.zoom.search(_large(picture, color), index, **given)
 
-    def explore(
-        self, image: ImageLike, *, start: int | None = None, shifts: int = 20, seed: int = 0, until: float | None = None
-    ) -> Scanpath:
-        """Explore an image: learn which classes are where, without a target.
+    def find_all(
+        self,
+        picture: PictureLike,
+        target: Targets = None,
+        *,
+        how: How = "auto",
+        passes: int | None = None,
+        shifts: int | None = None,
+        seconds: float | None = None,
+        duration: float | None = None,
+        on_look: OnLook | None = None,
+        worth: float | None = None,
+        batch: int = 1,
+        color: Color = "rgb",
+    ) -> GazeRecord:
+        """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
-        The exploration ends after `shifts` gaze shifts, or when every cell was fixated. With a learned map it also ends
-        when no look is expected to classify at least `until` more cells correctly.
+        The first look is the whole picture. Each other look is a window at the magnification with the largest expected
+        number of new objects. A picture that fits the detector's input needs few more looks than the first.
 
         Args:
-            image: a picture of any common kind (`semfov.as_image`): a path, a Pillow image, an array or a tensor.
-            start: first cell; None draws one at random.
-            shifts: largest number of gaze shifts, 0 to 10,000.
-            seed: seed of the generator that draws the start and breaks ties.
-            until: least expected increase in the number of correctly classified cells that is worth a look
-                (`semfov.acquisition.ExpectedGain`). 0 makes all shifts. None takes `PRICE` for a learned map.
+            picture: as for `search`.
+            target: class by name or index 1..K, several in a list, or None for all classes.
+            how: the kind of look, as for `search`; `auto` looks at windows, or moves the head in a scene.
+            passes: largest number of passes of the detector; None takes 24, and 40 for a head.
+            shifts: largest number of gaze shifts of a fovea; None takes 20, or with `passes` no limit.
+            seconds: longest time in seconds on this machine.
+            duration: in a scene, longest time in seconds that the movements of eye and head take.
+            on_look: called after each look with the record so far; returning False ends it.
+            worth: least number of new objects that a look must be expected to show; None takes 0.01. Only for windows.
+            batch: number of windows that are chosen jointly and pass the detector together.
+            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
 
         Returns:
-            The scanpath, without target and decision.
+            The record with its objects: a `ZoomPath`, a `Scanpath` or a `HeadPath`.
 
         Raises:
-            InputError: an argument does not fit, or `until` is given for an agent without a learned map.
-            DataError: the file of the image cannot be read.
+            InputError: a class is unknown (the message suggests the nearest names), or an argument does not fit the
+                kind of look.
+            DataError: the file of the picture cannot be read.
         """
-        check(until is None or (is_number(until) and until >= 0), "until", "0 or more cells, or None", until)
-        image, grid = self._frame(image)
-        observer = self.exploring.observer
-        if not isinstance(observer, LearnedMap):
-            if until:
-                raise InputError(
-                    f"until: expected None for an agent without a learned map, got {until}; use the recommended agent"
-                )
-            return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)[0]
-        explored = outcome_by_gain(ExpectedGain(observer.model, grid), PRICE if until is None else until)
-        scanpath, ended, _ = self._gaze(image, grid, self.exploring, None, start, shifts, seed, explored)
-        return replace(scanpath, ending="worth") if ended else scanpath
+        kind = self.kind_of_look(picture, how, every=True)
+        targets = _classes(target, self.classes)
+        _only_for(kind, "fovea", "passes", shifts=shifts)
+        _only_for(kind, "head", "seconds", duration=duration)
+        _only_for(kind, "windows", "passes", worth=worth)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        if kind == "fovea":
+            usual = 20 if passes is None else MOST_SHIFTS
+            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            one = targets[0] if len(targets) == 1 else None
+            return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
+        if kind == "head":
+            return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))  # type: ignore[operator]
+        wanted = targets[0] if len(targets) == 1 else list(targets) or None
+        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))  # type: ignore[arg-type]
+
+    def explore(
+        self,
+        picture: PictureLike,
+        *,
+        how: How = "auto",
+        passes: int | None = None,
+        shifts: int | None = None,
+        seconds: float | None = None,
+        duration: float | None = None,
+        on_look: OnLook | None = None,
+        worth: float | None = None,
+        start: Start = None,
+        seed: int = 0,
+        color: Color = "rgb",
+    ) -> GazeRecord:
+        """Explore a picture: learn which classes are where, without a target.
+
+        The exploration ends at the first limit that is reached, when nothing is left to look at, or when no look is
+        expected to gain at least `worth`.
+
+        Args:
+            picture: as for `search`.
+            how: the kind of look, as for `search`.
+            passes: largest number of passes of the detector; None takes 24 for windows and 40 for a head.
+            shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 20, or with `passes` no limit.
+            seconds: longest time in seconds on this machine.
+            duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
+            on_look: called after each look with the record so far; returning False ends the exploration.
+            worth: least expected gain of a look. Of a fovea with a learned map it is the increase in the number of
+                correctly classified cells (`semfov.acquisition.ExpectedGain`; None takes 0.1). Of windows it is the
+                number of new objects (None takes 0.01). 0 makes all looks.
+            start: first cell of a fovea or first action of a head, as for `search`.
+            seed: seed of the generator that draws the start and breaks ties.
+            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+
+        Returns:
+            The record, without target and decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
+
+        Raises:
+            InputError: an argument does not fit the kind of look, or `worth` is given without a learned map.
+            DataError: the file of the picture cannot be read.
+        """
+        check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
+        kind = self.kind_of_look(picture, how)
+        _only_for(kind, "fovea", "passes", shifts=shifts)
+        _only_for(kind, "head", "seconds", duration=duration)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        if kind == "fovea":
+            usual = 20 if passes is None else MOST_SHIFTS
+            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            shifts = usual if shifts is None else shifts
+            return self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
+        if kind == "head":
+            given = _given(start=start, duration=duration, worth=worth, **limits)
+            return self.head.explore(_scene(picture, color), seed=seed, **given)
+        _only_for(kind, "fovea", "passes", start=start)
+        return self.zoom.explore(_large(picture, color), **_given(worth=worth, **limits))
 
     def live(
         self,
@@ -349,7 +509,7 @@ class ActivePerception(nn.Module):
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         strategy = self.exploring if index is None else self.searching
-        model = None if index is None else self._verification(closer)
+        model = None if index is None else self.fovea.deciding(closer)
         own = strategy.observer.thresholds
         chosen = own if model is None else model.thresholds
         usual = own.give_up if rate and own is not None else None
@@ -359,45 +519,63 @@ class ActivePerception(nn.Module):
             *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer
         )
 
-    def _verification(self, closer: int) -> Verification | None:
-        """The model for closer looks, if they are wanted and it can decide."""
-        model = self.verification
-        return model if closer and model is not None and model.thresholds is not None else None
+    def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
+        """The picture of a fovea, `(1, 3, H, W)`."""
+        assert not isinstance(picture, World)
+        like = self.eye.sensor.like
+        if isinstance(picture, LargePicture):
+            pixels = picture.read((0, 0, *picture.size))
+            return as_image(pixels, like=like, argument="picture")[None]
+        return as_image(picture, like=like, argument="picture", color=color)[None]
 
-    def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
-        """The image as a batch of one, and the grid over it."""
-        image = as_image(picture, like=self.eye.sensor.like)[None]
-        return image, Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
+    def _check_parts(self) -> None:
+        """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
+        settings, grid = self.eye.settings(), (self.columns, self.rows)
+        for module in self.modules():
+            if isinstance(module, FovealObservationModel | TargetEvidence | MapEvidence | Verification):
+                check_same_detector(module.metadata.get("detector", {}), settings["detector"], module.title)
+                check_sensor(module.metadata.get("sensor", {}), settings["sensor"], module.title, strict=True)
+                check_grid(module.metadata.get("training", {}), grid, module.title)
 
-    def _gaze(
-        self,
-        image: Tensor,
-        grid: Grid,
-        strategy: Strategy,
-        target: int | None,
-        start: int | None,
-        shifts: int,
-        seed: int,
-        outcome: Callable[[Step], Tensor] | None,
-    ) -> tuple[Scanpath, int, Step]:
-        """Move the gaze until an outcome, or until no shift or cell is left; returns the outcome and last step, too."""
-        check_whole(shifts, "shifts", 0, MOST_SHIFTS)
-        first, generator = first_cell(start, seed, len(grid))
-        looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
-        ended: tuple[int, Step] | None = None
 
-        def ends(step: Step) -> Tensor:
-            nonlocal ended
-            number = torch.zeros_like(step.cell) if outcome is None else outcome(step)
-            ended = int(number), step
-            return number > 0
+def _only_for(kind: KindOfLook, suits: KindOfLook, instead: str, **given: Any) -> None:
+    """Raise `InputError` for arguments that suit another kind of look."""
+    for name, value in given.items():
+        if value is not None and kind != suits:
+            raise InputError(
+                f"{name}: expected None for a picture that is looked at by {kind!r}, got {value}; use {instead}, or "
+                f"how={suits!r}"
+            )
 
-        begin, choice = torch.tensor([first], device=image.device), Greedy(drawn_by(generator, len(grid), image))
-        policy = strategy.policy(target, grid)
-        steps = rollout(looks, strategy.observer, policy, begin, choice, most=shifts + 1, ends=ends)
-        mapper = self.exploring.observer
-        beside = None if mapper is strategy.observer else mapper
-        scanpath = trace(steps, grid, self.classes, target, beside)
-        assert ended is not None
-        ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
-        return replace(scanpath, ending=ending, stimulus=Stimulus.of(self.eye, image)), *ended
+
+def _given(**values: Any) -> dict[str, Any]:
+    """The arguments that are not None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
+    """Number of the only class of a target."""
+    wanted = {target: 1.0} if isinstance(target, str | int) else dict(target)
+    check(len(wanted) == 1, "target", "one class for this kind of look", wanted)
+    return class_index(next(iter(wanted)), classes[1:], "target")
+
+
+def _classes(target: Targets, classes: Sequence[str]) -> tuple[int, ...]:
+    """Numbers of the classes; none for all of them."""
+    if target is None:
+        return ()
+    wanted = [target] if isinstance(target, str | int) else list(target)
+    check(len(wanted) > 0, "target", "a class, several, or None for all", target)
+    return tuple(dict.fromkeys(class_index(each, classes[1:], "target") for each in wanted))
+
+
+def _large(picture: PictureLike, color: Color) -> LargePicture:
+    """The picture of windows."""
+    assert not isinstance(picture, World)
+    return open_large(picture, color=color)
+
+
+def _scene(picture: PictureLike, color: Color) -> World:
+    """The scene of a head."""
+    assert isinstance(picture, World)
+    return picture

@@ -23,6 +23,7 @@ from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import SENSORS, named_sensor
+from semfov.zoom import GlimpseEvidence
 
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
@@ -38,9 +39,7 @@ def recommended_arguments(
     eye = Eye(Foveation(sigma, growth=growth), detector)
     name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
     evidence = TargetEvidence.from_pretrained(name)
-    evidence.check_compatible(eye.settings(), grid)
     everything = MapEvidence.from_pretrained(name)
-    everything.check_compatible(eye.settings(), grid)
     observer: Observer = Target(evidence)
     if context:
         prior = ContextPrior.from_pretrained()
@@ -48,10 +47,14 @@ def recommended_arguments(
         observer = Context(observer, prior)
     mapping = LearnedMap(everything), Closer(sigma / eye.reference)
     verification = Verification.if_shipped(name)
-    if verification is not None:
-        verification.check_compatible(eye.settings(), grid)
-    search = observer, NonPredictive()
-    return {"eye": eye, "search": search, "explore": mapping, "verification": verification, "grid": grid}
+    return {
+        "eye": eye,
+        "search": (observer, NonPredictive()),
+        "explore": mapping,
+        "verification": verification,
+        "windows": GlimpseEvidence.if_shipped(detector.name),
+        "grid": grid,
+    }
 
 
 def published_arguments(
@@ -68,7 +71,6 @@ def published_arguments(
         eye = Eye(named_sensor(fovea), load_detector(name, **options))
         shipped = shipped_model(FovealObservationModel, f"{eye.detector.name}-{fovea}", fspath(name))
         model = FovealObservationModel.from_pretrained(shipped)
-    model.check_compatible(eye.settings(), eye.detector.classes)
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
     policy = Predictive(model) if search == "predictive" else NonPredictive()
     return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}

@@ -84,7 +84,7 @@ def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration
     ).eval()
     live, image = agent.live(rate=0, start=3), scene(60, 60)
     with torch.inference_mode():
-        explored = agent.explore(image, start=3, shifts=6, until=0)
+        explored = agent.explore(image, start=3, shifts=6, worth=0)
     for cell, map_, _ in zip(explored.cells, explored.probabilities, range(7), strict=True):
         moment = live.step(image)
         assert moment.cell == cell

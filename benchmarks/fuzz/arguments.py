@@ -40,13 +40,13 @@ def agent_arguments(data: st.DataObject) -> str:
     kind = choose(data, PICTURES, "image")
     image = picture(kind, rng)
     given: dict[str, Any] = {}
-    wrong = set() if kind in ("ordinary", "bytes", "float64", "half") else {"image"}
+    wrong = set() if kind in ("ordinary", "bytes", "float64", "half") else {"picture"}
     ranges = {"shifts": (0, 10_000), "seed": (0, 2**63 - 1), "start": (0, 11)}
     for name, (low, high) in ranges.items():
         if not data.draw(st.booleans(), label=f"give {name}"):
             continue
         value = choose(data, NUMBERS, name)
-        if name == "start" and value is None:
+        if name in ("start", "shifts") and value is None:
             continue
         given[name] = value
         if not (isinstance(value, int) and not isinstance(value, bool) and low <= value <= high):

@@ -54,8 +54,7 @@ class Stage:
         """
         shutil.rmtree(self.folder, ignore_errors=True)
         files = [path for kind in ("*.md", "*.png", "*.css") for path in DOCS.rglob(kind)]
-        asked = [path.relative_to(ROOT).as_posix() for path in files if not path.name.endswith(".template.md")]
-        self._asked = [*asked, *HOME]
+        self._asked = [*(path.relative_to(ROOT).as_posix() for path in files), *HOME]
         self._follow()
 
     def finish(self) -> None:

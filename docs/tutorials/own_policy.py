@@ -52,7 +52,7 @@ agents = {
     for policy in (KeepAway(), closer, policies.Random())
 }
 scenes = semfov.EmbeddedScenes(recommended.classes[1:], count=4)
-explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, until=0)
+explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, worth=0)
 viz.plot_episode(explored)
 
 # %% [markdown]
@@ -71,7 +71,7 @@ for index in range(len(scenes)):
     for start in (0, 99):
         cells += int(answers.any(-1).sum())
         for name, agent in agents.items():
-            path = agent.explore(scene.image, start=start, shifts=looks, until=0)
+            path = agent.explore(scene.image, start=start, shifts=looks, worth=0)
             right[name] += count_right(path.probabilities[..., 1:], answers)
 share = {name: counts / cells for name, counts in right.items()}
 print({name: f"{100 * counts[-1]:.0f} %" for name, counts in share.items()})

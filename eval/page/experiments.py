@@ -153,7 +153,7 @@ class Study:
     settings: dict[str, Changes]
     policies: tuple[PolicyChoice, ...]
     explores: bool = False
-    shifts: tuple[int, ...] = (1, 5, 10, 15, 30)
+    shifts: tuple[int, ...] = (1, 5, 15, 30)
     model: str | None = None
 
 
@@ -162,7 +162,7 @@ STUDIES = {
     "sensor": Study(_SENSORS, ("random", "non-predictive-raw", CENTRAL)),
     "explore-sensor": Study(_SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
     "saliency": Study(VIEWS, ("random", "vocus2", "itti-koch")),
-    "weights": Study(_WEIGHTS, GUIDED, model="published"),
+    "weights": Study(_WEIGHTS, GUIDED[:1], model="published"),
 }
 
 
@@ -183,10 +183,8 @@ class ResultsConfig(Settings):
             and detector.
         only: names of the experiments to run (None: all); for the others the pages show the results of earlier runs,
             if there are any.
-        page: file to write with the findings.
-        template: file with the text of this page.
-        tables: file to write with all other tables.
-        tables_template: file with the text of that page.
+        page: file with the findings, whose tables are replaced.
+        tables: file with all other tables, which are replaced.
         pictures: folder for the figures of the pages.
         out: folder for the runs.
         cache: folder for the stored detections (None: the user's cache).
@@ -203,9 +201,7 @@ class ResultsConfig(Settings):
     study: Count = 30
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
-    template: Path = Path("docs/results.template.md")
     tables: Path = Path("docs/tables.md")
-    tables_template: Path = Path("docs/tables.template.md")
     pictures: Path = Path("docs/pictures")
     out: Path = Path("runs/results")
     cache: Path | None = None

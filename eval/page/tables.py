@@ -1,11 +1,10 @@
 """Tables of the pages of results, made from the output of the runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from eval.page import paper
 from eval.page.curves import (
@@ -45,11 +44,11 @@ def published_columns(kind: str, runs: Runs) -> dict[str, Path | None]:
     return found
 
 
-def beside_paper(published: Mapping[str, tuple[float, ...]], runs: Runs) -> list[str]:
-    """A table of the paper beside our results; the target is the commonest class of each image."""
+def beside_paper(runs: Runs) -> list[str]:
+    """Tables I and II of the paper beside our results; the target is the commonest class of each image."""
     folders = published_columns("search", runs)
     rows = [["policy", "", "paper", *folders]]
-    for policy, figures in published.items():
+    for policy, figures in (paper.TABLE_II | paper.TABLE_I).items():
         for place, n in enumerate(paper.TABLE_SHIFTS):
             ours = [performance_cell(folder, policy, n) for folder in folders.values()]
             rows.append([policy if place == 0 else "", f"CP@{n}", f"{figures[place]:.2f}", *ours])
@@ -108,19 +107,29 @@ def study_table(title: str, runs: Runs) -> list[str]:
     return table(rows)
 
 
-def run_summary(folder: Path, section: int | None = None) -> list[str]:
-    """All tables that a run printed, or one of them."""
-    text = (folder / "summary.md").read_text(encoding="utf-8").strip()
-    parts = ["**" + part.strip() for part in text.split("\n**")]
-    parts[0] = parts[0].removeprefix("**")
-    return text.splitlines() if section is None else parts[section].splitlines()
-
-
-def told_table(name: str, number: int, folder: Path) -> list[str]:
-    """The table of this number in a Markdown file, without the text around it."""
+def told_table(name: str, number: int, folder: Path, columns: Sequence[str] | None = None) -> list[str]:
+    """The table of this number in a Markdown file, without the text around it; with `columns`, only these of it."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
-    return tables[number]
+    return tables[number] if columns is None else with_columns(tables[number], columns)
+
+
+def with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
+    """A Markdown table reduced to its first column and some others.
+
+    Args:
+        lines: the table.
+        columns: headings of the other columns.
+
+    Returns:
+        The table with these columns.
+
+    >>> with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
+    ['| a | c |', '|---|---|', '| 1 | 3 |']
+    """
+    heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
+    kept = [0, *(heads.index(column) for column in columns)]
+    return table([[row[place] for place in kept] for row in (heads, *rows)])
 
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
@@ -169,38 +178,6 @@ def agreement(folder: Path) -> list[str]:
         found = [a["found_at"] == b["found_at"] for a, b in pairs]
         rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, found))])
     return table(rows)
-
-
-def first_fixations(folder: Path) -> list[str]:
-    """Share of explorations whose first gaze shift ends in the middle half, or at the border."""
-    rows = [["policy", "in the middle half of rows and columns", "at the border"]]
-    for policy in policies_of(folder):
-        # The reference of one sharp look has no fixations.
-        if not records_of(folder, policy)[0]["cells"]:
-            continue
-        cells = np.array([record["cells"][1] for record in records_of(folder, policy)])
-        middle, border = central(cells)
-        rows.append([policy, f"{100 * middle.mean():.1f} %", f"{100 * border.mean():.1f} %"])
-    return table(rows)
-
-
-def central(cells: NDArray[np.int64], size: int = 10) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cells of a square grid lie in the middle half of rows and columns, and which at its border.
-
-    Args:
-        cells: numbers of the cells.
-        size: number of columns and of rows.
-
-    Returns:
-        Two boolean arrays, one value for each cell.
-
-    >>> central(np.array([0, 33, 55, 22]))
-    (array([False,  True,  True, False]), array([ True, False, False, False]))
-    """
-    axes = np.stack([cells % size, cells // size])
-    middle = (axes + 0.5 > size / 4) & (axes + 0.5 < 3 * size / 4)
-    border = (axes == 0) | (axes == size - 1)
-    return np.asarray(middle.all(0)), np.asarray(border.any(0))
 
 
 def photographs(runs: Runs) -> list[str]:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture
+from semfov.data.large import LargePicture, picture_size
 from semfov.decision import MOST_CLOSER, OUTCOMES, Decision, Verifier, check_thresholds, settle
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
@@ -20,6 +20,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import Glance, Glances, LiveGlances
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything, look_for
 
@@ -96,7 +97,7 @@ class ZoomAgent(nn.Module):
             True where there are two octaves or more to zoom in: the longer side of the picture is at least four times
             that of the detector's input.
         """
-        return self.eye.open(picture).lattice.levels >= 3
+        return pays(picture_size(picture), self.eye.detector.input_size)
 
     def search(
         self,
@@ -196,6 +197,23 @@ class ZoomAgent(nn.Module):
 
     def _open(self, picture: _Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
+
+
+def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
+    """Tell whether a picture is large enough for windows to pay.
+
+    Args:
+        size: `(width, height)` of the picture.
+        canvas: `(width, height)` of the detector's input.
+
+    Returns:
+        True where there are two octaves or more to zoom in: the longer side of the picture is at least four times
+        that of the detector's input.
+
+    >>> pays((3840, 2160), (416, 416)), pays((640, 480), (416, 416))
+    (True, False)
+    """
+    return Lattice.over(size, canvas).levels >= 3
 
 
 def search_windows(

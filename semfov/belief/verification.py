@@ -75,18 +75,6 @@ class Verification(PretrainedForEye):
         value: Tensor = self.linear(features)
         return value
 
-    @classmethod
-    def if_shipped(cls, name: str) -> Self | None:
-        """Load a model that is shipped with the package.
-
-        Args:
-            name: its name, that of the target evidence that it was fitted with.
-
-        Returns:
-            The model, in `eval` mode; None if there is none of this name.
-        """
-        return cls.from_pretrained(name) if (cls.shipped / f"{name}.safetensors").is_file() else None
-
     def _record(self) -> dict[str, Any]:
         """The thresholds."""
         return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}

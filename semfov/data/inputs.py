@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any, TypeAlias, Union
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union, get_args
 
 import numpy as np
 import torch
@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import from_pillow, read_image
-from semfov.errors import InputError, check, check_pixels
+from semfov.errors import InputError, check, check_pixels, lookup
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 ImageLike: TypeAlias = Union[Tensor, NDArray[Any], str, PathLike[str], "Image"]
 """A picture: the path of its file, a Pillow image, an array or a tensor; see `as_image`."""
+
+Color = Literal["rgb", "bgr"]
+"""Order of the channels of arrays and tensors; OpenCV reads BGR."""
 
 PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
@@ -25,15 +28,15 @@ _WHITE = {torch.uint8: 255, torch.uint16: 65535}
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
-def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "image") -> Tensor:
+def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb") -> Tensor:
     """Convert a picture of any common type to RGB in [0, 1].
 
     - A path: a file that Pillow reads (`semfov.read_image`).
     - A Pillow image of any mode: it is turned upright, and transparent pixels are blended with white.
     - A NumPy array or a tensor of shape `(3, H, W)` or `(H, W, 3)`, or grey of shape `(H, W)`, `(1, H, W)` or
       `(H, W, 1)`, or a batch of one such picture. Floats must lie in [0, 1]; bytes and 16-bit numbers are divided by
-      their largest value. Channels are RGB. OpenCV reads BGR: convert it with `array[..., ::-1]`. A tensor of shape
-      `(3, H, 3)` is taken as channels first.
+      their largest value. Channels are RGB, or with `color="bgr"` as OpenCV reads them. A tensor of shape `(3, H, 3)`
+      is taken as channels first.
 
     Gradients flow through tensors.
 
@@ -42,9 +45,10 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "i
         like: a tensor with the dtype and device of the result; None keeps the dtype of floats, converts other numbers
             to float32, and leaves the picture on its device.
         argument: name of the argument, for the message.
+        color: order of the channels of arrays and tensors. Files and Pillow images know their own.
 
     Returns:
-        `(3, H, W)`.
+        `(3, H, W)`, RGB.
 
     Raises:
         InputError: it is not a picture, there are several, or its values are not in [0, 1]; the message tells the
@@ -54,18 +58,21 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "i
     >>> as_image(np.zeros((48, 64, 3), np.uint8)).shape
     torch.Size([3, 48, 64])
     """
-    images = as_images(image, like=like, argument=argument)
+    images = as_images(image, like=like, argument=argument, color=color)
     check(len(images) == 1, argument, "one picture", f"a batch of {len(images)}; give them one by one")
     return images[0]
 
 
-def as_images(images: ImageLike, *, like: Tensor | None = None, argument: str = "image") -> Tensor:
+def as_images(
+    images: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb"
+) -> Tensor:
     """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`.
 
     Args:
         images: the picture or pictures.
         like: a tensor with the dtype and device of the result, as for `as_image`.
         argument: name of the argument, for the message.
+        color: order of the channels, as for `as_image`.
 
     Returns:
         `(B, 3, H, W)`.
@@ -74,9 +81,28 @@ def as_images(images: ImageLike, *, like: Tensor | None = None, argument: str = 
     torch.Size([2, 3, 8, 9])
     """
     pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
+    pixels = in_rgb(pixels, images, color)
     pixels = _in_unit(pixels, like, argument)
     check_pixels(pixels, argument)
     return pixels
+
+
+def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
+    """Pixels with channels in the order red, green, blue.
+
+    Args:
+        pixels: `(B, 3, H, W)`, made from the source.
+        source: the picture. Files and Pillow images are RGB already.
+        color: order of the channels of arrays and tensors.
+
+    Returns:
+        The pixels.
+
+    Raises:
+        InputError: the order is unknown.
+    """
+    swap = lookup(color, get_args(Color), "order of channels") == "bgr"
+    return pixels.flip(1) if swap and isinstance(source, Tensor | np.ndarray) else pixels
 
 
 def is_batch(image: object) -> bool:

@@ -4,11 +4,11 @@ import warnings
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
-from semfov.data.inputs import ImageLike, as_image, channels_first, pixels_of
+from semfov.data.inputs import Color, ImageLike, as_image, channels_first, in_rgb, pixels_of
 from semfov.data.reduction import FIRST, LARGE, PixelBox, ReducedCopies, bytes_of, reduction_for
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_TILED = (".tif", ".tiff")
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
 
 
@@ -112,16 +116,17 @@ class MemoryPicture(ArrayPicture):
 
     Args:
         image: the picture.
+        color: order of the channels of arrays and tensors.
     """
 
-    def __init__(self, image: ImageLike) -> None:
+    def __init__(self, image: ImageLike, *, color: Color = "rgb") -> None:
         if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
             # Bytes are not converted to floats in between, which would take four times the memory.
             pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
-            super().__init__(to_bytes(pixels[0]))
+            super().__init__(to_bytes(in_rgb(pixels, image, color)[0]))
         else:
-            super().__init__(to_bytes(as_image(image, argument="picture").detach()))
+            super().__init__(to_bytes(as_image(image, argument="picture", color=color).detach()))
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
@@ -259,7 +264,7 @@ class TiffPicture(LargePicture):
         return window
 
 
-def open_large(source: LargePicture | ImageLike) -> LargePicture:
+def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> LargePicture:
     """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
     Files `.tif` and `.tiff` are read tile by tile. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the
@@ -267,6 +272,7 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
 
     Args:
         source: the picture.
+        color: order of the channels of arrays and tensors.
 
     Returns:
         The opened picture.
@@ -277,13 +283,52 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
     if isinstance(source, LargePicture):
         return source
     if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.size and _by_rows(source.shape):
-        return ArrayPicture(source)
+        return ArrayPicture(source[..., ::-1] if color == "bgr" and source.ndim == 3 else source)
     if not isinstance(source, str | PathLike):
-        return MemoryPicture(source)
+        return MemoryPicture(source, color=color)
     check("://" not in str(source), "picture", "a file on this machine", f"{str(source)!r}; download it first")
-    if Path(source).suffix.lower() in (".tif", ".tiff"):
+    if Path(source).suffix.lower() in _TILED:
         return TiffPicture(source)
     return PhotographPicture(source)
+
+
+def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
+    """Size of a picture of any common type, without decoding a file.
+
+    Args:
+        source: the picture.
+
+    Returns:
+        `(width, height)` in pixels, upright.
+
+    Raises:
+        InputError: it is no picture.
+        DataError: the file cannot be read.
+
+    >>> picture_size(np.zeros((48, 64, 3), np.uint8))
+    (64, 48)
+    """
+    from PIL import Image as Pillow
+
+    if isinstance(source, LargePicture):
+        return source.size
+    if isinstance(source, str | PathLike):
+        path = Path(source)
+        if path.suffix.lower() in _TILED:
+            with suppress(DataError):
+                return TiffPicture(path).size
+        with _opening(path, "opened"), Pillow.open(path) as image:
+            return _upright_size(image)
+    if isinstance(source, Pillow.Image):
+        return _upright_size(source)
+    height, width = channels_first(pixels_of(source, "picture"), "picture").shape[-2:]
+    return width, height
+
+
+def _upright_size(image: "Image") -> tuple[int, int]:
+    """Size of a Pillow image after it is turned upright."""
+    width, height = image.size
+    return (height, width) if orientation(image) >= 5 else (width, height)
 
 
 def _by_rows(shape: tuple[int, ...]) -> bool:

@@ -211,12 +211,12 @@ def outcome_of(
     return outcome
 
 
-def outcome_by_gain(gain: AcquisitionFunction, price: float) -> Callable[[Step], Tensor]:
+def outcome_by_gain(gain: AcquisitionFunction, worth: float) -> Callable[[Step], Tensor]:
     """Make the function that decides which explorations end with a step.
 
     Args:
         gain: expected gain of a look at each cell.
-        price: least expected gain that is worth a look; 0 never ends an exploration.
+        worth: least expected gain for which a look is worth it; 0 never ends an exploration.
 
     Returns:
         A function from a step to `(A,)`, 1 for an exploration in which no cell is worth a look, otherwise 0.
@@ -224,7 +224,7 @@ def outcome_by_gain(gain: AcquisitionFunction, price: float) -> Callable[[Step],
 
     def outcome(step: Step) -> Tensor:
         best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
-        return ((best < price) & (price > 0) & ~step.visited.all(-1)).long()
+        return ((best < worth) & (worth > 0) & ~step.visited.all(-1)).long()
 
     return outcome
 

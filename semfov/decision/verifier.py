@@ -180,17 +180,20 @@ class Verifier(Generic[LookType]):
         """
         return verified(self._chances, self.presence, self.thresholds.confirm, over=self.over)
 
-    def conclude(self) -> Decision:
+    def conclude(self, room: float = math.inf) -> Decision:
         """Make the decision of a search that is over.
 
         If it did not end, all its looks are spent: what is left of closer looks is made now.
+
+        Args:
+            room: number of passes of the detector that are left for closer looks.
 
         Returns:
             The decision.
         """
         if not self.outcome():
             self._choose(last=True)
-            self.look_closely()
+            self.look_closely(room)
         return self.decision(over=True)
 
     def decision(self, *, over: bool | None = None) -> Decision:

@@ -48,7 +48,11 @@ class Objects:
 
     @classmethod
     def none(cls) -> Objects:
-        """No objects."""
+        """No objects.
+
+        Returns:
+            The objects of a picture in which nothing was found.
+        """
         nothing = torch.zeros(0)
         return cls(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
 

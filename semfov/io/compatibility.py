@@ -96,13 +96,31 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
             f"model for this detector, or use the one it was fitted for"
         )
     check_background(fitted, detector.get("background"), what)
-    _warn_of_others("detector", fitted, detector, _ALIKE, what)
+    others = _others(fitted, detector, _ALIKE)
+    if others:
+        warnings.warn(f"the {what} was fitted for another detector: {'; '.join(others)}", stacklevel=3)
 
 
-def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str) -> None:
-    """Warn where the sensor has other settings than the one that the model was fitted with."""
-    if sensor and fitted:
-        _warn_of_others("sensor", fitted, sensor, set(), what)
+def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str, *, strict: bool = False) -> None:
+    """Warn where the sensor has other settings than the one that the model was fitted with; raise if it is strict.
+
+    Args:
+        fitted: settings of the sensor of the fit; empty if they are not known.
+        sensor: settings of the sensor.
+        what: title of the model, for the message.
+        strict: whether another sensor is an error.
+
+    Raises:
+        InputError: the settings differ, and it is strict.
+    """
+    others = _others(fitted, sensor, set()) if sensor and fitted else []
+    if others and strict:
+        raise InputError(
+            f"eye: expected the sensor that the {what} was fitted for, got another: {'; '.join(others)}; make the "
+            "sensor with these settings, or fit a model for this one (semfov fit)"
+        )
+    if others:
+        warnings.warn(f"the {what} was fitted for another sensor: {'; '.join(others)}", stacklevel=3)
 
 
 def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
@@ -140,14 +158,13 @@ def check_shipped_sensor(sigma: float, growth: float) -> None:
         )
 
 
-def _warn_of_others(part: str, fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str], what: str) -> None:
-    other = [
+def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str]) -> list[str]:
+    """The settings that differ, in words."""
+    return [
         f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
         for key in sorted((fitted.keys() | used.keys()) - known)
         if _plain(fitted.get(key)) != _plain(used.get(key))
     ]
-    if other:
-        warnings.warn(f"the {what} was fitted for another {part}: {'; '.join(other)}", stacklevel=4)
 
 
 def _plain(value: Any) -> str:

@@ -94,6 +94,18 @@ class Pretrained(nn.Module):
             raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None
         return model.eval()
 
+    @classmethod
+    def if_shipped(cls, name: str) -> Self | None:
+        """Load a model that is shipped with the package, if there is one.
+
+        Args:
+            name: its name.
+
+        Returns:
+            The model, in `eval` mode; None if none of this name is shipped.
+        """
+        return cls.from_pretrained(name) if (cls.shipped / f"{name}.safetensors").is_file() else None
+
 
 class PretrainedForEye(Pretrained):
     """Base of models that were fitted for one eye; `metadata` holds the settings of its `detector` and `sensor`."""

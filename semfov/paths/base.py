@@ -21,21 +21,21 @@ from semfov.errors import InputError, check
 from semfov.paths.drawing import drawing_of
 from semfov.paths.endings import FIXATIONS, Ending, sentence
 from semfov.paths.files import Format
-from semfov.paths.merging import Place, confirm, places_confirmed
+from semfov.paths.merging import ConfirmedPlace, confirm, places_confirmed
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Table = Literal["looks", "objects"]
+_Table = Literal["looks", "objects"]
 """Tables of a record."""
 
 _NAMED = 5  # largest number of objects that the text form names
 
 
 @dataclass(frozen=True)
-class Look:
+class RecordedLook:
     """One look of a record, in pixels of the picture.
 
     Attributes:
@@ -45,6 +45,11 @@ class Look:
         detections: its detections, a batch of one.
         seconds: time that it took; None if it is not known.
         value: value for which it was chosen; None if it was not chosen by a value.
+
+    Example::
+
+        for look in agent.search("kitchen.jpg", "cup"):
+            print(look.number, look.fixation, look.seconds)
     """
 
     number: int
@@ -59,7 +64,7 @@ class Look:
 class Record(ABC):
     """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
 
-    Iterating over a record gives its looks one by one (`Look`). Its objects are one set: what `describe` counts, what
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts, what
     `plot` draws, and what `objects` returns.
 
     Attributes:
@@ -108,7 +113,7 @@ class Record(ABC):
         """Number of passes of the detector, closer looks included."""
 
     @abstractmethod
-    def __iter__(self) -> Iterator[Look]:
+    def __iter__(self) -> Iterator[RecordedLook]:
         """The looks in their order."""
 
     @cached_property
@@ -146,12 +151,16 @@ class Record(ABC):
         """The objects, and which of them were confirmed."""
         return confirm(self.candidates.of(self._sought()), self._confirmations(), self.least)
 
-    def _confirmations(self) -> list[Place]:
+    def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
         return places_confirmed(self.decision, self.target, (), self.passes - 1)
 
     def objects_in_words(self) -> str:
-        """The number of the objects, by class where classes were searched for, and their least score."""
+        """Count the objects, by class where classes were searched for, and say from which score on.
+
+        Returns:
+            A phrase such as `2 × person from score 0.3`.
+        """
         labels = self.objects.labels
         names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought()]
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
@@ -235,7 +244,7 @@ class Record(ABC):
             )
         ]
 
-    def to_frame(self, table: Table = "looks") -> pandas.DataFrame:
+    def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
         """A table of the record as a pandas data frame.
 
         Args:
@@ -247,7 +256,7 @@ class Record(ABC):
         Raises:
             InputError: there is no such table, or pandas is not installed.
         """
-        check(table in get_args(Table), "table", "looks or objects", table)
+        check(table in get_args(_Table), "table", "looks or objects", table)
         try:
             import pandas
         except ImportError:
@@ -302,11 +311,11 @@ class GazeRecord(Record):
         """Number of looks, the first included."""
         return len(self.detections)
 
-    def __iter__(self) -> Iterator[Look]:
+    def __iter__(self) -> Iterator[RecordedLook]:
         """The looks in their order."""
         for number, (x, y) in enumerate(self._gaze()[0].tolist()):
             parts = self.region(number), self._in_picture(number), self._duration(number), self._value(number)
-            yield Look(number, (x, y), *parts)
+            yield RecordedLook(number, (x, y), *parts)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -316,7 +325,7 @@ class GazeRecord(Record):
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
-        return len(self)
+        return len(self.detections) + len(self.closer)
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
@@ -342,7 +351,7 @@ class GazeRecord(Record):
         """Value for which a look was chosen."""
         return None
 
-    def _confirmations(self) -> list[Place]:
+    def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
         return places_confirmed(self.decision, self.target, self.closer, len(self) - 1)
 
@@ -355,7 +364,8 @@ class GazeRecord(Record):
         if self.closer and self.found:
             return self._sentences["closer found"]
         outcome = None if self.decision is None else self.decision.outcome
-        return sentence(self._sentences, self.ending, outcome, len(self), closer=bool(self.closer))
+        looks = self.passes if self.ending == "passes" else len(self)
+        return sentence(self._sentences, self.ending, outcome, looks, closer=bool(self.closer))
 
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""

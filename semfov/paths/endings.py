@@ -7,16 +7,20 @@ from typing import Literal
 
 from semfov.decision import Outcome
 
-Ending = Literal["box", "decision", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"]
-"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, no look was worth
-it, all gaze shifts were made, every cell was fixated, the passes were used up, no window was left that can show the
-target, the time on this machine was over, the time of the scene was over, or the caller stopped it."""
+Ending = Literal[
+    "box", "decision", "detection", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
+]
+"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, a detection
+showed the target at the gaze in a search whose belief has no thresholds, no look was worth it, all gaze shifts were
+made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
+machine was over, the time of the scene was over, or the caller stopped it."""
 
 RENAMED: Mapping[str, Ending] = {"price": "worth"}
 """Endings that files of earlier versions call by another name."""
 
 FIXATIONS = {
     "box": "The gaze is on a box of the target.",
+    "detection": "A detection shows the target at the gaze.",
     "worth": "No look is expected to classify enough more cells correctly.",
     "cells": "Every cell was fixated.",
     "duration": "The next look would end after the time limit of the scene.",

@@ -19,9 +19,9 @@ from semfov.head.world import Flat, Panorama, Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
-from semfov.paths.merging import Place, distances_to, merge_fixations, places_confirmed
+from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
 
-BORDER = 2.0
+_BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
 
 _WORLDS: dict[str, tuple[type[Panorama] | type[Flat], tuple[str, ...]]] = {
@@ -106,7 +106,7 @@ class HeadPath(GazeRecord):
             boxes, field = seen.boxes[0], float(self.pose(number)[2])
             point = self.views.view_grid.centres[action % self.views.cells]
             distances.append(distances_to(boxes, point) * field / width)
-            border = boxes.new_tensor([BORDER, BORDER, width - BORDER, height - BORDER])
+            border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
             cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
         looks = [self._in_picture(number) for number in range(len(self))]
         around = float(self.size[0]) if self.views.world.closed else None
@@ -218,7 +218,7 @@ class HeadPath(GazeRecord):
     def _duration(self, number: int) -> float | None:
         return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
 
-    def _confirmations(self) -> list[Place]:
+    def _confirmations(self) -> list[ConfirmedPlace]:
         decision = self.decision
         if decision is not None and decision.box is not None:
             decision = replace(decision, box=self.views.world.picture_boxes(decision.box[None], self.pose(-1))[0])

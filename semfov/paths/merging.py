@@ -17,7 +17,7 @@ CONFIRMED = 0.5
 """Probability from which on a closer look confirms that the target is there."""
 
 
-class Place(NamedTuple):
+class ConfirmedPlace(NamedTuple):
     """A place that was confirmed.
 
     Attributes:
@@ -109,7 +109,7 @@ def number_of(look: CloseUp) -> int:
 
 def places_confirmed(
     decision: Decision | None, target: int | None, closer: Sequence[CloseUp], last: int
-) -> list[Place]:
+) -> list[ConfirmedPlace]:
     """The places that closer looks confirmed, and the one that the decision found.
 
     Args:
@@ -123,15 +123,15 @@ def places_confirmed(
     """
     found = decision.box if decision is not None and decision.outcome == "found" else None
     others = [look for look in closer if look.place >= CONFIRMED and (found is None or not look.box.equal(found))]
-    places = [Place(look.box, look.target, look.place, number_of(look)) for look in others]
+    places = [ConfirmedPlace(look.box, look.target, look.place, number_of(look)) for look in others]
     if found is not None and decision is not None and target is not None:
         last = next((number_of(look) for look in closer if look.box.equal(found)), last)
         probability = decision.probability if decision.place is None else decision.place
-        places.append(Place(found, target, probability, last))
+        places.append(ConfirmedPlace(found, target, probability, last))
     return places
 
 
-def confirm(candidates: Objects, places: Sequence[Place], least: float) -> tuple[Objects, Tensor]:
+def confirm(candidates: Objects, places: Sequence[ConfirmedPlace], least: float) -> tuple[Objects, Tensor]:
     """The candidates that count as objects: those with a high score, and those that were confirmed.
 
     Args:

@@ -14,8 +14,8 @@ from semfov.belief.grid import Grid
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
-from semfov.paths.base import Look, Record
-from semfov.paths.merging import Place, distances_to, merge_fixations, places_confirmed
+from semfov.paths.base import Record, RecordedLook
+from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -67,10 +67,12 @@ class Moment(Record):
         """One pass of the detector."""
         return 1
 
-    def __iter__(self) -> Iterator[Look]:
+    def __iter__(self) -> Iterator[RecordedLook]:
         """The look at the frame, with the whole frame as its region."""
         (x, y), (width, height) = self.fixation.tolist(), self.size
-        yield Look(0, (x, y), (0.0, 0.0, float(width), float(height)), self.detections, sum(self.seconds.values()))
+        yield RecordedLook(
+            0, (x, y), (0.0, 0.0, float(width), float(height)), self.detections, sum(self.seconds.values())
+        )
 
     @cached_property
     def candidates(self) -> Objects:
@@ -103,7 +105,7 @@ class Moment(Record):
         row, column = divmod(self.cell, self.grid.columns)
         return [f"frame {self.number}, at (column, row): ({column}, {row})", self._listed()]
 
-    def _confirmations(self) -> list[Place]:
+    def _confirmations(self) -> list[ConfirmedPlace]:
         closer = [] if self.closer is None else [self.closer]
         return places_confirmed(self.decision, self.target, closer, 0)
 

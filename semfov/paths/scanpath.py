@@ -62,7 +62,7 @@ _FORMAT = Format.of(
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
         "settings": Maybe(_SETTINGS),
     },
-    endings=("box", "decision", "worth", "shifts", "cells", "passes", "seconds", "stopped"),
+    endings=("box", "decision", "detection", "worth", "shifts", "cells", "passes", "seconds", "stopped"),
     closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of scanpaths."""
@@ -119,11 +119,6 @@ class Scanpath(GazeRecord):
         return len(self) - 1
 
     @property
-    def passes(self) -> int:
-        """Number of passes of the detector, closer looks included."""
-        return len(self) + len(self.closer)
-
-    @property
     def image(self) -> Tensor | None:
         """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
         return super().image if self.stimulus is None else self.stimulus.image
@@ -170,7 +165,10 @@ class Scanpath(GazeRecord):
         if decision is None:
             return f"“{name}” {'found after' if self.found else 'not found in'} {shifts}"
         sure = f"probability {decision.probability:.2f}"
-        if decision.place is not None:
+        if self.ending == "detection":
+            # Beliefs without thresholds are no probabilities in the plain sense.
+            sure = f"by a detection at the gaze; its belief gives {decision.probability:.2f}"
+        elif decision.place is not None:
             sure += f", {decision.place:.2f} at this place"
         if self.closer:
             shifts += f" and {len(self.closer)} closer look{'s' if len(self.closer) != 1 else ''}"

@@ -11,10 +11,74 @@ from semfov.episode import Step
 from semfov.paths.scanpath import Scanpath
 
 
+class Trace:
+    """Keeps the steps of one episode, and makes scanpaths of them at any time.
+
+    Args:
+        grid: the cells.
+        classes: names of the classes, background first.
+        target: class 1..K that is searched for; None for exploration.
+        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
+            about all classes itself.
+
+    Attributes:
+        steps: the steps, in order.
+
+    Example::
+
+        trace = Trace(grid, ("background", "cup"), target=1, beside=None)
+        for step in rollout(looks, observer, acquisition, start, choice, most=10):
+            trace.add(step)
+        scanpath = trace.scanpath()
+    """
+
+    def __init__(self, grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None) -> None:
+        self.grid, self.classes, self.target, self.beside = grid, classes, target, beside
+        self.steps: list[Step] = []
+        self._maps: list[torch.Tensor] = []
+        self._known: Belief | None = None
+
+    def add(self, step: Step) -> None:
+        """Keep a step.
+
+        Args:
+            step: the next step of the episode.
+        """
+        known = step.belief
+        if self.beside is not None:
+            before = self.beside.start(1, self.grid, step.values) if self._known is None else self._known
+            known = self.beside(before, step.detections, step.fixation, self.grid)
+        self._known = known
+        self._maps.append(known.class_probabilities()[0])
+        self.steps.append(step)
+
+    def scanpath(self) -> Scanpath:
+        """Make the scanpath of the steps so far.
+
+        Returns:
+            The scanpath, without a decision.
+        """
+        steps, target = self.steps, self.target
+        return Scanpath(
+            grid=self.grid,
+            classes=self.classes,
+            target=target,
+            cells=torch.cat([step.cell for step in steps]),
+            fixations=torch.cat([step.fixation for step in steps]),
+            detections=tuple(step.detections for step in steps),
+            probabilities=torch.stack(self._maps),
+            values=torch.stack([step.values[0] for step in steps]),
+            found=False,
+            posterior=None if target is None else torch.stack([step.belief.probability(target)[0] for step in steps]),
+            presence=None if target is None else torch.stack([step.belief.presence(target)[0] for step in steps]),
+            seconds=tuple(step.seconds for step in steps),
+        )
+
+
 def trace(
     steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
 ) -> Scanpath:
-    """Make the scanpath of one episode.
+    """Make the scanpath of one episode (`Trace`).
 
     Args:
         steps: steps of one episode, from `semfov.episode.rollout`.
@@ -32,34 +96,7 @@ def trace(
         steps = rollout(looks, observer, acquisition, start, choice, most=10)
         scanpath = trace(steps, grid, ("background", "cup"), target=1, beside=None)
     """
-    cells, fixations, detections, maps, values, present, anywhere, seconds = [], [], [], [], [], [], [], []
-    known: Belief | None = None
+    kept = Trace(grid, classes, target, beside)
     for step in steps:
-        if beside is None:
-            known = step.belief
-        else:
-            before = beside.start(1, grid, step.values) if known is None else known
-            known = beside(before, step.detections, step.fixation, grid)
-        cells.append(step.cell)
-        fixations.append(step.fixation)
-        detections.append(step.detections)
-        maps.append(known.class_probabilities()[0])
-        values.append(step.values[0])
-        seconds.append(step.seconds)
-        if target is not None:
-            present.append(step.belief.probability(target)[0])
-            anywhere.append(step.belief.presence(target)[0])
-    return Scanpath(
-        grid=grid,
-        classes=classes,
-        target=target,
-        cells=torch.cat(cells),
-        fixations=torch.cat(fixations),
-        detections=tuple(detections),
-        probabilities=torch.stack(maps),
-        values=torch.stack(values),
-        found=False,
-        posterior=torch.stack(present) if present else None,
-        presence=torch.stack(anywhere) if anywhere else None,
-        seconds=tuple(seconds),
-    )
+        kept.add(step)
+    return kept.scanpath()

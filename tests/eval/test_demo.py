@@ -37,7 +37,10 @@ def photo(tmp_path):
 def test_search_prints_looks_and_writes_pictures(run, photo, tmp_path):
     code, printed = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
-    assert re.search(r"my photo\.png: “red” found after 1 gaze shift \(probability [01]\.\d\d\)", printed.out)
+    assert re.search(
+        r"my photo\.png: “red” found after 1 gaze shift \(by a detection at the gaze",
+        printed.out,
+    )
     rows = [line.split() for line in printed.out.splitlines() if line[:1] in ("0", "1")]
     assert rows[0][:3] == ["0", "(7,", "5)"]
     for name in ("scanpath.png", "views.png", "belief.png", "animation.gif"):
@@ -254,7 +257,7 @@ def demo_and_agent(agent, picture, **how):
     assert all(set(look) == set(STAGES) for look in shown.seconds)
     with torch.inference_mode():
         if config.target is None:
-            return shown, agent.explore(picture.image, start=0, shifts=2, until=0)
+            return shown, agent.explore(picture.image, start=0, shifts=2, worth=0)
         return shown, agent.search(picture.image, config.target, start=0, shifts=2)
 
 

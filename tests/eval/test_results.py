@@ -12,8 +12,8 @@ from eval.page.curves import behind
 from eval.page.experiments import ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
-from eval.page.tables import agreement, central, first_fixations, paired, run_summary
-from eval.results import TABLES, WHOLE, fill_page, results
+from eval.page.tables import agreement, paired
+from eval.results import PLACE, TABLES, WHOLE, fill_line, fill_page, results
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.config import SensorConfig
@@ -24,7 +24,10 @@ ROOT = Path(__file__).parents[2]
 
 def write_records(folder, records):
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "summary.md").write_text("**one** (1)\n\n| a |\n|---|\n| 1 |\n\n**two** (2)\n\n| b |\n")
+    shown = (
+        "| policy | CP@1 | CP@5 | CP@10 | CP@15 | CP@30 |\n|---|---|---|---|---|---|\n| random | 1 | 2 | 3 | 4 | 5 |\n"
+    )
+    (folder / "summary.md").write_text(f"**one** (1)\n\n{shown}\n**two** (2)\n\n| b |\n|---|\n")
     (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
@@ -99,32 +102,47 @@ def test_published_experiments_have_the_published_sensor_and_model(runs):
                 assert run.saliency.view == "foveated"
 
 
-def test_lines_of_the_template_are_replaced_by_tables(searched):
+def place(name, content="anything"):
+    return f"<!-- table {name} -->\n\n{content}\n\n<!-- end -->"
+
+
+def test_tables_of_a_page_are_replaced_and_its_text_stays(searched):
     runs, _ = searched
-    text = fill_page("before\n@@ beyond-search-tiny second\nafter\n", runs)
-    assert text == "before\n**two** (2)\n\n| b |\nafter\n"
-    assert fill_page("@@ beyond-explore-nano all\n", runs) == "*Not run yet.*\n"
-    assert fill_page("@@ sensitivity\n", runs).count("not run yet") > 50
-    assert fill_page("@@ explore-sensor\n", runs).count("not run yet") == 6 * 2 * 7
-    assert fill_page("@@ table-1\n", runs).count("not run yet") == 4 * 4 * 4
-    assert run_summary(runs["beyond-search-tiny"].out, 0)[0] == "**one** (1)"
+    page = "before\n{}\nbetween\n{}\nafter\n"
+    text = fill_page(page.format(place("beyond-search-tiny search"), place("explore-published-nano explore", "")), runs)
+    shown = ["| policy | CP@1 | CP@5 | CP@15 | CP@30 |", "|--------|------|------|-------|-------|"]
+    table = "\n".join([*shown, "| random | 1    | 2    | 4     | 5     |"])
+    missing = place("explore-published-nano explore", "*Not run yet.*")
+    assert text == page.format(place("beyond-search-tiny search", table), missing)
+    assert fill_page(text, runs) == text
+
+
+def test_tables_of_experiments_that_have_not_run_say_so(runs):
+    assert "\n".join(fill_line("sensitivity", runs)).count("not run yet") > 50
+    assert "\n".join(fill_line("explore-sensor", runs)).count("not run yet") == 6 * 2 * 7
+    assert "\n".join(fill_line("paper", runs)).count("not run yet") == 6 * 4 * 4
+
+
+def test_unknown_tables_are_refused(runs):
     with pytest.raises(InputError, match="did you mean 'beyond-search-tiny'"):
-        fill_page("@@ beyond-search-tin first\n", runs)
+        fill_page(place("beyond-search-tin search"), runs)
     with pytest.raises(InputError, match="table"):
-        fill_page("@@ beyond-search-tiny third\n", runs)
+        fill_page(place("beyond-search-tiny third"), runs)
 
 
 def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
     """Tables are chosen by their number in the file, without the prose around them."""
-    assert fill_page("@@ decide-tiny presence\n", runs) == "*Not run yet.*\n"
+    heads = "| looks | cells | belief | NLL | ECE | mean probability | share that hold it |"
     for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
         runs[name].out.mkdir(parents=True)
-        parts = [f"Some words.\n\n| {number} |\n|---|\n| x |\n" for number in range(4)]
+        parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
     for number, kind in enumerate(("presence", "decisions", "landings")):
-        assert fill_page(f"@@ decide-tiny {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+        assert fill_line(f"decide-tiny {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
     for number, kind in enumerate(("by-looks", "by-distance")):
-        assert fill_page(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+        rows = [cells_of(row) for row in fill_line(f"beliefs-nano {kind}", runs)]
+        assert rows[0] == ["looks", "belief", "NLL", "ECE", "mean probability", "share that hold it"]
+        assert rows[2] == [str(number), *"xxxxx"]
 
 
 def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
@@ -135,55 +153,44 @@ def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
         assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
 
 
-def lines_of_tables(page):
-    text = (ROOT / f"docs/{page}.template.md").read_text(encoding="utf-8")
-    return [line for line in text.splitlines() if line.startswith("@@ ")]
-
-
 @pytest.mark.parametrize("page", ["results", "tables"])
-def test_every_line_of_the_templates_can_be_filled(page, runs):
-    for line in lines_of_tables(page):
-        name, _, kind = line.removeprefix("@@ ").partition(" ")
-        assert name in WHOLE or not kind or (name in runs and kind in TABLES), line
+def test_every_table_of_the_pages_can_be_filled(page, runs):
+    text = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
+    assert text.count("<!--") == 2 * len(PLACE.findall(text))
+    for found in PLACE.finditer(text):
+        name, _, kind = found[2].partition(" ")
+        assert name in WHOLE or not kind or (name in runs and kind in TABLES), found[2]
+        _, comment, empty, *rows = ["", *found[0].splitlines()]
+        assert (comment, empty) == (found[1], "")
+        assert len(rows) > 4
+        assert all(row.startswith("|") for row in rows[:-2]), found[2]
 
 
 def test_no_table_is_on_both_pages():
-    lines = [*lines_of_tables("results"), *lines_of_tables("tables")]
-    assert len(set(lines)) == len(lines) > 40
-
-
-@pytest.mark.parametrize("page", ["results", "tables"])
-def test_the_pages_are_their_templates_with_tables(page):
-    """The text of a page between its tables is that of the template, in the same order."""
-    written = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8").splitlines()
-    place = 0
-    for line in (ROOT / f"docs/{page}.template.md").read_text(encoding="utf-8").splitlines():
-        if line.startswith("@@ "):
-            assert any(each.startswith("|") for each in written[place:]), line
-        else:
-            place = written.index(line, place) + bool(line)
+    names = [
+        name for page in ("results", "tables") for _, name in PLACE.findall((ROOT / f"docs/{page}.md").read_text())
+    ]
+    assert len(set(names)) == len(names) > 40
 
 
 def test_one_command_writes_both_pages(runs, tmp_path):
-    templates = {page: tmp_path / f"{page}.template.md" for page in ("results", "tables")}
-    for page, template in templates.items():
-        template.write_text(f"{page}\n@@ table-1\n")
+    pages = [tmp_path / f"{name}.md" for name in ("results", "tables")]
+    for page in pages:
+        page.write_text(f"{page}\n{place('paper')}\n")
     config = ResultsConfig(
         root=tmp_path,
         annotations=tmp_path / "a.json",
         only=(),
-        page=tmp_path / "results.md",
-        template=templates["results"],
-        tables=tmp_path / "tables.md",
-        tables_template=templates["tables"],
+        page=pages[0],
+        tables=pages[1],
         pictures=tmp_path,
         out=tmp_path / "out",
     )
     results(config)
-    for page in templates:
-        assert (tmp_path / f"{page}.md").read_text() == fill_page(f"{page}\n@@ table-1\n", runs)
-    templates["tables"].unlink()
-    with pytest.raises(DataError, match=r"tables\.template\.md cannot be read"):
+    for page in pages:
+        assert page.read_text() == fill_page(f"{page}\n{place('paper')}\n", runs)
+    pages[1].unlink()
+    with pytest.raises(DataError, match=r"tables\.md cannot be read"):
         results(config)
 
 
@@ -209,9 +216,9 @@ def test_a_policy_is_behind_by_more_than_two_standard_errors():
 
 def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
-    records = searches(tuple(paper.TABLE_II), lambda policy, scene, _: found.get((policy, scene), 1))
+    records = searches(tuple(paper.TABLE_II | paper.TABLE_I), lambda policy, scene, _: found.get((policy, scene), 1))
     write_records(runs["search-published-nano"].out, records)
-    rows = [cells_of(row) for row in fill_page("@@ table-2\n", runs).splitlines()]
+    rows = [cells_of(row) for row in fill_line("paper", runs)]
     assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
     # The target of one of the three even scenes is found within 5 and 15 gaze shifts, of two within 30.
     assert rows[2][:4] == ["random", "CP@5", "45.20", "33.3 ± 33.3"]
@@ -248,14 +255,6 @@ def test_agreement_compares_policies_episode_by_episode(tmp_path):
     assert cells_of(rows[3]) == ["calibrated", "100.0 %", "100.0 %"]
 
 
-def test_first_fixations_are_counted_in_the_centre_and_at_the_border(tmp_path):
-    middle, border = central(np.arange(100))
-    assert middle.nonzero()[0].tolist() == [10 * row + column for row in (3, 4, 5, 6) for column in (3, 4, 5, 6)]
-    assert border.sum() == 36
-    write_records(tmp_path, [{"policy": "kl-raw", "cells": [50, cell]} for cell in (44, 45, 9, 21)])
-    assert cells_of(first_fixations(tmp_path)[2]) == ["kl-raw", "50.0 %", "25.0 %"]
-
-
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     right = {"random-raw": (1, 2), "closer-look-learned": (3, 4)}
     records = [
@@ -264,7 +263,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
         for scene in (0, 1)
     ]
     write_records(runs["explore-sensor fovea 50 px, growth 1"].out, records)
-    rows = [cells_of(row) for row in fill_page("@@ explore-sensor\n", runs).splitlines()]
+    rows = [cells_of(row) for row in fill_line("explore-sensor", runs)]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
     assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
     assert rows[3][1:3] == ["closer-look-learned", "87.5 ± 12.5"]

@@ -3,6 +3,7 @@
 import io
 import re
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from semfov import (
     foveate,
 )
 from semfov.data.classes import class_index
+from semfov.data.large import open_large
 from semfov.data.synonyms import SYNONYMS
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.load import check_detector
@@ -178,9 +180,9 @@ INVALID_IMAGES = {
     "half a file": (lambda folder: folder / "cut.png", r"cut\.png: truncated, damaged"),
     "half a file, opened": (
         lambda folder: Image.open(io.BytesIO((folder / "cut.png").read_bytes())),
-        "image: truncated, damaged or closed",
+        "(image|picture): truncated, damaged or closed",
     ),
-    "closed": (lambda _: closed(), "image: truncated, damaged or closed .*open it again"),
+    "closed": (lambda _: closed(), "(image|picture): truncated, damaged or closed .*open it again"),
 }
 
 
@@ -191,7 +193,7 @@ def test_invalid_images_are_refused_with_the_remedy(kind, folder, agent):
     for function in (as_image, lambda image: agent.search(image, "cup"), agent.explore):
         with pytest.raises(SemfovError, match=message) as error:
             function(make(folder))
-        assert str(error.value).startswith("image")
+        assert str(error.value).startswith(("image", "picture"))
         assert "\n" not in str(error.value)
 
 
@@ -279,7 +281,7 @@ def test_invalid_targets_are_refused(target, agent, zooming):
 
 
 ARGUMENTS = [
-    ("shifts", -1), ("shifts", 10**9), ("shifts", 2.5), ("shifts", None), ("seed", -1), ("seed", 2**64), ("seed", 1.5),
+    ("shifts", -1), ("shifts", 10**9), ("shifts", 2.5), ("seed", -1), ("seed", 2**64), ("seed", 1.5),
     ("seed", None), ("start", 12), ("start", -1), ("start", True), ("start", "middle"),
     ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
     ("give_up", float("nan")),
@@ -376,3 +378,21 @@ def test_classes_are_listed_without_loading_the_agent(monkeypatch, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
     assert program.main([]) == 0
     assert "wine glass" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["array", "tensor", "floats", "Pillow image"])
+def test_pictures_in_the_order_of_opencv_have_the_same_colours(kind):
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (12, 17, 3), dtype=np.uint8)
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    given = {
+        "array": bgr,
+        "tensor": torch.from_numpy(bgr),
+        "floats": torch.from_numpy(bgr).permute(2, 0, 1) / 255,
+        "Pillow image": Image.fromarray(rgb),  # knows its own order
+    }[kind]
+    expected = torch.from_numpy(rgb).permute(2, 0, 1)
+    torch.testing.assert_close(as_image(given, color="bgr"), expected / 255)
+    assert torch.equal(open_large(given, color="bgr").read((3, 1, 9, 12)), expected[:, 1:12, 3:9])
+    with pytest.raises(SemfovError, match="bgr"):
+        as_image(given, color="brg")

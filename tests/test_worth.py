@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Foveation, Grid
-from semfov.agent import PRICE
+from semfov.agents.fovea import WORTH
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.errors import InputError
@@ -62,14 +62,14 @@ def largest_gains(model, scanpath):
 @pytest.mark.parametrize("policy", [None, Random()], ids=["closer-look", "random"])
 def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     agent = agent_of(model, policy)
-    whole = agent.explore(image, start=0, shifts=12, until=0, seed=1)
+    whole = agent.explore(image, start=0, shifts=12, worth=0, seed=1)
     assert len(whole) == 13
     assert whole.ending == "shifts"
     expected = largest_gains(model, whole)
     assert max(expected) > 4 * min(expected)
     lengths = set()
     for price in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
-        part = agent.explore(image, start=0, shifts=12, until=price, seed=1)
+        part = agent.explore(image, start=0, shifts=12, worth=price, seed=1)
         last = next((number for number, value in enumerate(expected) if value < price), None)
         assert part.ending == ("shifts" if last is None else "worth")
         assert len(part) == (13 if last is None else last + 1)
@@ -87,7 +87,7 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
 def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, image):
     """After the last look every gain is below the price; after every earlier look at least one is not."""
     agent = agent_of(model, Gain(model))
-    scanpath = agent.explore(image, start=7, shifts=19, until=0.25)
+    scanpath = agent.explore(image, start=7, shifts=19, worth=0.25)
     assert scanpath.ending == "worth"
     for number, values in enumerate(scanpath.values):
         left = values.clone()
@@ -98,8 +98,8 @@ def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, i
 
 def test_until_none_means_the_default_price(model, image):
     agent = agent_of(model)
-    model.worth[-1].bias.fill_(PRICE / 3.5)
-    free, default, same = (agent.explore(image, start=0, shifts=19, until=until, seed=3) for until in (0, None, PRICE))
+    model.worth[-1].bias.fill_(WORTH / 3.5)
+    free, default, same = (agent.explore(image, start=0, shifts=19, worth=worth, seed=3) for worth in (0, None, WORTH))
     assert free.ending == "cells"
     assert default.ending == same.ending == "worth"
     assert torch.equal(default.cells, same.cells)
@@ -110,23 +110,23 @@ def test_until_none_means_the_default_price(model, image):
 def test_price_zero_never_ends_an_exploration(model, image, gain):
     model.worth[-1].bias.fill_(gain)
     agent = agent_of(model)
-    assert agent.explore(image, start=0, shifts=3, until=0).ending == "shifts"
-    assert len(agent.explore(image, start=0, shifts=30, until=0)) == 20
-    assert len(agent.explore(image, start=0, shifts=30, until=0.01)) == 1
+    assert agent.explore(image, start=0, shifts=3, worth=0).ending == "shifts"
+    assert len(agent.explore(image, start=0, shifts=30, worth=0)) == 20
+    assert len(agent.explore(image, start=0, shifts=30, worth=0.01)) == 1
     assert len(agent.explore(image, start=0, shifts=30)) == 1
 
 
-@pytest.mark.parametrize("until", [0, 1e-6])
-def test_exploration_with_a_low_price_ends_after_all_cells(model, image, until):
+@pytest.mark.parametrize("worth", [0, 1e-6])
+def test_exploration_with_a_low_price_ends_after_all_cells(model, image, worth):
     """The gain of every look exceeds the price, so the exploration ends after the last cell."""
-    scanpath = agent_of(model, grid=(3, 2)).explore(image, shifts=30, until=until)
+    scanpath = agent_of(model, grid=(3, 2)).explore(image, shifts=30, worth=worth)
     assert sorted(scanpath.cells.tolist()) == list(range(6))
     assert scanpath.ending == "cells"
 
 
 def test_exploration_without_gaze_shifts(model, image):
-    assert agent_of(model).explore(image, start=0, shifts=0, until=0.1).ending == "shifts"
-    assert agent_of(model).explore(image, start=0, shifts=0, until=1e3).ending == "worth"
+    assert agent_of(model).explore(image, start=0, shifts=0, worth=0.1).ending == "shifts"
+    assert agent_of(model).explore(image, start=0, shifts=0, worth=1e3).ending == "worth"
 
 
 def test_the_map_of_a_search_is_the_learned_map(model, image):
@@ -143,13 +143,13 @@ def test_the_map_of_a_search_is_the_learned_map(model, image):
 def test_until_needs_an_agent_with_a_learned_map(image):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     agent = ActivePerception(eye, (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(5, 4))
-    with pytest.raises(InputError, match=r"^until: expected None for an agent without a learned map"):
-        agent.explore(image, until=0.1)
-    assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, until=0).ending == "shifts"
+    with pytest.raises(InputError, match=r"^worth: expected None for an agent without a learned map"):
+        agent.explore(image, worth=0.1)
+    assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, worth=0).ending == "shifts"
     assert agent.explore(image, shifts=50).ending == "cells"
 
 
-@pytest.mark.parametrize("until", [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400])
-def test_invalid_prices_are_refused(model, image, until):
-    with pytest.raises(InputError, match="until: expected 0 or more cells"):
-        agent_of(model).explore(image, until=until)
+@pytest.mark.parametrize("worth", [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400])
+def test_invalid_prices_are_refused(model, image, worth):
+    with pytest.raises(InputError, match="worth: expected 0 or more"):
+        agent_of(model).explore(image, worth=worth)
