@@ -7,7 +7,7 @@ import argparse
 
 import semfov
 from semfov import HeadAgent
-from semfov.head import Panorama, Panoramas
+from semfov.head import Panoramas
 from semfov.viz.head import animate_head, plot_head_path
 
 
@@ -30,9 +30,9 @@ def main() -> None:
         image = Panoramas(scenes, width=2048, count=1, seed=arguments.seed)[0].image
 
     if arguments.target is None:
-        path = agent.explore(Panorama(image), seconds=arguments.seconds)
+        path = agent.explore(semfov.Panorama(image), duration=arguments.seconds)
     else:
-        path = agent.search(Panorama(image), arguments.target, seconds=arguments.seconds)
+        path = agent.search(semfov.Panorama(image), arguments.target, duration=arguments.seconds)
 
     for number, seconds in enumerate(path.seconds):
         yaw, pitch, _ = path.pose(number).tolist()

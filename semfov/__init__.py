@@ -13,6 +13,7 @@ from semfov.episode import rollout
 from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
 from semfov.gaze import acquisition, policies, saliency
+from semfov.head import Flat, Panorama
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.paths import Scanpath
 from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
@@ -36,12 +37,14 @@ __all__ = [
     "EmbeddedScenes",
     "Eye",
     "FovealObservationModel",
+    "Flat",
     "Foveation",
     "Grid",
     "HeadAgent",
     "InputError",
     "MapEvidence",
     "Objects",
+    "Panorama",
     "Scanpath",
     "Selection",
     "SemfovError",

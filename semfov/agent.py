@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from os import PathLike, fspath
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 from torch import Tensor, nn
 
@@ -24,6 +24,7 @@ from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
+from semfov.head.camera import PanTiltCamera, is_scene, open_scene
 from semfov.head.world import World
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
@@ -41,8 +42,9 @@ KindOfLook = Literal["fovea", "windows", "head"]
 How = Literal["auto", "fovea", "windows", "head"]
 """KindOfLook of look, or `auto` for the one that suits the picture."""
 
-PictureLike = ImageLike | LargePicture | World
-"""A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene."""
+PictureLike = ImageLike | LargePicture | World | PanTiltCamera
+"""A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
+`semfov.Panorama`, a `semfov.Flat`, or a camera that turns."""
 
 Targets = str | int | Sequence[str | int] | None
 """A class by name or index, several of them, or None for all classes."""
@@ -248,7 +250,7 @@ class ActivePerception(nn.Module):
             InputError: the kind is unknown, or does not suit a scene.
         """
         how = lookup(how, get_args(How), "kind of look")
-        if isinstance(picture, World):
+        if is_scene(picture):
             check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
             return "head"
         if how != "auto":
@@ -257,7 +259,11 @@ class ActivePerception(nn.Module):
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            return "windows" if pays(picture_size(picture), self.eye.detector.input_size) else "fovea"
+            return (
+                "windows"
+                if pays(picture_size(cast(ImageLike | LargePicture, picture)), self.eye.detector.input_size)
+                else "fovea"
+            )
         return "fovea"
 
     def search(
@@ -411,7 +417,7 @@ class ActivePerception(nn.Module):
             one = targets[0] if len(targets) == 1 else None
             return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
-            return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))  # type: ignore[operator]
+            return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))  # type: ignore[arg-type]
 
@@ -521,12 +527,11 @@ class ActivePerception(nn.Module):
 
     def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
         """The picture of a fovea, `(1, 3, H, W)`."""
-        assert not isinstance(picture, World)
         like = self.eye.sensor.like
         if isinstance(picture, LargePicture):
             pixels = picture.read((0, 0, *picture.size))
             return as_image(pixels, like=like, argument="picture")[None]
-        return as_image(picture, like=like, argument="picture", color=color)[None]
+        return as_image(cast(ImageLike, picture), like=like, argument="picture", color=color)[None]
 
     def _check_parts(self) -> None:
         """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
@@ -571,11 +576,9 @@ def _classes(target: Targets, classes: Sequence[str]) -> tuple[int, ...]:
 
 def _large(picture: PictureLike, color: Color) -> LargePicture:
     """The picture of windows."""
-    assert not isinstance(picture, World)
-    return open_large(picture, color=color)
+    return open_large(cast(ImageLike | LargePicture, picture), color=color)
 
 
 def _scene(picture: PictureLike, color: Color) -> World:
     """The scene of a head."""
-    assert isinstance(picture, World)
-    return picture
+    return open_scene(picture, color)

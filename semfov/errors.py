@@ -92,6 +92,21 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     check(False, argument, f"a tensor of shape (..., {wanted})", tuple(tensor.shape))
 
 
+def check_tensor(value: object, argument: str) -> None:
+    """Raise `InputError` unless a value is a tensor; the message has the call that converts it.
+
+    Args:
+        value: the value.
+        argument: name of the argument, for the message.
+
+    >>> check_tensor([1.0], "beta")
+    Traceback (most recent call last):
+    semfov.errors.InputError: beta: expected a tensor, got a list; give torch.as_tensor(beta)
+    """
+    got = f"a {type(value).__name__}; give torch.as_tensor({argument})"
+    check(isinstance(value, Tensor), argument, "a tensor", got.replace("a ndarray", "a NumPy array"))
+
+
 def check_whole(value: object, argument: str, low: int, high: int) -> None:
     """Raise `InputError` unless a value is a whole number in a range.
 

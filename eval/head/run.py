@@ -21,11 +21,12 @@ from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
-from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, LookGain, PerPrice, Scan, SearchGain
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, LookGain, PerSecond, Scan, SearchGain
 from semfov.head.panoramas import Panoramas
+from semfov.head.scenes import Boxes, Flat, Panorama
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
-from semfov.head.world import Boxes, Flat, Panorama, Places, World
+from semfov.head.world import Places, World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
@@ -137,8 +138,10 @@ class HeadRun(SceneRun):
 
     def world(self, index: int) -> World:
         """The scene as a world in which the head looks around."""
-        image = self.scenes[index].image
-        return Panorama(image) if self.config.scene == "panorama" else Flat(image, degree=image.shape[-1] / MOSAIC)
+        image, speeds = self.scenes[index].image, self.config.speeds
+        if self.config.scene == "panorama":
+            return Panorama(image, speeds=speeds)
+        return Flat(image, speeds=speeds, degree=image.shape[-1] / MOSAIC)
 
     def places(self, index: int) -> Places:
         """The places of the scene's objects."""
@@ -175,9 +178,9 @@ class HeadRun(SceneRun):
         order = tiling_order(views, pose)
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
-            OURS: lambda action: PerPrice(gain, config.speeds, action),
-            "ours, half a view apart": lambda action: PerPrice(gain, config.speeds, action, range(len(views))),
-            "ours, blind to prices": lambda action: PerPrice(gain, None, action),
+            OURS: lambda action: PerSecond(gain, config.speeds, action),
+            "ours, half a view apart": lambda action: PerSecond(gain, config.speeds, action, range(len(views))),
+            "ours, blind to time": lambda action: PerSecond(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),
             "random head and eye": lambda action: Anywhere(views),
@@ -230,8 +233,8 @@ class HeadRun(SceneRun):
     def _steps(self, views, looks, observer, acquire, start, target, index):  # type: ignore[no-untyped-def]
         config = self.config
         return look_around(
-            views, looks, observer, acquire, start, target=target, speeds=config.speeds, passes=config.passes,
-            seconds=config.seconds, seed=[config.seed, index, target or 0],
+            views, looks, observer, acquire, start, target=target, passes=config.passes, duration=config.seconds,
+            seed=[config.seed, index, target or 0],
         )  # fmt: skip
 
     def _explorations(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:

@@ -1,28 +1,27 @@
 """An agent that moves its eye and turns its head."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index
-from semfov.decision import Decision, conclude, place_known, settle
-from semfov.detection.detections import Detections
+from semfov.data.inputs import Color
+from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
 from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
-from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.head.belief import SceneObserver
+from semfov.head.belief import SceneBelief, SceneObserver
+from semfov.head.camera import SceneLike, open_scene
 from semfov.head.episode import HeadStep, live, look_around
-from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, PerPrice, SearchGain
-from semfov.head.speeds import Speeds
+from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
-from semfov.head.world import World
 from semfov.io.compatibility import learned_for
 from semfov.io.shipped import shipped_model
 from semfov.paths import Ending, HeadPath
@@ -31,6 +30,12 @@ from semfov.sensor.foveation import Foveation
 SIGMA = 100.0
 """Width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels."""
 
+PASSES = 40
+"""Default of the largest number of looks."""
+
+DURATION = 30.0
+"""Default time limit of a scene in seconds."""
+
 CONFIRM = 0.7
 """Probability of the target in the fixated cell at which a search ends as found."""
 
@@ -38,50 +43,33 @@ CONFIRM = 0.7
 class HeadAgent(nn.Module):
     """An agent that looks around in a scene larger than its eye's field of view, and turns its head where that pays.
 
+    A scene is a `semfov.Panorama`, a `semfov.Flat`, a camera of your own (`semfov.head.PanTiltCamera`), or a picture of
+    any common kind, which is a panorama if it is twice as wide as high. The scene has the fields of view and the speeds
+    of eye and head. The belief is about directions, so that it survives turns of the head.
+
     Args:
         eye: sensor and detector.
         search: evidence model for a target.
         explore: evidence model for a map.
-        speeds: of eye and head.
-        fields: fields of view in degrees, narrowest first.
 
     Example::
 
         agent = HeadAgent.recommended("yolox-nano")
-        path = agent.search(Panorama("street.jpg"), "bicycle")
+        path = agent.search("street.jpg", "bicycle")
         print(path, path.gaze(-1))
     """
 
-    def __init__(
-        self,
-        eye: Eye,
-        search: TargetEvidence,
-        explore: MapEvidence,
-        *,
-        speeds: Speeds | None = None,
-        fields: Sequence[float] = (60.0,),
-    ) -> None:
+    def __init__(self, eye: Eye, search: TargetEvidence, explore: MapEvidence) -> None:
         super().__init__()
         self.eye = eye
         self.target_evidence, self.map_evidence = search, explore
-        self.speeds = Speeds() if speeds is None else speeds
-        self.fields = tuple(fields)
 
     @classmethod
-    def recommended(
-        cls,
-        name: str = "yolov3-tiny",
-        *,
-        speeds: Speeds | None = None,
-        fields: Sequence[float] = (60.0,),
-        **options: Any,
-    ) -> Self:
+    def recommended(cls, name: str = "yolov3-tiny", **options: Any) -> Self:
         """Make the agent with the models that are shipped for a detector, as `ActivePerception.recommended` does.
 
         Args:
             name: `yolov3-tiny` or `yolox-nano`.
-            speeds: of eye and head.
-            fields: fields of view in degrees, narrowest first.
             options: options of `semfov.load_detector`.
 
         Returns:
@@ -96,146 +84,247 @@ class HeadAgent(nn.Module):
         models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
         for model in models:
             model.check_compatible(eye.settings())
-        return cls(eye, *models, speeds=speeds, fields=fields).eval().requires_grad_(False)
+        return cls(eye, *models).eval().requires_grad_(False)
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
         return ("background", *self.eye.detector.classes)
 
-    def views(self, world: World) -> Views:
+    def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
         """The views and fixations that are possible in a scene.
 
         Args:
-            world: the scene.
+            scene: the scene (`semfov.head.open_scene`).
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
-            Views with the agent's fields of view and fovea.
+            Views with the scene's fields of view and the agent's fovea.
         """
-        return Views(world, self.fields, fovea=SIGMA / self.eye.reference)
+        return Views(open_scene(scene, color), fovea=SIGMA / self.eye.reference)
 
     def search(
         self,
-        world: World,
+        scene: SceneLike,
         target: str | int,
         *,
+        passes: int | None = None,
+        seconds: float | None = None,
+        duration: float = DURATION,
+        on_look: OnLook | None = None,
         start: int | None = None,
-        passes: int = 40,
-        seconds: float = 30.0,
-        confirm: float = CONFIRM,
+        confirm: float | None = None,
+        give_up: float | None = None,
         foresight: float = FORESIGHT,
         prior: float = PRIOR,
         seed: int = 0,
+        color: Color = "rgb",
     ) -> HeadPath:
-        """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerPrice`).
+        """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
 
-        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`. A search
-        that ends without it decides that the target is absent if every cell that can be seen was fixated, or is less
-        probable than one that was never seen, and no cell holds the target with a probability of one half.
-        Otherwise it is undecided (`semfov.decision.settle`).
+        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`. It is
+        absent if every cell that can be seen was fixated, or is less probable than `give_up`, and no cell holds it with
+        a probability of one half. Both end the search. A search that a limit ends is undecided
+        (`semfov.decision.settle`).
 
         Args:
-            world: the scene, a `semfov.head.Panorama` or `Flat`.
+            scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
             target: name or index (1..K) of the class.
+            passes: largest number of looks; None takes 40.
+            seconds: time in seconds that looks may take on this machine; None for no limit.
+            duration: time limit of the scene in seconds, for the movements of eye and head and the looks, as its
+                `speeds` have it; a look that would end later is not taken.
+            on_look: called after each look with the record so far; returning False ends the search.
             start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
-            passes: largest number of looks.
-            seconds: time limit in seconds; a look that would end later is not taken.
-            confirm: probability at which the search ends as found.
+            confirm: probability at which the search ends as found; None takes 0.7.
+            give_up: probability below which a cell is not worth a look; None takes `prior`.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
             prior: probability that a cell that was never seen holds the target.
             seed: of the generator that breaks ties.
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
-            The record of the search.
+            The record of the search, with its decision.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
+            DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
         index = class_index(target, self.classes[1:], "target")
-        check_number(confirm, "confirm", 0, 1)
+        check_thresholds(confirm, give_up)
         check_number(foresight, "foresight", 0, 1e6)
-        views = self.views(world)
-        gain = SearchGain(views, foresight)
-        observer = SceneObserver(Target(self.target_evidence), views, prior=prior)
-        acquire: Callable[[int], AcquisitionFunction] = lambda action: PerPrice(gain, self.speeds, action)  # noqa: E731
-        thresholds = Thresholds(confirm, prior, confirm)
-        return self._look(views, observer, acquire, index, start, passes, seconds, thresholds, seed)
+        limits = self._limits(passes, seconds, on_look)
+        views = self.views(scene, color)
+        gain, observer = SearchGain(views, foresight), SceneObserver(Target(self.target_evidence), views, prior=prior)
+        sure = CONFIRM if confirm is None else confirm
+        thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
+        return self._look(observer, gain, index, start, limits, duration, seed, thresholds=thresholds)
 
-    def explore(
-        self, world: World, *, start: int | None = None, passes: int = 40, seconds: float = 30.0, seed: int = 0
+    def find_all(
+        self,
+        scene: SceneLike,
+        target: str | int | Sequence[str | int] | None = None,
+        *,
+        passes: int | None = None,
+        seconds: float | None = None,
+        duration: float = DURATION,
+        on_look: OnLook | None = None,
+        worth: float = 0.0,
+        start: int | None = None,
+        seed: int = 0,
+        color: Color = "rgb",
     ) -> HeadPath:
-        """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerPrice`).
+        """Find all objects of a class, of several, or of all: an exploration whose record is about them.
 
         Args:
-            world: the scene, a `semfov.head.Panorama` or `Flat`.
+            scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
+            target: name or index (1..K) of the class, or several of them; None for all classes.
+            passes: largest number of looks; None takes 40.
+            seconds: time in seconds that looks may take on this machine; None for no limit.
+            duration: time limit of the scene in seconds, as for `search`.
+            on_look: called after each look with the record so far; returning False ends it.
+            worth: least gain for which a look is worth it, as for `explore`.
             start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
-            passes: largest number of looks.
-            seconds: time limit in seconds; a look that would end later is not taken.
             seed: of the generator that breaks ties.
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
+
+        Returns:
+            The record, with the objects.
+
+        Raises:
+            InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
+            DataError: a file cannot be read, or the camera gives no frame from the right direction.
+        """
+        wanted = [] if target is None else [target] if isinstance(target, str | int) else [*target]
+        indices = tuple(dict.fromkeys(class_index(each, self.classes[1:], "target") for each in wanted))
+        limits = self._limits(passes, seconds, on_look)
+        return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
+
+    def explore(
+        self,
+        scene: SceneLike,
+        *,
+        passes: int | None = None,
+        seconds: float | None = None,
+        duration: float = DURATION,
+        on_look: OnLook | None = None,
+        worth: float = 0.0,
+        start: int | None = None,
+        seed: int = 0,
+        color: Color = "rgb",
+    ) -> HeadPath:
+        """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
+
+        Args:
+            scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
+            passes: largest number of looks; None takes 40.
+            seconds: time in seconds that looks may take on this machine; None for no limit.
+            duration: time limit of the scene in seconds, as for `search`.
+            on_look: called after each look with the record so far; returning False ends the exploration.
+            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
+            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            seed: of the generator that breaks ties.
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
             The record of the exploration.
 
         Raises:
             InputError: an argument is out of range.
+            DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        views = self.views(world)
+        limits = self._limits(passes, seconds, on_look)
+        return self._explore(self.views(scene, color), (), start, limits, duration, worth, seed)
+
+    def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
+        return EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
+
+    def _explore(
+        self,
+        views: Views,
+        targets: tuple[int, ...],
+        start: int | None,
+        limits: EpisodeLimits,
+        duration: float,
+        worth: float,
+        seed: int,
+    ) -> HeadPath:
+        check_number(worth, "worth", 0, float("inf"))
         gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
-        acquire: Callable[[int], AcquisitionFunction] = lambda action: PerPrice(gain, self.speeds, action)  # noqa: E731
-        return self._look(views, observer, acquire, None, start, passes, seconds, None, seed)
+        target = targets[0] if len(targets) == 1 else None
+        return self._look(observer, gain, target, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()
     def _look(
         self,
-        views: Views,
         observer: SceneObserver,
-        acquire: Callable[[int], AcquisitionFunction],
+        gain: LookGain,
         target: int | None,
         start: int | None,
-        passes: int,
-        seconds: float,
-        thresholds: Thresholds | None,
+        limits: EpisodeLimits,
+        duration: float,
         seed: int,
+        *,
+        worth: float = 0.0,
+        thresholds: Thresholds | None = None,
     ) -> HeadPath:
-        check_whole(passes, "passes", 1, 1_000_000)
-        check_number(seconds, "seconds", 0, float("inf"))
+        """Look around until a decision or a limit."""
+        check_number(duration, "duration", 0, float("inf"))
         check_whole(seed, "seed", 0, 2**63 - 1)
+        views = observer.views
         middle = views.tiling[0][len(views.tiling[0]) // 2]
         first = middle[len(middle) // 2] * views.cells + views.cells // 2 + 5 if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
-        actions, times, seen, maps = list[int](), list[float](), list[Detections](), list[Tensor]()
-        decision, found = None, False
+        steps, maps = list[HeadStep](), list[Tensor]()
+        decision: Decision | None = None
+        ending: Ending | None = None
+
+        def record() -> HeadPath:
+            return HeadPath(
+                views=views,
+                target=target,
+                classes=self.classes,
+                actions=tuple(step.action for step in steps),
+                seconds=tuple(step.seconds for step in steps),
+                detections=tuple(step.detections for step in steps),
+                maps=torch.stack(maps),
+                found=decision is not None and decision.outcome == "found",
+                decision=decision,
+                ending=ending,
+            )
+
         for step in look_around(
-            views, live(self.eye, views), observer, acquire, first,
-            target=target, speeds=self.speeds, passes=passes, seconds=seconds, seed=seed,
+            views, live(self.eye, views), observer, lambda action: PerSecond(gain, views.world.speeds, action), first,
+            target=target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
         ):  # fmt: skip
-            belief = step.belief
-            told = 1 - belief.class_probabilities()[0, :, 0] if target is None else belief.probability(target)[0]
-            unseen = belief.owner[0] < 0
-            maps.append(told.masked_fill(unseen, 0.0) if target is None else told)
-            actions.append(step.action)
-            times.append(step.seconds)
-            seen.append(step.detections)
-            if target is not None and thresholds is not None:
+            steps.append(step)
+            maps.append(probabilities_of(step.belief, target))
+            if thresholds is not None and target is not None:
                 decision = decide_look(views, step, target, thresholds)
-                found = decision.outcome == "found"
-            if found:
-                break
-        ending: Ending = "decision" if found else "passes" if len(actions) == passes else "duration"
-        if not found and len(actions) == len(views.grid):
+            reached = limits.reached(len(steps), record)
+            ending = "decision" if decision is not None and decision.outcome != "undecided" else reached
+            if ending is not None:
+                return record()
+        if len(steps) == len(views.grid):
             ending = "cells"
-        return HeadPath(
-            views=views,
-            target=target,
-            classes=self.classes,
-            actions=tuple(actions),
-            seconds=tuple(times),
-            detections=tuple(seen),
-            maps=torch.stack(maps),
-            found=found,
-            decision=decision,
-            ending=ending,
-        )
+        else:
+            ending = "duration" if step.seconds + step.ahead > duration else "worth"
+        return record()
+
+
+def probabilities_of(belief: SceneBelief, target: int | None) -> Tensor:
+    """Probability that each cell of a scene holds the target, `(S,)`; or any object, where the cell was seen.
+
+    Args:
+        belief: about the scene.
+        target: class 1..K; None for any object.
+
+    Returns:
+        `(S,)`.
+    """
+    if target is not None:
+        return belief.probability(target)[0]
+    return (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
 
 
 def decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape, lookup, values_known
+from semfov.errors import check, check_shape, check_tensor, lookup, values_known
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
 
@@ -154,13 +154,14 @@ def check_parameters(beta: Tensor) -> None:
         beta: `(...)`, the parameters.
 
     Raises:
-        InputError: one is not.
+        InputError: one is not, or they are not a tensor.
 
     >>> check_parameters(torch.tensor([1.0, 0.0]))
     Traceback (most recent call last):
     ...
     semfov.errors.InputError: beta: expected positive, finite Dirichlet parameters, got 0 to 1
     """
+    check_tensor(beta, "beta")
     if not beta.numel() or not values_known(beta):
         return
     # The minimum and the maximum of a tensor with a NaN are NaN.
@@ -179,11 +180,12 @@ def scale_likelihood(likelihood: Tensor) -> Tensor:
         `(..., K+1)`, scaled.
 
     Raises:
-        InputError: a row is zero, or a likelihood is negative or not finite.
+        InputError: a row is zero, a likelihood is negative or not finite, or they are not a tensor.
 
     >>> scale_likelihood(torch.tensor([0.1, 0.4]))
     tensor([0.2500, 1.0000])
     """
+    check_tensor(likelihood, "likelihood")
     largest = likelihood.amax(-1, keepdim=True)
     if values_known(likelihood) and likelihood.numel():
         # NaN and infinity pass through the maximum and the minimum, so two reductions check every condition.

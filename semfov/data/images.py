@@ -17,6 +17,7 @@ MAX_PIXELS = 89_478_485
 """Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
 
 _ORIENTATION_TAG = 0x0112
+_PHOTOMETRIC_TAG = 0x0106
 # Moves that turn a picture with this orientation upright. All are their own inverse except 6 and 8, which are inverse
 # to each other.
 _MOVES = {
@@ -176,8 +177,11 @@ def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
 def _pixels(image: Any, name: str, *, upright: bool) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
     stored = orientation(image)
+    # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
+    inverted = image.mode in _SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
     image.load()
-    return _rgb(turned(image, stored, orientation(image), upright=upright), name)
+    pixels = _rgb(turned(image, stored, orientation(image), upright=upright), name)
+    return 1 - pixels if inverted else pixels
 
 
 def _rgb(image: Any, name: str) -> NDArray[np.float32]:

@@ -25,6 +25,9 @@ PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
 
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
+STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")
+"""Kinds of addresses of cameras and streams."""
+
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
@@ -128,7 +131,7 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
     if isinstance(image, np.ndarray):
         return _from_numpy(image, argument)
     if isinstance(image, str | PathLike):
-        check("://" not in str(image), argument, "a file on this machine", f"{str(image)!r}; download it first")
+        check_local(image, argument)
         return read_image(image)
     from PIL.Image import Image
 
@@ -141,6 +144,20 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
     elif isinstance(image, Sequence):
         got = f"a {got}; give pictures one by one"
     raise InputError(f"{argument}: expected {expected}, got {got}")
+
+
+def check_local(path: str | PathLike[str], argument: str) -> None:
+    """Raise `InputError` for an address, which is no file on this machine.
+
+    Args:
+        path: the path or address.
+        argument: name of the argument, for the message.
+
+    >>> check_local("kitchen.jpg", "image")
+    """
+    kind, separator, _ = str(path).partition("://")
+    remedy = "it is a stream; use live, or semfov.data.sources.open_stream" if kind in STREAMS else "download it first"
+    check(not separator, argument, "a file on this machine", f"an address, {kind}://…; {remedy}")
 
 
 def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = True) -> Tensor:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
-from semfov.data.inputs import Color, ImageLike, as_image, channels_first, in_rgb, pixels_of
+from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.reduction import FIRST, LARGE, PixelBox, ReducedCopies, bytes_of, reduction_for
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _TILED = (".tif", ".tiff")
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
+_WHITE_IS_ZERO, _PALETTE = 0, 3  # photometric interpretations of a TIFF
 
 
 class LargePicture(ABC):
@@ -202,15 +203,16 @@ class PhotographPicture(LargePicture):
 
 
 class TiffPicture(LargePicture):
-    """An 8-bit TIFF, read tile by tile (or strip by strip) through `tifffile`.
+    """A TIFF of 8 or 16 bits, read tile by tile (or strip by strip) through `tifffile`.
 
-    Only the tiles that overlap a window are decoded, one at a time.
+    Only the tiles that overlap a window are decoded, one at a time. Those of 16 bits are scaled by their white, 65535,
+    to 8 bits.
 
     Args:
         path: the file; its first page is read.
 
     Raises:
-        DataError: `tifffile` is not installed, or the page is not grey or RGB with 8 bits.
+        DataError: `tifffile` is not installed, or the page is not grey or RGB with 8 or 16 bits.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -224,10 +226,11 @@ class TiffPicture(LargePicture):
             weakref.finalize(self, self._file.close)
             page: Any = self._file.pages[0]
             shape = page.shape
-        fits = page.dtype == np.uint8 and (len(shape) == 2 or (len(shape) == 3 and shape[2] in (3, 4)))
-        if not fits or page.planarconfig not in (None, 1):
-            got = f"{page.dtype} {shape}"
-            raise DataError(f"{path}: expected grey or RGB with 8 bits and interleaved channels, got {got}; convert it")
+        fits = page.dtype in (np.uint8, np.uint16) and (len(shape) == 2 or (len(shape) == 3 and shape[2] in (3, 4)))
+        if not fits or page.planarconfig not in (None, 1) or page.photometric == _PALETTE:
+            got = "a palette" if page.photometric == _PALETTE else f"{page.dtype} {shape}"
+            expected = "grey or RGB with 8 or 16 bits and interleaved channels"
+            raise DataError(f"{path}: expected {expected}, got {got}; convert it")
         self._page = page
         self.size = shape[1], shape[0]
 
@@ -260,15 +263,21 @@ class TiffPicture(LargePicture):
             columns = slice(max(x1 - left, 0), min(x2 - left, tile.shape[1]))
             at = slice(top + rows.start - y1, top + rows.stop - y1)
             along = slice(left + columns.start - x1, left + columns.stop - x1)
-            window[at, along] = tile[rows, columns, : min(3, tile.shape[-1])]
+            window[at, along] = self._bytes(tile[rows, columns, : min(3, tile.shape[-1])])
         return window
+
+    def _bytes(self, tile: NDArray[Any]) -> NDArray[np.uint8]:
+        """Grey or RGB bytes, in which 0 is black."""
+        if tile.dtype == np.uint16:
+            tile = ((tile.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+        return 255 - tile if self._page.photometric == _WHITE_IS_ZERO else tile
 
 
 def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> LargePicture:
     """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
-    Files `.tif` and `.tiff` are read tile by tile. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the
-    windows of a `numpy.memmap` are read.
+    Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, else as other photographs. Arrays of
+    bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows of a `numpy.memmap` are read.
 
     Args:
         source: the picture.
@@ -286,10 +295,23 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
         return ArrayPicture(source[..., ::-1] if color == "bgr" and source.ndim == 3 else source)
     if not isinstance(source, str | PathLike):
         return MemoryPicture(source, color=color)
-    check("://" not in str(source), "picture", "a file on this machine", f"{str(source)!r}; download it first")
+    check_local(source, "picture")
     if Path(source).suffix.lower() in _TILED:
-        return TiffPicture(source)
+        return _tiff(source)
     return PhotographPicture(source)
+
+
+def _tiff(path: str | PathLike[str]) -> LargePicture:
+    """A TIFF read tile by tile, or as a photograph if `tifffile` is missing or leaves such files to Pillow."""
+    try:
+        return TiffPicture(path)
+    except DataError as error:
+        try:
+            photograph = PhotographPicture(path)
+            photograph.read((0, 0, 1, 1))
+        except DataError:
+            raise error from None
+        return photograph
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,9 +14,9 @@ from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.head.belief import SceneBelief, SceneObserver
-from semfov.head.speeds import Speeds
+from semfov.head.gain import OUT
 from semfov.head.views import Views
-from semfov.head.world import Places
+from semfov.head.world import Places, World
 
 Detect = Callable[[int], Detections]
 """Maps an action to its detections, a batch of one with boxes in pixels of the view."""
@@ -46,7 +46,11 @@ class HeadLooks(Looks):
 
 
 def live(eye: Eye, views: Views) -> Detect:
-    """Detections of an eye, computed when they are asked for; the view of the last pose is kept for the next look.
+    """Detections of an eye, computed when they are asked for.
+
+    The view of the last pose is kept for the next look at a picture; a camera takes a new frame for each look. If a
+    frame was taken from a pose beside the one that was asked for, the eye fixates the same point of the scene, and the
+    boxes are moved to where the view from the right pose would show them.
 
     Args:
         eye: sensor and detector.
@@ -55,16 +59,45 @@ def live(eye: Eye, views: Views) -> Detect:
     Returns:
         A function that maps an action to its detections.
     """
+    world = views.world
     opened: tuple[int, View] | None = None
 
     def detect(action: int) -> Detections:
         nonlocal opened
-        pose, cell = divmod(action, views.cells)
-        if opened is None or opened[0] != pose:
-            opened = pose, eye.open(views.world.view(views.poses[pose])[None])
-        return eye.look(opened[1], views.view_grid.centres[cell][None])
+        number, cell = divmod(action, views.cells)
+        pose = views.poses[number]
+        if opened is not None and opened[0] == number and world.still:
+            return eye.look(opened[1], views.view_grid.centres[cell][None])
+        image, at = world.view(pose)
+        opened = number, eye.open(image[None])
+        if at is pose:
+            return eye.look(opened[1], views.view_grid.centres[cell][None])
+        seen = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0])
+        return replace(seen, boxes=boxes_from(world, seen.boxes, at, pose))
 
     return detect
+
+
+def boxes_from(world: World, boxes: Tensor, at: Tensor, pose: Tensor) -> Tensor:
+    """Smallest boxes in the view from one pose around boxes in the view from another pose nearby.
+
+    Args:
+        world: the scene.
+        boxes: `(..., 4)`, in pixels of the view from `at`.
+        at: `(3,)`, pose in which the boxes were seen.
+        pose: `(3,)`, pose in whose view they are wanted.
+
+    Returns:
+        `(..., 4)`, in pixels of the view from `pose`.
+
+    >>> from semfov.head import Panorama
+    >>> world, box = Panorama((360, 180), (100, 100)), torch.tensor([[40.0, 40, 60, 60]])
+    >>> boxes_from(world, box, torch.tensor([10.0, 0, 60]), torch.tensor([0.0, 0, 60])).round()
+    tensor([[55., 40., 76., 60.]])
+    """
+    corners = boxes[..., [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2) - 0.5
+    moved = world.to_view(world.to_scene(corners, at), pose)[0].view(*boxes.shape[:-1], 4, 2) + 0.5
+    return torch.cat([moved.amin(-2), moved.amax(-2)], -1)
 
 
 @dataclass(frozen=True)
@@ -76,12 +109,16 @@ class HeadStep:
         seconds: time since the start, this look included.
         belief: after the look.
         detections: a batch of one, with boxes in pixels of the view.
+        gain: expected gain per second for which the look was chosen; infinite for the first look.
+        ahead: seconds that the next look would take.
     """
 
     action: int
     seconds: float
     belief: SceneBelief
     detections: Detections
+    gain: float = math.inf
+    ahead: float = 0.0
 
 
 def look_around(
@@ -92,9 +129,9 @@ def look_around(
     start: int,
     *,
     target: int | None = None,
-    speeds: Speeds | None = None,
     passes: int = 100,
-    seconds: float = math.inf,
+    duration: float = math.inf,
+    worth: float = 0.0,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
     """Run an episode and yield its looks one by one; the caller may stop at any time.
@@ -106,22 +143,22 @@ def look_around(
         acquire: makes the acquisition function that chooses the action after a given one.
         start: first action.
         target: class that is searched for.
-        speeds: of eye and head.
         passes: largest number of looks.
-        seconds: time limit; a look that would end later is not taken.
+        duration: time limit of the scene, in seconds of its `speeds`; a look that would end later is not taken.
+        worth: least gain for which a look is taken, in the unit of the acquisition function times seconds.
         seed: of the generator that breaks ties.
 
     Yields:
         Each look, with the belief after it.
     """
-    speeds = Speeds() if speeds is None else speeds
+    speeds = views.world.speeds
     numbers = [seed] if isinstance(seed, int) else [*seed]
     generator = torch.Generator().manual_seed(hash_of(numbers))
     looks = HeadLooks(views, detect, target)
-    spent, last = speeds.look, start
+    spent, ahead, gain = speeds.look, 0.0, math.inf
 
     def ends(step: Step) -> Tensor:
-        return torch.tensor([spent + float(views.prices(last, speeds)[step.next_cell]) > seconds])
+        return torch.tensor([spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)])
 
     steps = rollout(
         looks,
@@ -134,11 +171,10 @@ def look_around(
     )
     for step in steps:
         action = int(step.cell)
-        if step.shift:
-            spent += float(views.prices(last, speeds)[action])
-        last = action
+        spent, chosen = spent + ahead, gain
+        ahead, gain = float(views.durations(action, speeds)[step.next_cell]), float(step.values[0, step.next_cell])
         assert isinstance(step.belief, SceneBelief)
-        yield HeadStep(action, spent, step.belief, step.detections)
+        yield HeadStep(action, spent, step.belief, step.detections, chosen, ahead)
 
 
 def hash_of(numbers: Sequence[int]) -> int:

@@ -146,12 +146,14 @@ class ExploreGain(LookGain):
         return gains
 
 
-class PerPrice(AcquisitionFunction):
+class PerSecond(AcquisitionFunction):
     """Expected gain per second, for movements of the eye and turns of the head alike.
+
+    Turns of the head within the dead zone of its speeds are not made.
 
     Args:
         gain: expected gain of a look.
-        speeds: of eye and head; None takes the gain alone, whatever the movement costs.
+        speeds: of eye and head; None takes the gain alone, however long the movement takes.
         action: the present action (`Views`).
         poses: numbers of the poses that the head may turn to; None takes those whose views tile the scene.
 
@@ -160,7 +162,7 @@ class PerPrice(AcquisitionFunction):
     >>> from semfov.head import Flat, SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
     >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
-    >>> acquisition = PerPrice(SearchGain(views), Speeds(), action=0)
+    >>> acquisition = PerSecond(SearchGain(views), Speeds(), action=0)
     >>> values = acquisition(belief, torch.zeros(1, 900, dtype=torch.bool))
     >>> int((values > OUT).sum())  # 4 of the 9 poses tile the scene
     400
@@ -176,10 +178,12 @@ class PerPrice(AcquisitionFunction):
         """Values `(1, A)`."""
         views = self.gain.views
         values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
-        if self.speeds is not None:
-            values = values / views.prices(self.action, self.speeds)
         allowed = torch.zeros(len(views), dtype=torch.bool)
         allowed[self.poses] = True
+        if self.speeds is not None:
+            values = values / views.durations(self.action, self.speeds)
+            here = views.poses[self.action // views.cells]
+            allowed &= self.speeds.worthwhile(views.world.turn(here.expand_as(views.poses), views.poses))
         return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]
 
 

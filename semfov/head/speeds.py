@@ -20,7 +20,8 @@ class Speeds:
 
     .. math:: t = 2 \sqrt{A / a} \ \text{ for } A \le v^2 / a, \quad \text{else } \frac{A}{v} + \frac{v}{a}
 
-    Eye, head and zoom move at the same time, and the look follows when all have arrived.
+    Eye, head and zoom move at the same time, and the look follows when all have arrived. After a movement of the head
+    or of the zoom it also waits until a frame is sharp and has reached this machine.
 
     Attributes:
         look: duration of a fixation with its pass of the detector, in seconds.
@@ -29,6 +30,8 @@ class Speeds:
         head: v, degrees per second.
         acceleration: a, degrees per second squared.
         zoom: seconds for each doubling or halving of the field of view.
+        settle: seconds from the end of a movement of head or zoom to a frame that shows its result.
+        dead_zone: degrees; a smaller turn of the head is not made.
 
     >>> speeds = Speeds()
     >>> round(float(speeds.saccade(torch.tensor(10.0))), 3), round(float(speeds.turn(torch.tensor(90.0))), 3)
@@ -41,9 +44,11 @@ class Speeds:
     head: float = 100.0
     acceleration: float = 400.0
     zoom: float = 0.5
+    settle: float = 0.0
+    dead_zone: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("look", "eye_start", "eye", "zoom"):
+        for name in ("look", "eye_start", "eye", "zoom", "settle", "dead_zone"):
             check_number(getattr(self, name), name, 0, 1e6)
         for name in ("head", "acceleration"):
             check_number(getattr(self, name), name, 1e-6, 1e9)
@@ -74,8 +79,8 @@ class Speeds:
         short = 2 * (angle / self.acceleration).sqrt()
         return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
 
-    def price(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:
-        """Duration of a gaze shift and the look after it: that of the slowest movement, plus the look.
+    def duration(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:
+        """Duration of a gaze shift and the look after it: of the slowest movement, of settling, and of the look.
 
         Args:
             eye: `(...)`, amplitude of the saccade in degrees.
@@ -86,4 +91,16 @@ class Speeds:
             `(...)`, seconds.
         """
         slowest = torch.maximum(self.saccade(eye), self.turn(head))
-        return self.look + torch.maximum(slowest, self.zoom * octaves.abs())
+        moves = (head > _STILL) | (octaves.abs() > _STILL)
+        return self.look + torch.maximum(slowest, self.zoom * octaves.abs()) + self.settle * moves
+
+    def worthwhile(self, head: Tensor) -> Tensor:
+        """Which turns of the head are made: those that are not within the dead zone.
+
+        Args:
+            head: `(...)`, angles in degrees.
+
+        Returns:
+            `(...)` boolean; true also where the head stays.
+        """
+        return (head <= _STILL) | (head >= self.dead_zone)

@@ -39,7 +39,7 @@ class Views:
 
     Args:
         world: the scene.
-        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
+        fields: fields of view in degrees, narrowest first; None takes those of the scene.
         fovea: width σ of the fovea in units of a view's longer side.
 
     Attributes:
@@ -60,7 +60,8 @@ class Views:
     (9, 900, [[[0, 2], [6, 8]]])
     """
 
-    def __init__(self, world: World, fields: Sequence[float] = (60.0,), *, fovea: float = 100 / 640) -> None:
+    def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
+        fields = world.fields if fields is None else fields
         ascending = len(fields) > 0 and list(fields) == sorted(fields)
         check(ascending, "fields", "one or more fields of view in degrees, narrowest first", fields)
         check(fovea > 0, "fovea", "a positive fraction of the longer side", fovea)
@@ -171,7 +172,7 @@ class Views:
         centres = self.view_grid.centres
         return [self.world.shift(centres[:, None], centres[None], field) for field in self.fields]
 
-    def prices(self, action: int, speeds: Speeds) -> Tensor:
+    def durations(self, action: int, speeds: Speeds) -> Tensor:
         """Time from one action to each other one, the look there included.
 
         Args:
@@ -188,4 +189,4 @@ class Views:
         # The angle of the saccade is measured in the field of view of the new pose.
         which = torch.tensor([self.fields.index(float(field)) for field in self.poses[:, 2]])
         eye = torch.stack([shifts[cell] for shifts in self._shifts])[which]
-        return speeds.price(eye, head[:, None], octaves[:, None]).flatten()
+        return speeds.duration(eye, head[:, None], octaves[:, None]).flatten()

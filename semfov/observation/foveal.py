@@ -21,6 +21,7 @@ from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
 
 _MOST_TEMPERING = 100
+_MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image
 
 
 class FovealObservationModel(Pretrained):
@@ -166,10 +167,13 @@ class FovealObservationModel(Pretrained):
             `(...)` int64, from 0 (the fovea) to N - 1.
 
         Raises:
-            InputError: a distance is negative or NaN.
+            InputError: a distance is negative, NaN, or so large that it must be in pixels.
         """
         if distance.numel() and values_known(distance):
-            check(bool((distance >= 0).all()), "distance", "numbers from 0 up", "NaN or a negative number")
+            least, most = (float(bound) for bound in distance.detach().aminmax())
+            check(least >= 0, "distance", "numbers from 0 up", "NaN or a negative number")
+            got = f"{most:g}; divide distances in pixels by it"
+            check(most < _MOST_DISTANCE or most == float("inf"), "distance", "units of the image's longer side", got)
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:

@@ -64,8 +64,8 @@ class RecordedLook:
 class Record(ABC):
     """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
 
-    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts, what
-    `plot` draws, and what `objects` returns.
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts,
+    what `plot` draws, and what `objects` returns.
 
     Attributes:
         classes: names of the classes, background first.
@@ -73,7 +73,7 @@ class Record(ABC):
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
         least: score from which on objects count.
-        photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.thumbnail`); None if it was not kept.
+        photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
         source: file of the picture; None if it does not come from a file.
 
     Example::

@@ -14,8 +14,11 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
+from semfov.head.camera import CameraScene
+from semfov.head.scenes import Flat, Panorama
+from semfov.head.sphere import Sphere
 from semfov.head.views import Views
-from semfov.head.world import Flat, Panorama, Places, World
+from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
@@ -24,9 +27,10 @@ from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, 
 _BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
 
-_WORLDS: dict[str, tuple[type[Panorama] | type[Flat], tuple[str, ...]]] = {
+_WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
     "panorama": (Panorama, ("picture", "size", "cell", "reach")),
     "flat": (Flat, ("picture", "size", "cell", "degree")),
+    "camera": (Sphere, ("picture", "size", "cell", "pan", "tilt")),
 }
 _WORLD = {
     "kind": Text(tuple(_WORLDS)),
@@ -35,6 +39,8 @@ _WORLD = {
     "cell": POSITIVE,
     "reach": Number(0, 90),
     "degree": POSITIVE,
+    "pan": pair(Number()),
+    "tilt": pair(Number(-90, 90)),
 }
 
 _FORMAT = Format.of(
@@ -123,7 +129,7 @@ class HeadPath(GazeRecord):
         """
         width, height = self.views.world.size
         frame = torch.tensor([[0.0, 0.0, width, height]])
-        x1, y1, x2, y2 = self.views.world.picture_boxes(frame, self.pose(number))[0].tolist()
+        x1, y1, x2, y2 = self.views.world.boxes(frame, self.pose(number))[0].tolist()
         return x1, y1, x2, y2
 
     def pose(self, look: int) -> Tensor:
@@ -133,7 +139,7 @@ class HeadPath(GazeRecord):
             look: number of the look; negative numbers count from the end.
 
         Returns:
-            `(3,)`, as `World` defines it: the position of the window, and its field of view in degrees.
+            `(3,)`, pan to the right, tilt up, and field of view, in degrees.
         """
         return self.views.poses[self.actions[look] // self.views.cells]
 
@@ -212,7 +218,7 @@ class HeadPath(GazeRecord):
 
     def _in_picture(self, number: int) -> Detections:
         seen = self.detections[number]
-        boxes = self.views.world.picture_boxes(seen.boxes[0], self.pose(number))
+        boxes = self.views.world.boxes(seen.boxes[0], self.pose(number))
         return replace(seen, boxes=boxes[None].to(seen.boxes))
 
     def _duration(self, number: int) -> float | None:
@@ -221,7 +227,7 @@ class HeadPath(GazeRecord):
     def _confirmations(self) -> list[ConfirmedPlace]:
         decision = self.decision
         if decision is not None and decision.box is not None:
-            decision = replace(decision, box=self.views.world.picture_boxes(decision.box[None], self.pose(-1))[0])
+            decision = replace(decision, box=self.views.world.boxes(decision.box[None], self.pose(-1))[0])
         return places_confirmed(decision, self.target, self.closer, len(self) - 1)
 
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
@@ -250,10 +256,12 @@ class HeadPath(GazeRecord):
 
 def _settings(world: World) -> dict[str, Any]:
     """The geometry of a scene as JSON values."""
+    what = Sphere if isinstance(world, CameraScene) else type(world)
     for kind, (made, names) in _WORLDS.items():
-        if type(world) is made:
+        if what is made:
             return {"kind": kind, **{name: getattr(world, name) for name in names}}
-    raise InputError(f"views: expected a scene that files can describe, Panorama or Flat, got {type(world).__name__}")
+    expected = "a scene that files can describe, Panorama, Flat or that of a camera"
+    raise InputError(f"views: expected {expected}, got {type(world).__name__}")
 
 
 def _world(settings: Mapping[str, Any]) -> World:
@@ -261,5 +269,5 @@ def _world(settings: Mapping[str, Any]) -> World:
     made, names = _WORLDS[settings["kind"]]
     for name in names:
         check(name in settings, f"world.{name}", "a value", "nothing")
-    picture, size = tuple(settings["picture"]), tuple(settings["size"])
-    return made(picture, size, **{name: settings[name] for name in names[2:]})
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    return made(values["picture"], values["size"], **{name: values[name] for name in names[2:]})

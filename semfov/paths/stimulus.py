@@ -65,7 +65,7 @@ class Stimulus:
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
             canvas, placement = eye.detector.fit(image)
-            return cls(thumbnail(image[0]), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
+            return cls(reduced_copy(image[0]), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
 
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
@@ -156,7 +156,7 @@ def sensor_in_words(sensor: Mapping[str, Any]) -> str:
     return f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
 
 
-def thumbnail(picture: LargePicture | Tensor) -> Tensor:
+def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     """Reduce a picture to the bytes that a record keeps for its drawings.
 
     Args:
@@ -165,7 +165,7 @@ def thumbnail(picture: LargePicture | Tensor) -> Tensor:
     Returns:
         `(3, h, w)` uint8, with a longer side of at most `LONGEST` pixels.
 
-    >>> thumbnail(torch.rand(3, 960, 2560)).shape
+    >>> reduced_copy(torch.rand(3, 960, 2560)).shape
     torch.Size([3, 480, 1280])
     """
     if isinstance(picture, Tensor):

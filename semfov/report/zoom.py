@@ -71,7 +71,7 @@ def zoom_data(
     ... )
     >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
-    ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup found. The only pass was used.')
+    ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup from score 0.3. The only pass was used.')
     """
     source = open_large(picture)
     wide, high = path.lattice.size

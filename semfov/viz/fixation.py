@@ -20,7 +20,7 @@ from semfov.viz.drawing import (
     photograph_of,
     picture_array,
 )
-from semfov.viz.path import GazePath
+from semfov.viz.path import path_of
 from semfov.viz.scanpath import MOST_BOXES, draw_legend, draw_place
 from semfov.viz.semantic import draw_semantic_map, most_probable, write_names
 from semfov.viz.style import lay_out, make_figure, styled
@@ -118,7 +118,7 @@ class FixationFigure:
         if axes is None:
             # The layout does not change any more, and computing it again takes as long as drawing.
             self.figure.set_layout_engine("none")
-        self.path = GazePath(path, scanpath)
+        self.path = path_of(path, scanpath)
         self.changing: list[Artist] = []
 
     def show(self, fixation: int, view: Tensor) -> Figure:

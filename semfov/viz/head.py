@@ -157,7 +157,7 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
         left, right = below.subplots(1, 2, width_ratios=[1, 1.25])
-        left.imshow(picture_array(world.view(path.pose(look))))
+        left.imshow(picture_array(world.view(path.pose(look))[0]))
         x, y = path.views.view_grid.centres[action % path.views.cells].tolist()
         left.plot([x], [y], marker="+", markersize=14, color=TARGET, markeredgewidth=2)
         left.set(xticks=[], yticks=[], title="what the head sees")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from semfov.data.fixations.record import FixationValues
 from semfov.paths import Scanpath
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import LabelBox, place_numbers
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
 _POINTS = 6.5
 
 
+def path_of(axes: Axes, scanpath: Scanpath) -> GazePath:
+    """Draw the path of an episode."""
+    width, height = scanpath.grid.extent.tolist()
+    points = scanpath.fixations.detach().double().cpu().numpy()
+    return GazePath(axes, points, (width, height), found=scanpath.found)
+
+
 class GazePath:
     """Saccades as thin lines and fixations as numbered dots, from dark to bright in the order of time.
 
@@ -25,19 +33,20 @@ class GazePath:
 
     Args:
         axes: axes that hold the photograph, laid out.
-        scanpath: the episode.
+        fixations: `(n, 2)`, in pixels of the photograph, pixel centres at integers.
+        frame: `(width, height)` of the photograph.
+        found: whether the last fixation found a target.
 
     Attributes:
         numbers: text of each fixation's number; None where it did not fit.
         taken: rectangles that the numbers occupy.
     """
 
-    def __init__(self, axes: Axes, scanpath: Scanpath) -> None:
+    def __init__(self, axes: Axes, fixations: FixationValues, frame: tuple[float, float], *, found: bool) -> None:
         from matplotlib import colormaps
         from matplotlib.collections import LineCollection
 
-        self.scanpath = scanpath
-        self.path = (scanpath.fixations.detach().cpu() + 0.5).double().numpy()
+        self.path, self.frame, self.found = fixations + 0.5, frame, found
         count = len(self.path)
         self.colours = colormaps[TIME](np.linspace(0, 1, max(count, 2))[:count])
         lines = np.stack([self.path[:-1], self.path[1:]], 1)
@@ -56,8 +65,7 @@ class GazePath:
         # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
         sizes = [((0.64 * len(str(n)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale) for n in range(count)]
         points = [(float(x), float(y)) for x, y in self.path]
-        frame = self.scanpath.grid.extent.tolist()
-        places = place_numbers(points, sizes, (frame[0], frame[1]), 60 * scale)
+        places = place_numbers(points, sizes, self.frame, 60 * scale)
         self.taken: list[LabelBox] = [place for place in places if place is not None]
         written: list[Annotation | None] = []
         for number, (point, place) in enumerate(zip(points, places, strict=True)):
@@ -98,6 +106,6 @@ class GazePath:
                 text.set_visible(number <= last)
                 ends = number == last
                 box: Any = text.get_bbox_patch()
-                found = ends and self.scanpath.found and last == len(self.path) - 1
+                found = ends and self.found and last == len(self.path) - 1
                 box.set(edgecolor=FOUND if found else "white", linewidth=1.6 if ends else 0.7)
         return [*self.lines, self.dots, *(text for text in self.numbers if text is not None)]

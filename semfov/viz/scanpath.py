@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from semfov.belief.grid import Grid
+from semfov.data.fixations import Fixations
 from semfov.decision import CloseUp
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.paths import Scanpath
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
@@ -22,7 +24,7 @@ from semfov.viz.drawing import (
     photograph_of,
     seen_well,
 )
-from semfov.viz.path import GazePath
+from semfov.viz.path import GazePath, path_of
 from semfov.viz.semantic import draw_semantic_map, write_names
 from semfov.viz.style import FOUND, OTHER, TARGET, TRUTH, lay_out, make_figure, only, root, styled
 
@@ -36,7 +38,7 @@ MOST_BOXES = 6
 
 @styled
 def plot_scanpath(
-    scanpath: Scanpath,
+    scanpath: Scanpath | Fixations,
     image: Tensor | None = None,
     *,
     boxes: Tensor | None = None,
@@ -45,11 +47,12 @@ def plot_scanpath(
 ) -> Figure:
     """Plot numbered fixations on the photograph, coloured by time, with the grid and the last look's detections.
 
-    A legend explains the colours of the boxes.
+    A legend explains the colours of the boxes. Fixations of people have no grid and no detections; their target's box
+    is drawn dashed.
 
     Args:
-        scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
+        scanpath: the episode, or the fixations of a person (`semfov.data.fixations`).
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own. Fixations of people need it.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
         detections: whether to draw the detections of the last fixation.
         ax: axes to draw in; None makes a figure.
@@ -65,6 +68,8 @@ def plot_scanpath(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_scanpath(scanpath), "scanpath.pdf")
     """
+    if isinstance(scanpath, Fixations):
+        return _plot_person(scanpath, image, boxes, ax)
     image = photograph_of(scanpath, image)
     height = 6.4 * image.shape[-2] / image.shape[-1] + 0.6
     figure, (axes,) = make_figure(1, 1, width=6.4, height=height, layout="compressed", given=only(ax))
@@ -77,9 +82,31 @@ def plot_scanpath(
     axes.set_title(scanpath.describe(), parse_math=False)
     draw_legend(axes, scanpath, boxes, len(scanpath) - 1 if detections else None)
     lay_out(figure)
-    path = GazePath(axes, scanpath)
+    path = path_of(axes, scanpath)
     if detections:
         draw_detections(axes, scanpath, len(scanpath) - 1, MOST_BOXES, kept_free=path.taken)
+    return figure
+
+
+def _plot_person(fixations: Fixations, image: Tensor | None, boxes: Tensor | None, ax: Axes | None) -> Figure:
+    """Plot fixations of a person on the photograph."""
+    if image is None:
+        raise InputError("image: expected the photograph, as fixations of people hold none, got None")
+    width, height = fixations.size
+    tall = 6.4 * height / width + 0.6
+    figure, (axes,) = make_figure(1, 1, width=6.4, height=tall, layout="compressed", given=only(ax))
+    draw_image(axes, image, Grid(1, 1, fixations.size))
+    if boxes is None and fixations.box is not None:
+        boxes = Tensor([fixations.box])
+    if boxes is not None:
+        draw_boxes(axes, boxes, TRUTH, "--", 1.8)
+    title = f"{fixations.picture}, {fixations.subject}: {len(fixations)} fixations"
+    if fixations.target is not None:
+        outcome = {None: "", True: ", found", False: ", not found"}[fixations.found]
+        title = f"{fixations.picture}, {fixations.subject}: “{fixations.target}”{outcome}"
+    axes.set_title(title, parse_math=False)
+    lay_out(figure)
+    GazePath(axes, fixations.points, (width, height), found=bool(fixations.found))
     return figure
 
 
@@ -184,7 +211,7 @@ def plot_episode(
     draw_scale(list(panels.flat), drawn, "probability")
     whole = root(first)
     _label_views(whole, scanpath, zip(panels[0], shown, strict=True))
-    GazePath(first, scanpath)
+    path_of(first, scanpath)
     if scanpath.target is None:
         for below, fixation in zip(panels[1], shown, strict=True):
             write_names(below, scanpath, fixation)

@@ -5,6 +5,7 @@ Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of t
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -145,3 +146,12 @@ def test_extreme_likelihoods_stay_finite():
             beta = rule(beta, fusion.scale_likelihood(likelihood))
         assert torch.isfinite(beta).all()
         assert (beta > 0).all()
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+def test_numpy_arrays_are_refused_with_the_conversion(rule):
+    beta, likelihood = np.ones(3), np.array([0.5, 0.2, 0.3])
+    with pytest.raises(InputError, match=r"^beta: expected a tensor, got a NumPy array; give torch\.as_tensor\(beta\)"):
+        rule(beta, torch.from_numpy(likelihood))
+    with pytest.raises(InputError, match=r"^likelihood: expected a tensor, got a NumPy array"):
+        rule(torch.from_numpy(beta), likelihood)

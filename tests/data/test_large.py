@@ -1,6 +1,7 @@
 """Large pictures read window by window: every source gives the same pixels, with limited memory."""
 
 import os
+import sys
 import tracemalloc
 
 import numpy as np
@@ -149,3 +150,32 @@ def test_every_colour_mode_is_read_as_by_read_image(tmp_path, mode):
     image.save(path)
     got = open_large(path).read((0, 0, 230, 150))
     assert torch.equal(got, (read_image(path) * 255).round().byte())
+
+
+@pytest.mark.parametrize("photometric", ["minisblack", "miniswhite", "rgb"])
+def test_sixteen_bit_tiffs_are_scaled_by_their_white(tmp_path, photometric):
+    """Tile by tile and as a whole, against the values that were written."""
+    tifffile = pytest.importorskip("tifffile")
+    shape = (50, 70, 3) if photometric == "rgb" else (50, 70)
+    array = np.random.default_rng(0).integers(65536, size=shape, dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", array, tile=(16, 32), photometric=photometric, compression="zlib")
+    white = array.reshape(50, 70, -1) / 65535
+    white = 1 - white if photometric == "miniswhite" else white
+    got = open_large(tmp_path / "a.tif").pixels((3, 5, 60, 44))
+    assert np.abs(got / 255 - white[5:44, 3:60]).max() <= 0.5 / 255 + 1e-6
+    if photometric != "rgb":
+        np.testing.assert_allclose(read_image(tmp_path / "a.tif")[0].numpy(), white[..., 0], atol=1e-6)
+
+
+def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_path, monkeypatch):
+    tifffile = pytest.importorskip("tifffile")
+    array = pixels()
+    colours = Image.fromarray(array).quantize(16)
+    colours.save(tmp_path / "palette.tif")
+    expected = np.asarray(colours.convert("RGB"))
+    assert np.array_equal(open_large(tmp_path / "palette.tif").pixels((0, 0, 230, 150)), expected)
+    tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb")
+    monkeypatch.setitem(sys.modules, "tifffile", None)
+    assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)
+    with pytest.raises(DataError, match="pip install tifffile"):
+        TiffPicture(tmp_path / "a.tif")

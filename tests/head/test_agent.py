@@ -10,7 +10,7 @@ from semfov.agents.head import decide_look
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Detections
 from semfov.errors import InputError
-from semfov.head import Flat, Panorama, Speeds
+from semfov.head import Flat, Panorama
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
@@ -19,7 +19,7 @@ from semfov.viz.head import animate_head, plot_head_path
 
 @pytest.fixture
 def agent(eye, models):
-    return HeadAgent(eye, *models, speeds=Speeds(look=0.2)).eval()
+    return HeadAgent(eye, *models).eval()
 
 
 def test_boxes_are_returned_as_directions_in_the_scene(agent, panorama):
@@ -56,7 +56,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     explored = agent.explore(world, passes=3)
     assert explored.target is None
     assert len(explored) == 3
-    limited = agent.explore(world, seconds=1.0)
+    limited = agent.explore(world, duration=1.0)
     assert limited.seconds[-1] <= 1.0
 
 
@@ -77,9 +77,8 @@ def test_boxes_of_a_flat_scene_lie_around_the_object(agent):
     assert ((boxes[:, 0] > 470) & (boxes[:, 2] < 570) & (boxes[:, 1] > 170) & (boxes[:, 3] < 270)).all()
 
 
-def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama, eye, models):
-    wide = HeadAgent(eye, *models, fields=(40.0, 80.0))
-    path = wide.explore(Panorama(panorama), passes=4)
+def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama):
+    path = agent.explore(Panorama(panorama, fields=(40.0, 80.0)), passes=4)
     assert {float(path.views.poses[action // 100, 2]) for action in path.actions} <= {40.0, 80.0}
 
 

@@ -9,7 +9,7 @@ from semfov.belief.observers import LearnedMap, Target
 from semfov.episode import rollout
 from semfov.errors import InputError
 from semfov.gaze.choice import Given
-from semfov.head import ExploreGain, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
 from semfov.head.episode import HeadLooks, live, look_around, rests_on
 from semfov.head.gain import OUT
 
@@ -23,7 +23,7 @@ def episode(views, eye, observer, actions, target=None):
     looks = HeadLooks(views, live(eye, views), target)
     gain = SearchGain(views)
     steps = rollout(
-        looks, observer, lambda _, cell: PerPrice(gain, None, int(cell)), torch.tensor(actions[:1]),
+        looks, observer, lambda _, cell: PerSecond(gain, None, int(cell)), torch.tensor(actions[:1]),
         Given(torch.tensor([actions])), most=len(actions),
     ) if target else rollout(
         looks, observer, Scan(_NoGain(views), [0], 1, 0), torch.tensor(actions[:1]), Given(torch.tensor([actions])),
@@ -48,7 +48,7 @@ def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, 
     pose = pose_ahead(views)
     cells = [33, 66, 52]
     belief = episode(views, eye, SceneObserver(Target(evidence), views), [pose * 100 + c for c in cells], 3)[-1]
-    image = views.world.view(views.poses[pose])[None]
+    image = views.world.view(views.poses[pose])[0][None]
     inner, view = Target(evidence), eye.open(image)
     alone = inner.start(1, views.view_grid, image)
     for cell in cells:
@@ -129,7 +129,7 @@ def test_search_gain_equals_brute_force(views, eye, models):
         assert float(gains[action]) == pytest.approx(value, rel=1e-4, abs=1e-5)
 
 
-def test_gain_per_price_by_hand(views, eye, models):
+def test_gain_per_second_by_hand(views, eye, models):
     pose = pose_ahead(views)
     here = pose * 100 + 55
     belief = episode(views, eye, SceneObserver(Target(models[0]), views), [here], 2)[-1]
@@ -138,23 +138,24 @@ def test_gain_per_price_by_hand(views, eye, models):
     gains = gain(belief, pose, range(len(views)))
     every = range(len(views))
     torch.testing.assert_close(
-        PerPrice(gain, speeds, here, every)(belief, visited)[0], gains / views.prices(here, speeds)
+        PerSecond(gain, speeds, here, every)(belief, visited)[0], gains / views.durations(here, speeds)
     )
-    torch.testing.assert_close(PerPrice(gain, None, here, every)(belief, visited)[0], gains)
-    tiling = PerPrice(gain, None, here)(belief, visited)[0].view(len(views), 100)
+    torch.testing.assert_close(PerSecond(gain, None, here, every)(belief, visited)[0], gains)
+    tiling = PerSecond(gain, None, here)(belief, visited)[0].view(len(views), 100)
     side_by_side = [pose for row in views.tiling[0] for pose in row]
     torch.testing.assert_close(tiling[side_by_side], gains.view(len(views), 100)[side_by_side])
     assert (tiling > OUT).any(-1).nonzero()[:, 0].tolist() == sorted(side_by_side)
 
 
 def test_the_head_stays_if_turning_is_expensive_and_turns_if_it_is_cheap(views, eye, models):
-    """The eye has found nothing nearby: whether the head turns depends on the price."""
+    """The eye has found nothing nearby: whether the head turns depends on its speed."""
 
     def turned(speeds):
+        views.world.speeds = speeds
         observer, gain, start = SceneObserver(Target(models[0]), views), SearchGain(views), pose_ahead(views) * 100 + 55
         steps = look_around(
-            views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), start,
-            target=1, speeds=speeds, passes=6,
+            views, live(eye, views), observer, lambda action: PerSecond(gain, speeds, action), start,
+            target=1, passes=6,
         )  # fmt: skip
         poses = [step.action // 100 for step in steps]
         return sum(one != other for one, other in pairwise(poses))
@@ -196,14 +197,14 @@ def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
 def test_seconds_of_a_path_add_up_those_of_its_movements(views, eye, models):
     observer, gain, speeds = SceneObserver(Target(models[0]), views), SearchGain(views), Speeds()
     found = look_around(
-        views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), 555,
-        target=1, speeds=speeds, seconds=3.0,
+        views, live(eye, views), observer, lambda action: PerSecond(gain, speeds, action), 555,
+        target=1, duration=3.0,
     )  # fmt: skip
     steps = [*found]
     total = speeds.look
     for before, step in zip([None, *steps], steps, strict=False):
         if before is not None:
-            total += float(views.prices(before.action, speeds)[step.action])
+            total += float(views.durations(before.action, speeds)[step.action])
         assert step.seconds == pytest.approx(total, abs=1e-5)
     assert steps[-1].seconds <= 3.0
     assert len({step.action for step in steps}) == len(steps)

@@ -7,7 +7,7 @@ import torch
 from semfov import Eye, Foveation
 from semfov.agents import HeadAgent
 from semfov.belief.observers import LearnedMap, Target
-from semfov.head import ExploreGain, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
 from tests.base_tester import BaseTester
 from tests.small import Blobs, detections, evidence, look, mapping, rand
 
@@ -59,9 +59,9 @@ class TestExploreGain(SceneTester):
         return module(SceneTester.seen(SceneObserver(LearnedMap(module.model), views()), scores, boxes), 0, [0, 1])
 
 
-class TestPerPrice(SceneTester):
+class TestPerSecond(SceneTester):
     def make(self):
-        return PerPrice(SearchGain(views()), Speeds(), 55)
+        return PerSecond(SearchGain(views()), Speeds(), 55)
 
     @staticmethod
     def call(module, scores, boxes):
@@ -69,7 +69,7 @@ class TestPerPrice(SceneTester):
         return module(belief, torch.zeros(1, len(views().grid), dtype=torch.bool))
 
 
-class TestScan(TestPerPrice):
+class TestScan(TestPerSecond):
     def make(self):
         return Scan(SearchGain(views()), [1, 0], 1, 55)
 

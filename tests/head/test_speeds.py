@@ -29,14 +29,27 @@ def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, sp
     assert time == pytest.approx(found, rel=0.01)
 
 
-def test_the_price_is_that_of_the_longest_of_simultaneous_movements():
+def test_a_shift_takes_as_long_as_the_longest_of_simultaneous_movements():
     speeds = Speeds()
     eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
     none = torch.tensor(0.0)
-    assert float(speeds.price(none, none, none)) == speeds.look
-    assert float(speeds.price(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
-    assert float(speeds.price(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
-    assert float(speeds.price(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
+    assert float(speeds.duration(none, none, none)) == speeds.look
+    assert float(speeds.duration(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
+    assert float(speeds.duration(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
+    assert float(speeds.duration(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
+
+
+def test_head_and_zoom_settle_after_a_movement_and_the_eye_does_not():
+    plain, slow, none = Speeds(), Speeds(settle=0.4), torch.tensor(0.0)
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-1.0)
+    for moved, later in (((eye, none, none), 0.0), ((eye, head, none), 0.4), ((none, none, zoom), 0.4)):
+        assert float(slow.duration(*moved) - plain.duration(*moved)) == pytest.approx(later)
+
+
+def test_turns_within_the_dead_zone_are_not_made():
+    angles = torch.tensor([0.0, 1.0, 4.9, 5.0, 90.0])
+    assert Speeds(dead_zone=5.0).worthwhile(angles).tolist() == [True, False, False, True, True]
+    assert Speeds().worthwhile(angles).all()
 
 
 @pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])

@@ -63,16 +63,17 @@ def test_a_view_of_a_panorama_is_perspective():
     image = torch.rand(3, 90, 180)
     pose = torch.tensor([33.0, 20.0, 60.0])
     expected = perspective(image[None], pose[None], (32, 24))[0]
-    torch.testing.assert_close(Panorama(image, (32, 24)).view(pose), expected.clamp(0, 1))
+    world = Panorama(image, (32, 24))
+    torch.testing.assert_close(world.view(pose)[0], expected.clamp(0, 1))
+    torch.testing.assert_close(world.look_at((33.0, 20.0), 60.0), expected.clamp(0, 1))
 
 
 def test_a_view_of_a_flat_scene_is_a_glimpse():
     """Without the border pixels, where a glimpse also uses pixels from outside the window."""
     torch.manual_seed(0)
     image = torch.rand(3, 120, 160).mul(255).round() / 255
-    pose = torch.tensor([79.5, 59.5, 16.0])
-    view = Flat(image, (32, 24), degree=5).view(pose)
-    expected = glimpse(image[None], torch.tensor([[40.0, 30, 120, 90]]), (32, 24))[0]
+    view = Flat(image, (32, 24), degree=5).look_at((-4.0, 2.0), 16.0)  # 20 px to the left, 10 px up
+    expected = glimpse(image[None], torch.tensor([[20.0, 20, 100, 80]]), (32, 24))[0]
     torch.testing.assert_close(view[:, 1:-1, 1:-1], expected[:, 1:-1, 1:-1], atol=1e-5, rtol=0)
 
 
@@ -86,7 +87,7 @@ def test_angles_of_eye_and_head():
     assert float(panorama.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
     flat = Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
     assert float(flat.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
-    assert float(flat.turn(torch.tensor([0.0, 0, 60]), torch.tensor([30.0, 40, 60]))) == pytest.approx(12.5)
+    assert float(flat.turn(torch.tensor([0.0, 0, 60]), torch.tensor([7.5, 10, 60]))) == pytest.approx(12.5)
 
 
 def test_actions_are_cells_of_a_strip(world):
@@ -101,26 +102,26 @@ def test_actions_are_cells_of_a_strip(world):
         torch.testing.assert_close(views.gaze[action], expected, atol=1e-3, rtol=1e-4)
 
 
-def test_prices_equal_brute_force(world):
+def test_durations_equal_brute_force(world):
     from semfov.head import Speeds
 
     views, speeds = Views(world, (40.0, 80.0) if isinstance(world, Panorama) else (60.0,)), Speeds()
     here = 7 * 100 + 33
-    prices = views.prices(here, speeds)
+    durations = views.durations(here, speeds)
     generator = torch.Generator().manual_seed(0)
     for action in torch.randint(len(views.grid), (20,), generator=generator).tolist():
         one, other = views.poses[7], views.poses[action // 100]
         points = views.view_grid.centres[[33, action % 100]]
         eye = world.shift(points[0], points[1], float(other[2]))
-        expected = speeds.price(eye, world.turn(one, other), (other[2] / one[2]).log2())
-        assert float(prices[action]) == pytest.approx(float(expected), abs=1e-4)
-    assert float(prices[here]) == pytest.approx(speeds.look)
+        expected = speeds.duration(eye, world.turn(one, other), (other[2] / one[2]).log2())
+        assert float(durations[action]) == pytest.approx(float(expected), abs=1e-4)
+    assert float(durations[here]) == pytest.approx(speeds.look)
 
 
 def test_windows_beyond_a_picture_are_refused():
     flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
     with pytest.raises(InputError, match="pose: expected a window inside 64 × 48 pixels"):
-        flat.view(torch.tensor([0.0, 0.0, 20.0]))
+        flat.look_at((-16.0, 0.0), 20.0)
     with pytest.raises(InputError, match="field: expected a window inside the picture"):
         flat.poses(60.0)
     with pytest.raises(InputError, match="fields: expected"):

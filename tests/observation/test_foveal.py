@@ -447,3 +447,11 @@ def test_conversions_of_one_checkpoint_count_as_one_detector():
         check_same_detector(
             {"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64}, "model"
         )
+
+
+def test_distances_in_pixels_are_refused_with_the_unit():
+    model = FovealObservationModel(torch.ones(3, 2, 3), [0.2], ("cup", "cat"))
+    scores = torch.tensor([0.2, 0.5, 0.3])
+    with pytest.raises(InputError, match=r"^distance: expected units of the image's longer side, got 240; divide"):
+        model.log_likelihood(scores, torch.tensor(240.0))
+    assert torch.isfinite(model.log_likelihood(scores, torch.tensor(1.5))).all()

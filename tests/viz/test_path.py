@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from semfov import Grid
+from semfov.data.fixations import Fixations
+from semfov.errors import InputError
 from semfov.viz import plot_scanpath
 from semfov.viz.style import TIME
 from tests import small
@@ -72,3 +74,14 @@ def test_numbers_of_few_and_of_very_many_fixations_do_not_overlap(count):
     assert {0, count - 1} <= numbers
     boxes = [text.get_bbox_patch().get_window_extent() for text in axes.texts]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+
+
+def test_fixations_of_people_are_drawn_as_those_of_an_agent():
+    points = np.array([[10.0, 20.0], [300.0, 40.0], [200.5, 400.25]])
+    person = Fixations("a.jpg", "7", points, (640, 480), target="cup", box=(180.0, 380.0, 230.0, 430.0), found=True)
+    axes = plot_scanpath(person, torch.rand(3, 48, 64)).axes[0]
+    np.testing.assert_allclose(axes.collections[-1].get_offsets(), points + 0.5)
+    assert axes.get_title() == "a.jpg, 7: “cup”, found"
+    assert [patch.get_bbox().bounds for patch in axes.patches] == [(180.0, 380.0, 50.0, 50.0)]
+    with pytest.raises(InputError, match=r"^image: expected the photograph"):
+        plot_scanpath(person)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.fixations.files import MILLISECONDS, PIXELS, durations_of, points_of, read_json, write_json
-from semfov.data.fixations.record import Fixations, ObjectBox
+from semfov.data.fixations.record import Fixations, ObjectBox, warn_outside
 from semfov.io.schema import Anything, Array, Maybe, Number, Object, Text
 
 _TRIAL = Object(
@@ -76,7 +76,7 @@ def read_cocosearch(
             found.append(record)
         elif record.picture in sizes:
             found.append(record.in_picture(sizes[record.picture]))
-    return found
+    return warn_outside(path, found)
 
 
 def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.fixations.files import MILLISECONDS, PIXELS, durations_of, points_of, read_json, write_json
-from semfov.data.fixations.record import Fixations, by_picture
+from semfov.data.fixations.record import Fixations, by_picture, warn_outside
 from semfov.errors import check
 from semfov.io.schema import Array, Object
 
@@ -48,7 +48,7 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
             points = points_of(path, name, person["x"], person["y"])
             times = durations_of(path, f"{name}.duration_ms", person.get("duration_ms"), len(points))
             found.append(Fixations(picture, str(number + 1), points, size, times))
-    return found
+    return warn_outside(path, found)
 
 
 def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,9 @@ from semfov.errors import check
 
 FixationValues = NDArray[np.float64]
 ObjectBox = tuple[float, float, float, float]
+
+FAR = 0.5
+"""Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +103,31 @@ class Fixations:
     def inside(self) -> NDArray[np.bool_]:
         """Whether each fixation is inside the frame, `(n,)` boolean."""
         return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
+
+
+def warn_outside(source: str | PathLike[str], fixations: list[Fixations]) -> list[Fixations]:
+    """Warn of fixations that lie farther than `FAR` outside their frame, with their share.
+
+    Args:
+        source: the file that they come from.
+        fixations: the records.
+
+    Returns:
+        The same records.
+
+    >>> warn_outside("people.json", [Fixations("a.jpg", "1", np.array([[40.0, 30.0]]), (80, 60))])[0].picture
+    'a.jpg'
+    """
+    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > FAR * max(each.size) for each in fixations]
+    count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
+    if count:
+        first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())
+        warnings.warn(
+            f"{source}: {count} of {total} fixations ({count / total:.0%}) lie far outside their frame, such as those "
+            f"of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check its size and the unit",
+            stacklevel=3,
+        )
+    return fixations
 
 
 def by_picture(fixations: Iterable[Fixations]) -> dict[str, list[Fixations]]:

@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from semfov.data.fixations.files import MILLISECONDS, PIXELS, SIDE, durations_of, points_of, read_json, write_json
-from semfov.data.fixations.record import Fixations, ObjectBox
+from semfov.data.fixations.record import Fixations, ObjectBox, warn_outside
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Anything, Array, Maybe, Number, Object, Text
 
@@ -94,7 +94,7 @@ def read_ruarte(
                 continue
             record = record.in_picture(sizes[name])
         found.append(record)
-    return found
+    return warn_outside(path, found)
 
 
 def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

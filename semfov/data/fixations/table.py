@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox
+from semfov.data.fixations.record import Fixations, ObjectBox, warn_outside
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, write_text
 
@@ -62,7 +62,7 @@ def read_table(path: str | PathLike[str]) -> list[Fixations]:
             groups.append([])
         groups[-1].append((number, line))
         previous = who
-    return [_record(path, group) for group in groups]
+    return warn_outside(path, [_record(path, group) for group in groups])
 
 
 def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> None:

@@ -5,6 +5,7 @@ Definitions differ between groups, and each function names the group whose defin
 sequences need `pip install semfov[human]`.
 """
 
+from semfov.metrics.scanpath.beside import BesidePeople, compare_scanpath
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_judd, auc_shuffled
 from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
@@ -25,12 +26,14 @@ from semfov.metrics.scanpath.sequence import (
 from semfov.metrics.scanpath.simplify import merge_close
 
 __all__ = [
+    "BesidePeople",
     "MultiMatch",
     "auc",
     "auc_judd",
     "auc_shuffled",
     "cell_labels",
     "cluster_labels",
+    "compare_scanpath",
     "edit_distance",
     "found_at",
     "information_gain",

@@ -225,3 +225,14 @@ def test_the_scanpath_of_a_model_is_converted_to_a_record(tmp_path, target):
     assert (fixations.target, fixations.found) == ((None, None) if target is None else ("cup", True))
     write_table(tmp_path / "t.csv", [fixations])
     assert_equal_records(fixations, read_table(tmp_path / "t.csv")[0])
+
+
+def test_fixations_far_outside_their_frame_are_reported_with_their_share(tmp_path):
+    """A tracker's noise is not: only points that lie farther than half the longer side outside."""
+    near = record(points=((-350.0, 5.0), (790.0, 990.0)))
+    far = record(subject="2", points=((900.0, 5.0), (1300.0, 300.0)))
+    write_table(tmp_path / "a.csv", [near])
+    assert len(read_table(tmp_path / "a.csv")) == 1
+    write_table(tmp_path / "b.csv", [near, far])
+    with pytest.warns(UserWarning, match=r"b\.csv: 1 of 4 fixations \(25%\) lie far outside their frame.* of 2 in"):
+        assert len(read_table(tmp_path / "b.csv")) == 2

@@ -1,0 +1,222 @@
+"""Cameras that turn: the protocol that a camera of your own implements, and the scene around it."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias, cast
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.data.inputs import Color, ImageLike, as_image
+from semfov.data.large import LargePicture, open_large
+from semfov.errors import DataError, check
+from semfov.head.scenes import Flat, Panorama, thumbnail
+from semfov.head.speeds import Speeds
+from semfov.head.sphere import AROUND, Sphere
+from semfov.head.world import FIELDS, World
+from semfov.sensor.sphere import Camera, panorama_directions
+
+TRIES = 25
+"""Largest number of frames that are asked for until one is from the right direction."""
+
+_WIDEST = 8192  # pixels of the panorama in which objects are located
+_KEPT = 320  # longer side of the frames that are kept for drawing
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """A frame of a camera that tells where it was really taken.
+
+    Attributes:
+        image: the frame, of any common kind (`semfov.as_image`).
+        direction: pan and tilt in degrees when it was taken.
+        field: field of view in degrees when it was taken; None for the one that was asked for.
+
+    >>> CameraFrame(torch.rand(3, 30, 40), direction=(29.5, 0.2)).field is None
+    True
+    """
+
+    image: ImageLike
+    direction: tuple[float, float]
+    field: float | None = None
+
+
+class PanTiltCamera(Protocol):
+    """A camera that turns. A class that derives from it needs `look_at` and `size`, and the attributes that differ.
+
+    Angles are in degrees. Pan is positive to the right and tilt is positive upwards; (0, 0) is straight ahead. The lens
+    is taken to be without distortion.
+
+    Attributes:
+        size: `(width, height)` of a frame in pixels.
+        pan: limits of pan, left and right; (-180, 180) for a camera that turns all the way round.
+        tilt: limits of tilt, down and up.
+        fields: fields of view across, narrowest first; more than one for a camera that zooms.
+        speeds: speeds of the motors, and the time until a frame is sharp after a movement.
+
+    >>> class Still(PanTiltCamera):
+    ...     size, pan, tilt = (40, 30), (-90, 90), (-20, 20)
+    ...
+    ...     def look_at(self, direction, field):
+    ...         return torch.rand(3, 30, 40)
+    >>> CameraScene(Still()).view(torch.tensor([30.0, 10.0, 60.0]))[0].shape
+    torch.Size([3, 30, 40])
+    """
+
+    size: tuple[int, int]
+    pan: tuple[float, float] = AROUND
+    tilt: tuple[float, float] = (-90.0, 90.0)
+    fields: tuple[float, ...] = FIELDS
+    speeds: Speeds = Speeds()
+
+    @abstractmethod
+    def look_at(self, direction: tuple[float, float], field: float) -> ImageLike | CameraFrame:
+        """Turn to a direction, wait until the camera is there, and take a frame.
+
+        Args:
+            direction: pan and tilt in degrees, between the limits.
+            field: field of view across, in degrees, one of `fields`.
+
+        Returns:
+            The frame, of any common kind (`semfov.as_image`); or a `CameraFrame` where the camera knows its direction.
+            One from another direction, such as one that was taken before the camera arrived, is asked for again.
+        """
+
+
+class CameraScene(Sphere):
+    """The scene around a camera that turns.
+
+    Pan and tilt have a motor each, which move at the same time. A camera that does not turn all the way round takes the
+    long way between its limits.
+
+    Args:
+        camera: the camera.
+        color: order of the channels of its frames if they are arrays or tensors (`semfov.as_image`).
+        cell: height of the scene's cells in degrees.
+
+    Raises:
+        InputError: the camera lacks an attribute, or one is out of range.
+
+    Example::
+
+        scene = CameraScene(MyCamera(), color="bgr")
+        path = HeadAgent.recommended().search(scene, "cup")
+    """
+
+    still = False
+
+    def __init__(self, camera: PanTiltCamera, color: Color = "rgb", *, cell: float = 6.0) -> None:
+        names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
+        missing = [name for name in names if not hasattr(camera, name)]
+        remedy = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
+        check(not missing, "camera", f"a camera with {', '.join(names)}", remedy)
+        fields = tuple(float(field) for field in camera.fields)
+        check(len(fields) > 0 and 0 < min(fields) <= max(fields) < 180, "fields", "degrees between 0 and 180", fields)
+        width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
+        super().__init__(
+            (width, width // 2),
+            camera.size,
+            pan=camera.pan,
+            tilt=camera.tilt,
+            fields=fields,
+            speeds=camera.speeds,
+            cell=cell,
+        )
+        self.camera, self.color = camera, color
+        self._frames: dict[tuple[float, ...], tuple[Tensor, Tensor]] = {}
+
+    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn the camera and take a frame; a frame that is off by more than a tenth of its field is taken again."""
+        pan, tilt, field = pose.tolist()
+        for _ in range(TRIES):
+            frame = self.camera.look_at((pan, tilt), field)
+            if not isinstance(frame, CameraFrame):
+                return self._seen(frame, pose, pose)
+            at = pose.new_tensor([*frame.direction, field if frame.field is None else frame.field])
+            off = max(float(Sphere.turn(self, at, pose)), abs(float(at[2]) - field))
+            if off <= field / 10:
+                return self._seen(frame.image, at, pose)
+        expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {TRIES} attempts"
+        got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*at.tolist())
+        raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
+
+    def _seen(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """A frame as an image of the right size, and its pose; a reduced copy is kept for drawing."""
+        image = as_image(picture, color=self.color, argument="frame")
+        got = image.shape[-1], image.shape[-2]
+        check(got == tuple(self.size), "frame", f"{self.size[0]} × {self.size[1]} pixels, as `size` has it", got)
+        self._frames[tuple(pose.tolist())] = thumbnail(image, _KEPT).float().cpu(), at
+        return image, at
+
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """The larger of the movements in pan and tilt."""
+        pan = (one[..., 0] - other[..., 0]).abs()
+        if self.around:
+            pan = torch.minimum(pan, 360 - pan)
+        return torch.maximum(pan, (one[..., 1] - other[..., 1]).abs())
+
+    def image(self, side: int) -> Tensor | None:
+        """A panorama of the last frames from all poses, grey where the camera never looked; None before the first."""
+        if not self._frames:
+            return None
+        size = min(side, self.picture[0]) // 2 * 2, min(side, self.picture[0]) // 2
+        y, x = torch.meshgrid(torch.arange(size[1]), torch.arange(size[0]), indexing="ij")
+        directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), size)
+        canvas = torch.full((3, size[0] * size[1]), 0.5)
+        for frame, at in self._frames.values():
+            shape = frame.shape[-1], frame.shape[-2]
+            points, inside = Camera(at, shape).points(directions)
+            place = 2 * (points[inside] + 0.5) / points.new_tensor(shape) - 1
+            sampled = F.grid_sample(frame[None], place[None, None], padding_mode="border", align_corners=False)
+            canvas[:, inside] = sampled[0, :, 0]
+        return canvas.unflatten(-1, size[::-1])
+
+
+SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike
+"""Anything that a head can look around in: a `Panorama`, a `Flat`, a camera that turns, or a picture."""
+
+
+def is_scene(picture: object) -> bool:
+    """Whether this is a scene to look around in, and not a picture: `Panorama`, `Flat` or a camera that turns.
+
+    Args:
+        picture: any object.
+
+    Returns:
+        Whether it has a way to look in a direction.
+
+    >>> is_scene(Flat(torch.rand(3, 48, 64))), is_scene(torch.rand(3, 48, 64)), is_scene("street.jpg")
+    (True, False, False)
+    """
+    return isinstance(picture, World) or hasattr(picture, "look_at")
+
+
+def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
+    """Make the scene that a head looks around in.
+
+    Args:
+        scene: a `Panorama` or a `Flat`; a camera that turns (`PanTiltCamera`); or a picture of any common kind, a
+            `Panorama` if it is twice as wide as high, else a `Flat`.
+        color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: it is none of these, or `color` is given for a scene that has its picture already.
+        DataError: a file cannot be read.
+
+    >>> type(open_scene(torch.rand(3, 64, 128))).__name__, type(open_scene(torch.rand(3, 96, 128))).__name__
+    ('Panorama', 'Flat')
+    """
+    if isinstance(scene, World):
+        check(color == "rgb", "color", f"rgb for a {type(scene).__name__}, which was made with its own color", color)
+        return scene
+    if is_scene(scene):
+        return CameraScene(cast(PanTiltCamera, scene), color)
+    opened = open_large(cast(LargePicture | ImageLike, scene), color=color)
+    width, height = opened.size
+    if width % 2 or abs(width - 2 * height) > 1:
+        return Flat(opened)
+    return Panorama(opened.read((0, 0, width, height)))

@@ -1,0 +1,132 @@
+"""The sphere of directions around a camera that turns, in cells and poses."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.errors import InputError, check
+from semfov.head.speeds import Speeds
+from semfov.head.world import FIELDS, World
+from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
+
+AROUND = (-180.0, 180.0)
+"""Limits of pan of a head that turns all the way round."""
+
+BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
+
+
+class Sphere(World):
+    """Directions around a perspective camera (`semfov.sensor.sphere.Camera`), without anything to see.
+
+    A pose is pan (yaw), tilt (pitch) and horizontal field of view in degrees. Points are unit directions, so D is 3.
+    The scene's picture is an equirectangular panorama.
+
+    Args:
+        picture: `(width, height)` of the panorama in pixels, with an even width.
+        size: `(w, h)` of a view in pixels.
+        pan: limits of pan in degrees, left and right; (-180, 180) turns all the way round.
+        tilt: limits of tilt in degrees, down and up.
+        fields: fields of view in degrees, narrowest first.
+        speeds: of eye and head.
+        cell: height of the scene's cells in degrees.
+
+    Raises:
+        InputError: an argument is out of range.
+
+    >>> rows = Sphere((360, 180), (40, 30), pan=(-60, 60), tilt=(0, 20)).poses(60.0)
+    >>> [pose.tolist() for pose in rows[0]]
+    [[-60.0, 10.0, 60.0], [-30.0, 10.0, 60.0], [0.0, 10.0, 60.0], [30.0, 10.0, 60.0], [60.0, 10.0, 60.0]]
+    """
+
+    closed = True
+
+    def __init__(
+        self,
+        picture: tuple[int, int],
+        size: tuple[int, int],
+        *,
+        pan: tuple[float, float] = AROUND,
+        tilt: tuple[float, float] = (-90.0, 90.0),
+        fields: tuple[float, ...] = FIELDS,
+        speeds: Speeds | None = None,
+        cell: float = 6.0,
+    ) -> None:
+        check(picture[0] % 2 == 0, "image", "an even number of columns", picture[0])
+        check(0 < cell <= 90, "cell", "a positive angle of at most 90 degrees", cell)
+        check(-360 <= pan[0] <= pan[1] <= 360, "pan", "limits in degrees, left and right", pan)
+        check(-90 <= tilt[0] <= tilt[1] <= 90, "tilt", "limits from -90 to 90 degrees, down and up", tilt)
+        self.picture, self.size, self.cell = picture, size, cell
+        self.pan, self.tilt, self.fields = pan, tilt, tuple(fields)
+        self.speeds = Speeds() if speeds is None else speeds
+        self.scene = Grid(round(360 / cell), round(180 / cell), picture)
+        self.centres = panorama_directions(self.scene.centres, picture)
+        weight = torch.linalg.vector_norm(self.centres[:, ::2], dim=-1)
+        self.area = weight / weight.mean()
+
+    @property
+    def around(self) -> bool:
+        """Whether the head turns all the way round."""
+        return self.pan[1] - self.pan[0] >= 360
+
+    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Raise an error, because directions alone show nothing."""
+        raise InputError(BLANK)
+
+    def image(self, side: int) -> Tensor | None:
+        """Nothing, because directions alone show nothing."""
+        return None
+
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels at which directions are seen."""
+        return Camera(pose, self.size).points(points)
+
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Directions of pixels."""
+        return Camera(pose, self.size).directions(points)
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cells that contain directions."""
+        return self.scene.cell_of(self.pixels_of(points))
+
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """Pixels of the panorama at directions."""
+        return panorama_points(points, self.picture)
+
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Angle between the optical axes of two cameras."""
+        middle = torch.tensor([[0.0, 0.0]])
+        return angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
+
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Angle between the directions of two pixels."""
+        camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
+        rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
+        return angle_between(*rays)
+
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Rings of poses around the viewer, or arcs of them between the limits of pan."""
+        high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
+        middle, reach = (self.tilt[0] + self.tilt[1]) / 2, (self.tilt[1] - self.tilt[0]) / 2
+        number = math.floor(reach / (high / 2))
+        left, width = self.pan[0], min(self.pan[1] - self.pan[0], 360)
+        rings = []
+        for row in range(-number, number + 1):
+            pitch = middle + row * high / 2
+            # In a ring that tiles, the sides of neighbouring windows meet even at the corners nearest to the horizon.
+            tiles = (row + number) % 2 == 0
+            low = max(abs(pitch) - high / 2, 0) if tiles else abs(pitch)
+            count = 2 * math.ceil(width * math.cos(math.radians(low)) / field - 1e-9)
+            # The ends of an arc are both poses; those of a ring are the same one.
+            steps = range(count if self.around else count + 1)
+            rings.append([torch.tensor([width * n / max(count, 1) + left, pitch, field]) for n in steps])
+        return rings
+
+    def places(self, boxes: Tensor, pose: Tensor) -> Regions:
+        """Regions of the sphere."""
+        return Regions(Camera(pose.expand(len(boxes), 3), self.size), boxes)
+
+    def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """Smallest boxes around the regions in the panorama."""
+        return self.places(boxes, pose).panorama_boxes(self.picture)

@@ -1,0 +1,136 @@
+"""One scanpath beside those of people in the same picture, by the measures of this folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.data.fixations.record import Fixations, FixationValues, warn_outside
+from semfov.errors import check
+from semfov.metrics.scanpath.conditional import auc, nss
+from semfov.metrics.scanpath.multimatch import multimatch
+from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
+from semfov.paths import GazeRecord
+
+_CELLS = 8
+_BLUR = 0.03
+_LONGEST = 64
+
+_Measure = Callable[[FixationValues, Sequence[FixationValues]], float]
+
+
+class BesidePeople(NamedTuple):
+    """A measure of a scanpath, and of people.
+
+    Attributes:
+        scanpath: of the scanpath against each person, on average.
+        people: of each person against each other person, on average; NaN for a single person.
+
+    Example::
+
+        for name, measure in compare_scanpath(agent.search("kitchen.jpg", "cup"), people).items():
+            print(f"{name}: {measure.scanpath:.2f}, people {measure.people:.2f}")
+    """
+
+    scanpath: float
+    people: float
+
+
+def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixations]) -> dict[str, BesidePeople]:
+    """Compare a scanpath with those of people in the same picture, and the people with each other.
+
+    - `MultiMatch shape`, `direction`, `length`, `position` (`multimatch`): 1 for equal scanpaths; NaN below three
+      fixations.
+    - `sequence score` (`sequence_score`): of the cells of an 8 × 8 grid in the order of the fixations, 0 to 1.
+    - `edit distance` (`edit_distance`): of the same sequences, divided by the longer one; 0 for equal scanpaths.
+    - `NSS` (`nss`) and `AUC` (`auc`): of the fixations in the density of all fixations of the others, blurred by a
+      Gaussian of 3 % of the longer side. A person is compared with the density of the other people.
+
+    Fixations outside the picture are left out of the sequences and densities.
+
+    Args:
+        scanpath: a record of an agent, or fixations.
+        people: fixations of people (`semfov.data.fixations`) in the same picture, in any size of it.
+
+    Returns:
+        The measures by name.
+
+    Raises:
+        InputError: there are no people, their records are of several pictures, or rapidfuzz is not installed.
+
+    >>> path = Fixations("a.jpg", "1", np.array([[10.0, 10], [60, 10], [60, 40]]), (80, 60))
+    >>> compare_scanpath(path, [path])["sequence score"].scanpath
+    1.0
+    """
+    check(len(people) > 0, "people", "fixations of at least one person", "none")
+    pictures = sorted({each.picture for each in people})
+    check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
+    size = people[0].size
+    ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
+    records = [each.resized(size) for each in (ours, *people)]
+    warn_outside("fixations", records)
+    mine, *theirs = [each.points for each in records]
+    found = {}
+    for name, measure in _measures(size).items():
+        among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
+        found[name] = BesidePeople(measure(mine, theirs), _mean(among))
+    return found
+
+
+def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
+    """Measures of points against those of several others, by name."""
+
+    def inside(points: FixationValues) -> FixationValues:
+        return points[Fixations("", "", points, size).inside]
+
+    def words(points: FixationValues) -> list[int]:
+        return [int(cell) for cell in cell_labels(inside(points), _CELLS, _CELLS, size)]
+
+    def paired(score: Callable[[FixationValues, FixationValues], float]) -> _Measure:
+        return lambda points, others: _mean([score(points, other) for other in others])
+
+    def matched(dimension: str) -> _Measure:
+        return paired(lambda one, other: float(getattr(multimatch(one, other, size), dimension)))
+
+    def spelled(score: Callable[[list[int], list[int]], float]) -> _Measure:
+        def pair(one: FixationValues, other: FixationValues) -> float:
+            a, b = words(one), words(other)
+            return score(a, b) if a and b else float("nan")
+
+        return paired(pair)
+
+    def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
+        def whole(points: FixationValues, others: Sequence[FixationValues]) -> float:
+            density, ratio = _density(np.concatenate([inside(other) for other in others]), size)
+            x, y = ((inside(points) + 0.5) * ratio - 0.5).T
+            return _mean(score(density, x, y).tolist())
+
+        return whole
+
+    return {
+        **{f"MultiMatch {name}": matched(name) for name in ("shape", "direction", "length", "position")},
+        "sequence score": spelled(sequence_score),
+        "edit distance": spelled(lambda a, b: edit_distance(a, b) / max(len(a), len(b))),
+        "NSS": mapped(nss),
+        "AUC": mapped(auc),
+    }
+
+
+def _density(points: FixationValues, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A map of 64 pixels along the longer side, a Gaussian around each point, and its pixels for each of the frame."""
+    shape = np.maximum(1, np.round(np.array(size) * _LONGEST / max(size)))
+    ratio = shape / np.array(size)
+    x, y = ((points + 0.5) * ratio - 0.5).T
+    columns, rows = (np.arange(side) for side in shape)
+    width = 2 * (_BLUR * _LONGEST) ** 2
+    across = np.exp(-((columns[:, None] - x) ** 2) / width)
+    down = np.exp(-((rows[:, None] - y) ** 2) / width)
+    return down @ across.T, ratio
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")

@@ -1,0 +1,60 @@
+"""A scanpath beside people: each measure is the mean of its function over pairs, and orders scanpaths as expected."""
+
+import numpy as np
+import pytest
+
+from semfov.data.fixations import Fixations
+from semfov.errors import InputError
+from semfov.metrics.scanpath import cell_labels, compare_scanpath, edit_distance, multimatch, sequence_score
+
+SIZE = (800, 600)
+
+
+def people(count=4, noise=12.0, seed=0):
+    """Scanpaths through the same five places, with noise."""
+    generator = np.random.default_rng(seed)
+    places = np.array([[400.0, 300.0], [120.0, 100.0], [640.0, 150.0], [600.0, 500.0], [200.0, 450.0]])
+    paths = [places[: 5 - n % 2] + generator.normal(0, noise, (5 - n % 2, 2)) for n in range(count)]
+    return [Fixations("a.jpg", str(n), path, SIZE) for n, path in enumerate(paths)]
+
+
+def test_measures_of_pairs_are_means_over_people():
+    mine, *others = people(4)
+    table = compare_scanpath(mine, others)
+    words = [cell_labels(each.points, 8, 8, SIZE) for each in (mine, *others)]
+    matched = [multimatch(mine.points, each.points, SIZE) for each in others]
+    expected = {f"MultiMatch {name}": [getattr(each, name) for each in matched] for name in matched[0]._fields[:4]}
+    expected["sequence score"] = [sequence_score(words[0], word) for word in words[1:]]
+    expected["edit distance"] = [edit_distance(words[0], w) / max(len(words[0]), len(w)) for w in words[1:]]
+    for name, values in expected.items():
+        assert table[name].scanpath == pytest.approx(np.mean(values)), name
+    among = [sequence_score(a, b) for n, a in enumerate(words[1:]) for m, b in enumerate(words[1:]) if n != m]
+    assert table["sequence score"].people == pytest.approx(np.mean(among))
+
+
+def test_a_person_is_nearer_to_people_than_a_random_scanpath_in_any_size():
+    mine, *others = people(5)
+    generator = np.random.default_rng(1)
+    noise = Fixations("a.jpg", "noise", generator.uniform((0, 0), SIZE, (5, 2)) - 0.5, SIZE)
+    person, random = compare_scanpath(mine, others), compare_scanpath(noise, others)
+    for name, worse in random.items():
+        assert (
+            (person[name].scanpath < worse.scanpath)
+            if name == "edit distance"
+            else (person[name].scanpath > worse.scanpath)
+        ), name
+        assert person[name].people == worse.people
+    smaller = compare_scanpath(mine.resized((400, 300)), others)
+    assert all(smaller[name] == pytest.approx(person[name]) for name in person)
+    assert np.isnan(compare_scanpath(mine, others[:1])["NSS"].people)
+
+
+def test_other_pictures_and_fixations_in_another_unit_are_told():
+    mine, *others = people(3)
+    with pytest.raises(InputError, match=r"^people: expected fixations of at least one person"):
+        compare_scanpath(mine, [])
+    with pytest.raises(InputError, match=r"^people: expected fixations in one picture"):
+        compare_scanpath(mine, [*others, Fixations("b.jpg", "1", mine.points, SIZE)])
+    shifted = Fixations("a.jpg", "1", mine.points * 3, SIZE)
+    with pytest.warns(UserWarning, match=r"of 14 fixations \(\d+%\) lie far outside their frame"):
+        compare_scanpath(shifted, others)
