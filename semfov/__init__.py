@@ -1,4 +1,18 @@
-"""semfov: semantic active perception with foveal sensors."""
+"""semfov looks at pictures as eyes do: piece by piece, where it pays.
+
+One agent takes a photograph, a picture of any size, a panorama or a camera, and chooses how to look at it::
+
+    agent = semfov.ActivePerception.recommended()
+    agent.search("kitchen.jpg", "cup").decision  # is there a cup, and where?
+    agent.find_all("harbour.jpg", "person", passes=16).objects  # all people of a large picture
+    agent.explore("kitchen.jpg").plot()  # what is where
+    agent.search(semfov.Panorama("street.jpg"), "bicycle")  # turns its head
+    agent.live("cup").step(frame)  # a look at each frame of a camera
+
+Its records print, draw, save and convert themselves. The command `semfov` does the same from a shell, and `semfov fit`
+fits the agent to a detector of your own. Each part is also a function or a differentiable module: `semfov.foveate`,
+`semfov.fusion`, `semfov.acquisition`, `semfov.rollout`.
+"""
 
 import warnings
 from typing import TYPE_CHECKING, Any

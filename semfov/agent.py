@@ -259,11 +259,8 @@ class ActivePerception(nn.Module):
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            return (
-                "windows"
-                if pays(picture_size(cast(ImageLike | LargePicture, picture)), self.eye.detector.input_size)
-                else "fovea"
-            )
+            size = picture_size(cast(ImageLike | LargePicture, picture))
+            return "windows" if pays(size, self.eye.detector.input_size) else "fovea"
         return "fovea"
 
     def search(
@@ -305,8 +302,9 @@ class ActivePerception(nn.Module):
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
                 tensor; a `semfov.data.large.LargePicture`; or a scene, such as `semfov.Panorama` or `semfov.Flat`.
-            target: class by name or index 1..K; in a photograph also several, each with the probability that it is
-                meant (`AnyOf`, `semfov.data.spread`). The target of the record is then the most probable of them.
+            target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
+                with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
+                the most probable of them.
             how: the kind of look, `fovea`, `windows` or `head`; `auto` chooses it by the picture.
             passes: largest number of passes of the detector, closer looks included; None takes 24 for windows and 40
                 for a head.
@@ -560,9 +558,9 @@ def _given(**values: Any) -> dict[str, Any]:
 
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     """Number of the only class of a target."""
-    wanted = {target: 1.0} if isinstance(target, str | int) else dict(target)
-    check(len(wanted) == 1, "target", "one class for this kind of look", wanted)
-    return class_index(next(iter(wanted)), classes[1:], "target")
+    wanted = [target] if isinstance(target, str | int) else list(target)
+    check(len(wanted) == 1, "target", "one class for a search by windows or a head, or find_all", target)
+    return class_index(wanted[0], classes[1:], "target")
 
 
 def _classes(target: Targets, classes: Sequence[str]) -> tuple[int, ...]:

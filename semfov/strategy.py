@@ -1,6 +1,7 @@
 """A strategy: the observer and the policy for one task."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from torch import nn
 
@@ -28,7 +29,7 @@ class Strategy(nn.Module):
         """Prepare the search for a target.
 
         Args:
-            target: a class by name or index, or several with weights.
+            target: a class by name or index, several, or several with weights.
             classes: names of the classes, background first.
 
         Returns:
@@ -37,10 +38,11 @@ class Strategy(nn.Module):
         Raises:
             InputError: a class is unknown, or the policy cannot search for several classes.
         """
-        if not isinstance(target, Mapping):
+        if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
-        wanted, policy = weights_by_class(target, classes[1:]), self.policy
+        given: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
+        wanted, policy = weights_by_class(given, classes[1:]), self.policy
         suits = isinstance(policy, NonPredictive | Random) or policy.by_place
-        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(target))
+        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(given))
         return Strategy(AnyOf(self.observer, wanted), policy), max(wanted, key=wanted.__getitem__), wanted

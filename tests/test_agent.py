@@ -330,3 +330,58 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
 def test_invalid_grids_are_refused(grid):
     with pytest.raises(InputError, match=r"^grid: expected"):
         ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)
+
+
+def test_any_of_a_list_of_classes_will_do(agent, image):
+    image[:, 8:28, 8:28] = 0.4  # nothing red is left
+    listed, weighted = (
+        agent.search(image, wanted, start=0) for wanted in (["red", "green"], {"red": 1.0, "green": 1.0})
+    )
+    assert listed.found
+    assert torch.equal(listed.cells, weighted.cells)
+    with pytest.raises(InputError, match="one class for a search by windows"):
+        agent.search(image, ["red", "green"], how="windows")
+
+
+@pytest.mark.parametrize("task", ["search", "explore"])
+def test_limits_end_an_episode(agent, image, task):
+    """By passes, by the word of the caller and by time; what was seen so far is that of the whole episode."""
+    run = {"search": lambda **how: agent.search(image, "red", start=47, confirm=1.0, **how)}.get(task, agent.explore)
+    given = {} if task == "search" else {"start": 47}
+    run = run if task == "search" else lambda **how: agent.explore(image, **given, **how)
+    whole = run(shifts=6)
+    few = run(passes=3)
+    assert (few.ending, few.passes) == ("passes", 3)
+    assert torch.equal(few.cells, whole.cells[:3])
+    records = []
+    stopped = run(on_look=lambda record: records.append(record) or len(record) < 4)
+    assert (stopped.ending, len(stopped)) == ("stopped", 4)
+    assert [len(record) for record in records] == [1, 2, 3, 4]
+    assert torch.equal(records[-1].probabilities, whole.probabilities[:4])
+    instant = run(seconds=0)
+    assert (instant.ending, len(instant)) == ("seconds", 1)
+    for wrong in ({"passes": 0}, {"seconds": -1}, {"on_look": 3}, {"duration": 2.0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            run(**wrong)
+
+
+def test_the_kind_of_look_follows_from_the_picture(agent):
+    small, large = torch.rand(3, 120, 160), torch.rand(3, 480, 640)
+    assert agent.kind_of_look(small) == "fovea"
+    assert agent.kind_of_look(small, every=True) == "windows"
+    assert agent.kind_of_look((large * 255).byte()) == "windows"
+    assert agent.kind_of_look(large.permute(1, 2, 0).numpy()) == "windows"
+    assert agent.kind_of_look(large, "fovea") == "fovea"
+    assert agent.search(large, "red", how="fovea", shifts=1).image.shape == large.shape
+    with pytest.raises(InputError, match=r"shifts: expected None .* use passes, or how='fovea'"):
+        agent.search(large, "red", shifts=2)
+    with pytest.raises(InputError, match="unknown kind of look 'zoom'"):
+        agent.search(small, "red", how="zoom")
+
+
+def test_parts_that_were_fitted_for_another_sensor_are_refused():
+    settings = Eye(Foveation(40.0, growth=1.0), Coloured(), reference=160.0).settings()
+    model = FovealObservationModel.identity(["red", "green"], [0.2])
+    model.metadata.update(sensor=settings["sensor"])
+    with pytest.raises(InputError, match=r"growth is 2\.0, the model was fitted with 1\.0"):
+        ActivePerception(squares_eye(), (Semantic(3, model), NonPredictive()), (Semantic(3), Random()), grid=(8, 6))

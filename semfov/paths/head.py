@@ -270,4 +270,5 @@ def _world(settings: Mapping[str, Any]) -> World:
     for name in names:
         check(name in settings, f"world.{name}", "a value", "nothing")
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-    return made(values["picture"], values["size"], **{name: values[name] for name in names[2:]})
+    options: dict[str, Any] = {name: values[name] for name in names[2:]}
+    return made(values["picture"], values["size"], **options)

@@ -15,8 +15,8 @@ from semfov.data.classes import class_index
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_number
 
-TargetLike = str | int | Mapping[str, float] | Mapping[int, float]
-"""A class by name or by index 1..K, or several classes, each with the probability that it is the one meant."""
+TargetLike = str | int | Sequence[str | int] | Mapping[str, float] | Mapping[int, float]
+"""A class by name or index 1..K; several, of which any will do; or several with the probability that each is meant."""
 
 
 @dataclass(frozen=True)
