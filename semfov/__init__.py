@@ -21,7 +21,7 @@ from semfov.agent import ActivePerception
 from semfov.agents import HeadAgent, ZoomAgent
 from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers
 from semfov.data import EmbeddedScenes, as_image, read_image
-from semfov.detection import Detections, Detector, Selection
+from semfov.detection import Detections, Detector, Objects, Selection, merge_boxes
 from semfov.detection.load import load_detector
 from semfov.episode import rollout
 from semfov.errors import DataError, InputError, SemfovError
@@ -57,6 +57,7 @@ __all__ = [
     "HeadAgent",
     "InputError",
     "MapEvidence",
+    "Objects",
     "Panorama",
     "Scanpath",
     "Selection",
@@ -72,6 +73,7 @@ __all__ = [
     "foveate",
     "fusion",
     "load_detector",
+    "merge_boxes",
     "observers",
     "policies",
     "read_image",

@@ -109,7 +109,7 @@ def test_scanpath_shows_numbered_fixations(scanpath, image):
     assert len(bare.axes[0].texts) == 3
     assert axes.get_title() == "“cup” found after 2 gaze shifts"
     explored = draw(plot_scanpath(replace(scanpath, target=None, found=False), image))
-    assert explored.axes[0].get_title() == "explored with 2 gaze shifts"
+    assert explored.axes[0].get_title() == "explored with 2 gaze shifts: 2 objects from score 0.3"
 
 
 def test_belief_is_the_posterior(scanpath):

@@ -301,7 +301,7 @@ def search_windows(
         target=target,
         glances=tuple(seen),
         values=tuple(values),
-        objects=merge(seen, target),
+        candidates=merge(seen, target),
         decision=decision,
         ending=ending,
         closer=() if verifier is None else tuple(verifier.looks),
@@ -348,6 +348,6 @@ def find_all(
         target=target,
         glances=tuple(seen),
         values=tuple(values),
-        objects=merge(seen, target),
+        candidates=merge(seen, target),
         ending=ending,
     )

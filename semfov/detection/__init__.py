@@ -2,6 +2,7 @@
 
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
+from semfov.detection.objects import LEAST, Objects, merge_boxes
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
 from semfov.detection.selection import Selection
@@ -11,8 +12,11 @@ __all__ = [
     "Candidates",
     "Detections",
     "Detector",
+    "LEAST",
+    "Objects",
     "Placement",
     "Selection",
     "letterbox",
+    "merge_boxes",
     "score_vectors",
 ]

@@ -156,7 +156,7 @@ class WindowGaze(Gazes):
             target=target,
             glances=tuple(self.looks),
             values=(float("inf"),) * len(self.looks),
-            objects=merge(self.looks, target),
+            candidates=merge(self.looks, target),
         )
         image = self.scenery.image(episode.scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))

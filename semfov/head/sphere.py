@@ -40,6 +40,8 @@ class Sphere(World):
     [[-60.0, 10.0, 60.0], [-30.0, 10.0, 60.0], [0.0, 10.0, 60.0], [30.0, 10.0, 60.0], [60.0, 10.0, 60.0]]
     """
 
+    closed = True
+
     def __init__(
         self,
         picture: tuple[int, int],

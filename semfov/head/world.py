@@ -40,6 +40,7 @@ class World(ABC):
         speeds: of eye and head.
         centres: `(S, D)`, centres of the cells.
         area: `(S,)`, relative areas of the cells, 1 on average.
+        closed: whether the left and the right border of the picture meet.
         still: whether two views from one pose are equal, as those of a picture are.
 
     >>> import torch
@@ -55,6 +56,7 @@ class World(ABC):
     speeds: Speeds
     centres: Tensor
     area: Tensor
+    closed: bool = False
     still: bool = True
 
     @abstractmethod

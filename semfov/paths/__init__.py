@@ -1,11 +1,11 @@
 """Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
 
-from semfov.paths.base import GazeRecord, Record, detections_in_words
+from semfov.paths.base import GazeRecord, Record, RecordedLook, detections_in_words
 from semfov.paths.endings import Ending
 from semfov.paths.head import HeadPath
 from semfov.paths.moment import Moment
 from semfov.paths.scanpath import Scanpath
-from semfov.paths.stimulus import Stimulus, sensor_in_words
+from semfov.paths.stimulus import Stimulus, reduced_copy, sensor_in_words
 from semfov.paths.trace import Trace, trace
 from semfov.paths.windows import ZoomPath
 
@@ -13,6 +13,7 @@ __all__ = [
     "Ending",
     "GazeRecord",
     "HeadPath",
+    "RecordedLook",
     "Moment",
     "Record",
     "Scanpath",
@@ -21,5 +22,6 @@ __all__ = [
     "ZoomPath",
     "detections_in_words",
     "sensor_in_words",
+    "reduced_copy",
     "trace",
 ]

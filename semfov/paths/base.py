@@ -3,51 +3,168 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
+from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
 from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
-from semfov.errors import InputError
+from semfov.detection.objects import LEAST, Objects
+from semfov.errors import InputError, check
 from semfov.paths.drawing import drawing_of
 from semfov.paths.endings import FIXATIONS, Ending, sentence
 from semfov.paths.files import Format
+from semfov.paths.merging import ConfirmedPlace, confirm, places_confirmed
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_Table = Literal["looks", "objects"]
+"""Tables of a record."""
+
+_NAMED = 5  # largest number of objects that the text form names
+
+
+@dataclass(frozen=True)
+class RecordedLook:
+    """One look of a record, in pixels of the picture.
+
+    Attributes:
+        number: number of the look, from 0.
+        fixation: `(x, y)`, the fixated point.
+        region: `(x1, y1, x2, y2)`, the part of the picture that the look shows.
+        detections: its detections, a batch of one.
+        seconds: time that it took; None if it is not known.
+        value: value for which it was chosen; None if it was not chosen by a value.
+
+    Example::
+
+        for look in agent.search("kitchen.jpg", "cup"):
+            print(look.number, look.fixation, look.seconds)
+    """
+
+    number: int
+    fixation: tuple[float, float]
+    region: tuple[float, float, float, float]
+    detections: Detections
+    seconds: float | None = None
+    value: float | None = None
+
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Record(ABC):
-    """Base of all records: what was looked for, and what was decided, in words and as a table.
+    """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
+
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts,
+    what `plot` draws, and what `objects` returns.
 
     Attributes:
         classes: names of the classes, background first.
         target: class index 1..K that was searched for; None for all classes.
         decision: decision of a search; None for exploration, and for a search without one.
+        targets: class indices 1..K of a search for several classes; otherwise empty.
+        least: score from which on objects count.
+        photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
+        source: file of the picture; None if it does not come from a file.
 
     Example::
 
-        record = live.step(frame)
-        print(record.describe(), record.rows())
+        record = agent.find_all("harbour.tif", "person")
+        print(record.describe(), record.objects.boxes)
+        for look in record:
+            print(look.number, look.fixation, int(look.detections.count))
     """
 
     classes: tuple[str, ...]
     target: int | None
     decision: Decision | None = None
+    targets: tuple[int, ...] = ()
+    least: float = LEAST
+    photograph: Tensor | None = None
+    source: str | None = None
 
     @property
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
         return None if self.target is None else self.classes[self.target]
+
+    @property
+    @abstractmethod
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
+
+    @property
+    def image(self) -> Tensor | None:
+        """The reduced picture, `(3, h, w)` in [0, 1]; None if it was not kept."""
+        return None if self.photograph is None else self.photograph.float() / 255
+
+    @property
+    @abstractmethod
+    def passes(self) -> int:
+        """Number of passes of the detector, closer looks included."""
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[RecordedLook]:
+        """The looks in their order."""
+
+    @cached_property
+    def candidates(self) -> Objects:
+        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels."""
+        raise NotImplementedError
+
+    @property
+    def objects(self) -> Objects:
+        """The candidates of the targets that have at least the score `least`, or that were confirmed.
+
+        A candidate that was confirmed has the probability that the target is there as its score, where that is higher.
+        The box that a decision found is always among the objects.
+        """
+        return self._outcome[0]
+
+    @property
+    def confirmed(self) -> Tensor:
+        """Which of the objects a closer look or the decision confirmed, `(M,)` boolean."""
+        return self._outcome[1]
+
+    @property
+    def expected(self) -> dict[str, float]:
+        """Expected number of objects by the name of their class; without a model of it, the number of `objects`."""
+        counts = Counter(self.objects.labels.tolist())
+        labels = self._sought() or tuple(counts)
+        return {self.classes[label]: float(counts[label]) for label in labels}
+
+    def _sought(self) -> tuple[int, ...]:
+        """Classes that were searched for; none stands for all."""
+        return self.targets or (() if self.target is None else (self.target,))
+
+    @cached_property
+    def _outcome(self) -> tuple[Objects, Tensor]:
+        """The objects, and which of them were confirmed."""
+        return confirm(self.candidates.of(self._sought()), self._confirmations(), self.least)
+
+    def _confirmations(self) -> list[ConfirmedPlace]:
+        """Places that closer looks and the decision confirmed."""
+        return places_confirmed(self.decision, self.target, (), self.passes - 1)
+
+    def objects_in_words(self) -> str:
+        """Count the objects, by class where classes were searched for, and say from which score on.
+
+        Returns:
+            A phrase such as `2 × person from score 0.3`.
+        """
+        labels = self.objects.labels
+        names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought()]
+        every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
+        return f"{', '.join(names) or every} from score {self.least:g}"
 
     @abstractmethod
     def describe(self) -> str:
@@ -71,7 +188,19 @@ class Record(ABC):
 
     def _lines(self) -> list[str]:
         """Lines of the text form after the summary."""
-        return []
+        return [self._listed()]
+
+    def _listed(self) -> str:
+        """The most confident objects in words."""
+        objects, sure = self.objects, self.confirmed.tolist()
+        named = [
+            f"{self.classes[label]} {score:.2f}{' (confirmed)' if known else ''}"
+            for label, score, known in zip(
+                objects.labels.tolist()[:_NAMED], objects.scores.tolist(), sure, strict=False
+            )
+        ]
+        more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
+        return f"objects from score {self.least:g}: {', '.join([*named, *more]) or 'none'}"
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -85,22 +214,56 @@ class Record(ABC):
             One dictionary for each look.
         """
 
-    def to_frame(self) -> pandas.DataFrame:
-        """The table of `rows` as a pandas data frame.
+    def object_rows(self) -> list[dict[str, Any]]:
+        """The objects as a table of plain values, one row for each object, most confident first.
+
+        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
+        number of the look that the box comes from.
 
         Returns:
-            One row for each look.
+            One dictionary for each object.
+        """
+        objects = self.objects
+        parts = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
+        return [
+            {
+                "object": number,
+                "class": self.classes[label],
+                "score": score,
+                "confirmed": sure,
+                "x": (x1 + x2) / 2,
+                "y": (y1 + y2) / 2,
+                "x1": x1,
+                "y1": y1,
+                "x2": x2,
+                "y2": y2,
+                "look": look,
+            }
+            for number, (label, score, sure, look, (x1, y1, x2, y2)) in enumerate(
+                zip(*(part.tolist() for part in parts), strict=True)
+            )
+        ]
+
+    def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
+        """A table of the record as a pandas data frame.
+
+        Args:
+            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
+
+        Returns:
+            One row for each look or object.
 
         Raises:
-            InputError: pandas is not installed.
+            InputError: there is no such table, or pandas is not installed.
         """
+        check(table in get_args(_Table), "table", "looks or objects", table)
         try:
             import pandas
         except ImportError:
             raise InputError(
                 "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
             ) from None
-        return pandas.DataFrame(self.rows())
+        return pandas.DataFrame(self.rows() if table == "looks" else self.object_rows())
 
     def _detected(self, look: Detections) -> dict[str, Any]:
         """Columns of a table on the detections of a look: their number, and the most confident one."""
@@ -116,8 +279,8 @@ class Record(ABC):
 class GazeRecord(Record):
     """Base of the records of whole searches and explorations: the looks, the decision, and the reason for the end.
 
-    `describe` and `why_it_ended` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a picture, a
-    table, fixations in the format of human data, and a file.
+    `describe` and `why_it_ended` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a picture,
+    tables, fixations in the format of human data, and a file.
 
     Beside the attributes of `Record` it has those of its looks and of its end.
 
@@ -148,10 +311,49 @@ class GazeRecord(Record):
         """Number of looks, the first included."""
         return len(self.detections)
 
+    def __iter__(self) -> Iterator[RecordedLook]:
+        """The looks in their order."""
+        for number, (x, y) in enumerate(self._gaze()[0].tolist()):
+            parts = self.region(number), self._in_picture(number), self._duration(number), self._value(number)
+            yield RecordedLook(number, (x, y), *parts)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
+        return self._gaze()[1]
+
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
         return len(self.detections) + len(self.closer)
+
+    def region(self, number: int) -> tuple[float, float, float, float]:
+        """Part of the picture that a look showed.
+
+        Args:
+            number: number of the look, from 0.
+
+        Returns:
+            `(x1, y1, x2, y2)` in picture pixels.
+        """
+        width, height = self.size
+        return 0.0, 0.0, float(width), float(height)
+
+    def _in_picture(self, number: int) -> Detections:
+        """Detections of a look, with boxes in pixels of the picture."""
+        return self.detections[number]
+
+    def _duration(self, number: int) -> float | None:
+        """Time that a look took."""
+        return float(self.seconds[number]) if self.seconds else None
+
+    def _value(self, number: int) -> float | None:
+        """Value for which a look was chosen."""
+        return None
+
+    def _confirmations(self) -> list[ConfirmedPlace]:
+        """Places that closer looks and the decision confirmed."""
+        return places_confirmed(self.decision, self.target, self.closer, len(self) - 1)
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended.
@@ -168,11 +370,6 @@ class GazeRecord(Record):
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
         return f"{self.describe()}. {self.why_it_ended()}".rstrip()
-
-    @property
-    def image(self) -> Tensor | None:
-        """The picture, `(3, h, w)` in [0, 1]; None if it was not kept."""
-        return None
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the looks on the picture.

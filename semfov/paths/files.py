@@ -12,10 +12,12 @@ from torch import Tensor
 
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Size, Text
 from semfov.io.storage import read, write_file
 from semfov.paths.endings import RENAMED, Ending
+from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
 
 WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
@@ -34,6 +36,7 @@ _DETECTIONS = {
 }
 
 _BOXES: dict[str, tuple[Size, ...]] = {"box": (4,), "closer_boxes": ("Q", 4)}
+_PHOTOGRAPH = Field((3, "h", "w"), dtype=torch.uint8, optional=True)
 
 
 def pair(of: Json) -> Pair:
@@ -86,9 +89,14 @@ class Format:
             # Files of earlier versions have neither `place` nor `closer`.
             "decision": Maybe(Object(_DECISION, None, ("outcome", "probability", "cell"))),
             "closer": Maybe(Array(Object({name: _CLOSER[name] for name in closer}, None, tuple(closer)))),
+            # Nor these.
+            "targets": Maybe(Array(WHOLE)),
+            "least": Maybe(CHANCE),
+            "source": Maybe(Text()),
             "ending": Maybe(Text((*endings, *(old for old, new in RENAMED.items() if new in endings)))),
         }
         boxes = {name: Field(shape, mixed=True, optional=True) for name, shape in _BOXES.items()}
+        boxes["photograph"] = _PHOTOGRAPH
         return cls(kind, Schema({**tensors, **_DETECTIONS, **boxes}, shared | dict(record)), tuple(closer))
 
     def write(
@@ -118,7 +126,8 @@ class Format:
             "version": __version__,
             "classes": list(fields["classes"]),
             "lengths": [look.mask.shape[-1] for look in looks],
-            **{name: fields[name] for name in ("target", "found", "ending")},
+            **{name: fields[name] for name in ("target", "found", "ending", "least", "source")},
+            "targets": list(fields["targets"]),
             "decision": None,
             "closer": [{name: getattr(look, name) for name in self.closer} for look in fields["closer"]],
             **record,
@@ -127,6 +136,8 @@ class Format:
             values["decision"] = {name: getattr(decision, name) for name in _DECISION}
             if decision.box is not None:
                 whole["box"] = decision.box
+        if fields["photograph"] is not None:
+            whole["photograph"] = fields["photograph"]
         if fields["closer"]:
             whole["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
         write_file(path, whole, values)
@@ -160,6 +171,11 @@ class Format:
         classes, target, lengths = tuple(record["classes"]), record.get("target"), record["lengths"]
         check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
         check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
+        targets, least = tuple(record.get("targets") or ()), record.get("least")
+        check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
+        photograph = tensors.get("photograph")
+        sides = (1,) if photograph is None else photograph.shape[1:]
+        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
         parts = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
         decision, closer = record.get("decision"), record.get("closer") or []
         boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
@@ -171,6 +187,10 @@ class Format:
         return {
             "classes": classes,
             "target": target,
+            "targets": targets,
+            "least": LEAST if least is None else least,
+            "source": record.get("source"),
+            "photograph": photograph,
             "detections": tuple(Detections(*(part[None] for part in look)) for look in parts),
             "found": record["found"],
             "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from semfov.detection.detections import Detections
+from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
 from semfov.head.camera import CameraScene
 from semfov.head.scenes import Flat, Panorama
@@ -19,6 +22,10 @@ from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
+from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
+
+_BORDER = 2.0
+"""A box this near to a border of its view, in pixels of the view, counts as cut by it."""
 
 _WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
     "panorama": (Panorama, ("picture", "size", "cell", "reach")),
@@ -91,6 +98,40 @@ class HeadPath(GazeRecord):
         poses = [action // self.views.cells for action in self.actions]
         return sum(one != other for one, other in pairwise(poses))
 
+    @cached_property
+    def candidates(self) -> Objects:
+        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
+
+        A box is the smallest one around the region of the scene. One that crosses the seam of a panorama begins inside
+        the picture and ends beyond its right border. Of several boxes of one object, one that no border of the view
+        cuts is kept, and of these the box of the nearest fixation.
+        """
+        distances, cut = [], []
+        width, height = self.views.world.size
+        for number, (action, seen) in enumerate(zip(self.actions, self.detections, strict=True)):
+            boxes, field = seen.boxes[0], float(self.pose(number)[2])
+            point = self.views.view_grid.centres[action % self.views.cells]
+            distances.append(distances_to(boxes, point) * field / width)
+            border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
+            cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
+        looks = [self._in_picture(number) for number in range(len(self))]
+        around = float(self.size[0]) if self.views.world.closed else None
+        return merge_fixations(looks, distances, self.closer, cut=cut, around=around)
+
+    def region(self, number: int) -> tuple[float, float, float, float]:
+        """Part of the picture that a look showed: the smallest box around it.
+
+        Args:
+            number: number of the look, from 0.
+
+        Returns:
+            `(x1, y1, x2, y2)` in picture pixels; beyond the right border where it crosses the seam of a panorama.
+        """
+        width, height = self.views.world.size
+        frame = torch.tensor([[0.0, 0.0, width, height]])
+        x1, y1, x2, y2 = self.views.world.boxes(frame, self.pose(number))[0].tolist()
+        return x1, y1, x2, y2
+
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.
 
@@ -141,13 +182,8 @@ class HeadPath(GazeRecord):
         found = "" if self.target is None else (" found" if self.found else " not found")
         looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
-        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
-
-    def __repr__(self) -> str:
-        """One line on the outcome of the episode."""
-        what = "exploration" if self.target is None else self.target_name
-        found = "" if self.target is None else (", found" if self.found else ", not found")
-        return f"HeadPath: {what}{found}, {len(self)} looks, {self.turns} turns of the head, {self.seconds[-1]:.1f} s"
+        objects = f", {self.objects_in_words()}" if self.target is None else ""
+        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}{objects}"
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look.
@@ -179,6 +215,20 @@ class HeadPath(GazeRecord):
                 }
             )
         return rows
+
+    def _in_picture(self, number: int) -> Detections:
+        seen = self.detections[number]
+        boxes = self.views.world.boxes(seen.boxes[0], self.pose(number))
+        return replace(seen, boxes=boxes[None].to(seen.boxes))
+
+    def _duration(self, number: int) -> float | None:
+        return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
+
+    def _confirmations(self) -> list[ConfirmedPlace]:
+        decision = self.decision
+        if decision is not None and decision.box is not None:
+            decision = replace(decision, box=self.views.world.boxes(decision.box[None], self.pose(-1))[0])
+        return places_confirmed(decision, self.target, self.closer, len(self) - 1)
 
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         width, height = (int(side) for side in self.views.world.scene.extent)

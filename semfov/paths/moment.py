@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -11,7 +13,9 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.paths.base import Record, detections_in_words
+from semfov.detection.objects import Objects
+from semfov.paths.base import Record, RecordedLook
+from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -53,6 +57,30 @@ class Moment(Record):
     closer: CloseUp | None = None
 
     @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the frame in pixels."""
+        width, height = (int(side) for side in self.grid.extent)
+        return width, height
+
+    @property
+    def passes(self) -> int:
+        """One pass of the detector."""
+        return 1
+
+    def __iter__(self) -> Iterator[RecordedLook]:
+        """The look at the frame, with the whole frame as its region."""
+        (x, y), (width, height) = self.fixation.tolist(), self.size
+        yield RecordedLook(
+            0, (x, y), (0.0, 0.0, float(width), float(height)), self.detections, sum(self.seconds.values())
+        )
+
+    @cached_property
+    def candidates(self) -> Objects:
+        """Objects of the frame, of all scores from 0.05 on, with boxes in pixels of the frame."""
+        distances = distances_to(self.detections.boxes[0], self.fixation)
+        return merge_fixations([self.detections], [distances], [] if self.closer is None else [self.closer])
+
+    @property
     def probability(self) -> Tensor:
         """Probability that each cell holds the target, or any object in an exploration, `(X·Y,)`."""
         if self.target is None:
@@ -75,8 +103,11 @@ class Moment(Record):
 
     def _lines(self) -> list[str]:
         row, column = divmod(self.cell, self.grid.columns)
-        seen = detections_in_words(self.detections, self.classes)
-        return [f"frame {self.number}, at (column, row): ({column}, {row}), seen: {seen}"]
+        return [f"frame {self.number}, at (column, row): ({column}, {row})", self._listed()]
+
+    def _confirmations(self) -> list[ConfirmedPlace]:
+        closer = [] if self.closer is None else [self.closer]
+        return places_confirmed(self.decision, self.target, closer, 0)
 
     def rows(self) -> list[dict[str, Any]]:
         """The frame as a table of plain values.

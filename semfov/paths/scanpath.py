@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,14 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.detection.objects import Objects
 from semfov.episode import STAGES
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
-from semfov.paths.base import GazeRecord, detections_in_words
+from semfov.paths.base import GazeRecord
 from semfov.paths.drawing import drawing_of
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
+from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import Stimulus
 
 if TYPE_CHECKING:
@@ -50,7 +53,6 @@ _FORMAT = Format.of(
         "values": Field(("n", "cells"), mixed=True, finite=False),
         "posterior": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),
         "presence": Field(("n",), mixed=True, low=0, high=1 + 1e-3, optional=True),
-        "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
     {
@@ -119,7 +121,18 @@ class Scanpath(GazeRecord):
     @property
     def image(self) -> Tensor | None:
         """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
-        return None if self.stimulus is None else self.stimulus.image
+        return super().image if self.stimulus is None else self.stimulus.image
+
+    @cached_property
+    def candidates(self) -> Objects:
+        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
+
+        Of several boxes of one object, the box of the nearest fixation is kept, or that of a closer look. The score of
+        a closer look is the probability that the target is there.
+        """
+        points = self.fixations
+        distances = [distances_to(seen.boxes[0], point) for seen, point in zip(self.detections, points, strict=True)]
+        return merge_fixations(self.detections, distances, self.closer)
 
     def views(self) -> list[Tensor]:
         """The foveated photograph at each fixation.
@@ -147,7 +160,7 @@ class Scanpath(GazeRecord):
         """
         shifts = f"{self.shifts} gaze shift{'s' if self.shifts != 1 else ''}"
         if self.target is None:
-            return f"explored with {shifts}"
+            return f"explored with {shifts}: {self.objects_in_words()}"
         name, decision = self.classes[self.target], self.decision
         if decision is None:
             return f"“{name}” {'found after' if self.found else 'not found in'} {shifts}"
@@ -164,14 +177,14 @@ class Scanpath(GazeRecord):
         return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"
 
     def _lines(self) -> list[str]:
-        """The fixated cells and the detections of the last look."""
+        """The fixated cells and the objects."""
         grid, cells = self.grid, [self._place(cell) for cell in self.cells.tolist()]
         path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
         width, height = grid.extent.tolist()
         of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
         return [
             f"at (column, row): {' '.join(path)} of {of}",
-            f"seen last: {detections_in_words(self.detections[-1], self.classes)}",
+            self._listed(),
         ]
 
     def _place(self, cell: int) -> str:
@@ -223,10 +236,17 @@ class Scanpath(GazeRecord):
                     "highest_cell": None if belief is None else int(belief[number].argmax()),
                     "presence": None if self.presence is None else float(self.presence[number]),
                     **self._detected(self.detections[number]),
-                    "seconds": sum(self.seconds[number].values()) if self.seconds else None,
+                    "seconds": self._duration(number),
                 }
             )
         return rows
+
+    def _duration(self, number: int) -> float | None:
+        return sum(self.seconds[number].values()) if self.seconds else None
+
+    def _value(self, number: int) -> float | None:
+        value = float(self.values[number - 1, self.cells[number]]) if number else float("inf")
+        return value if abs(value) < float("inf") else None
 
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         width, height = (int(side) for side in self.grid.extent)
@@ -264,10 +284,12 @@ class Scanpath(GazeRecord):
         check(found is None or found < len(grid), "decision.cell", f"a cell number below {len(grid)}", found)
         for look in shared["closer"]:
             check(look.cell < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
+        stimulus = Stimulus.restored(tensors, record)
         return {
             "grid": grid,
             **{name: tensors[name] for name in ("cells", "fixations", "probabilities", "values")},
             **{name: tensors.get(name) for name in _OPTIONAL},
             "seconds": tuple(seconds),
-            "stimulus": Stimulus.restored(tensors, record),
+            "stimulus": stimulus,
+            "photograph": shared["photograph"] if stimulus is None else None,
         }

@@ -9,6 +9,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from semfov.data.large import LargePicture
+from semfov.data.reduction import reduction_for, resized
 from semfov.detection.placement import Placement, resize
 from semfov.errors import check, check_shape
 from semfov.eye import Eye
@@ -63,7 +65,7 @@ class Stimulus:
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
             canvas, placement = eye.detector.fit(image)
-            return cls(in_bytes(reduced(image[0])), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
+            return cls(reduced_copy(image[0]), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
 
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
@@ -81,7 +83,7 @@ class Stimulus:
         """
         kept = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
         values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
-        if not kept and not values:
+        if "canvas" not in tensors and not values:
             return None
         check(
             len(kept) == len(values) == 2,
@@ -90,8 +92,6 @@ class Stimulus:
             f"{len(kept) + len(values)} of these 4",
         )
         photograph, canvas = kept
-        longest = max(photograph.shape[1:])
-        check(min(photograph.shape[1:]) >= 1 and longest <= LONGEST, "photograph", f"1 to {LONGEST} px", longest)
         placement = Placement(**{name: tuple(value) for name, value in values[0].items()})
         for axis in (0, 1):
             room, side = canvas.shape[2 - axis], placement.size[axis] * placement.scale[axis]
@@ -154,6 +154,27 @@ def sensor_in_words(sensor: Mapping[str, Any]) -> str:
         told = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
         return ", ".join([str(sensor.get("kind", "sensor")), *told])
     return f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
+
+
+def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
+    """Reduce a picture to the bytes that a record keeps for its drawings.
+
+    Args:
+        picture: an opened picture of any size, or `(3, h, w)`, RGB in [0, 1].
+
+    Returns:
+        `(3, h, w)` uint8, with a longer side of at most `LONGEST` pixels.
+
+    >>> reduced_copy(torch.rand(3, 960, 2560)).shape
+    torch.Size([3, 480, 1280])
+    """
+    if isinstance(picture, Tensor):
+        return in_bytes(reduced(picture))
+    width, height = picture.size
+    scale = min(1.0, LONGEST / max(width, height))
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    pixels = picture.read((0, 0, width, height), reduction_for(int(1 / scale)))
+    return resized(pixels, size)[0].contiguous()
 
 
 def reduced(image: Tensor, longest: int = LONGEST) -> Tensor:

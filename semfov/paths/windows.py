@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
+from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
-from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import Objects
 
 _WINDOW = {
     "fixation": Pair((Number(), Number(), POSITIVE)),
@@ -67,24 +66,24 @@ class ZoomPath(GazeRecord):
         glances: looks in their order, the overview first. In a path from a file they have no gist.
         values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
             probability that the target is at the place.
-        objects: objects that were found, merged from all looks.
+        candidates: objects merged from all looks (`semfov.zoom.merge`), of all scores from 0.05 on.
         detections: detections of each look, batches of one, with boxes in picture pixels.
-        found: whether the decision is `found`, or without a decision, whether an object of the target was found.
+        found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
         closer: closer looks of a search, in their order; they are among the `glances`.
 
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> path = ZoomPath(
-    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(), values=(), objects=nothing
+    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(), values=(), candidates=nothing
     ... )
     >>> path.describe()
-    '0 × cup in 0 passes'
+    '0 × cup from score 0.3 in 0 passes'
     """
 
     lattice: Lattice
     glances: tuple[Glance, ...]
     values: tuple[float, ...]
-    objects: Objects
+    candidates: Objects = field()
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
@@ -93,14 +92,14 @@ class ZoomPath(GazeRecord):
 
     def __post_init__(self) -> None:
         """Derive what the looks and the decision tell."""
-        some = self.target is not None and len(self.objects.above(FOUND)) > 0
+        object.__setattr__(self, "detections", tuple(glance.detections for glance in self.glances))
+        some = bool(self._sought()) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
-        object.__setattr__(self, "detections", tuple(glance.detections for glance in self.glances))
 
     @property
     def passes(self) -> int:
-        """Number of passes of the detector."""
+        """Number of passes of the detector, closer looks included."""
         return len(self.glances)
 
     def describe(self) -> str:
@@ -109,20 +108,17 @@ class ZoomPath(GazeRecord):
         Returns:
             A line of text.
         """
-        count = len(self.objects.above(FOUND))
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
             outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
             return f"{self.target_name}: {outcome} in {passes}"
-        if self.target is None:
-            return f"{count} object{'s' if count != 1 else ''} in {passes}"
-        return f"{count} × {self.target_name} in {passes}"
+        return f"{self.objects_in_words()} in {passes}"
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
 
         Args:
-            number: number of the look; the overview is 0.
+            number: number of the look, from 0; the overview is 0.
 
         Returns:
             `(x1, y1, x2, y2)` in picture pixels.
@@ -139,16 +135,10 @@ class ZoomPath(GazeRecord):
         """The windows and the objects."""
         looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
-        sure = self.objects.above(FOUND)
-        named = [
-            f"{self.classes[label]} {score:.2f}"
-            for label, score in zip(sure.labels.tolist()[:5], sure.scores.tolist(), strict=False)
-        ]
-        more = ["…"] if len(sure) > 5 else []
         width, height = self.lattice.size
         return [
             f"at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
-            f"objects: {', '.join([*named, *more]) or 'none'}",
+            self._listed(),
         ]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -163,7 +153,7 @@ class ZoomPath(GazeRecord):
         """
         closer = {look.number: look.place for look in self.closer}
         rows = []
-        for number, (glance, value) in enumerate(zip(self.glances, self.values, strict=True)):
+        for number, glance in enumerate(self.glances):
             x, y, magnification = glance.window.fixation
             rows.append(
                 {
@@ -172,18 +162,22 @@ class ZoomPath(GazeRecord):
                     "y": y,
                     "magnification": magnification,
                     "level": glance.window.level,
-                    "value": value if abs(value) < float("inf") else None,
+                    "value": self._value(number),
                     "closer": closer.get(number),
                     **self._detected(glance.detections),
                 }
             )
         return rows
 
+    def _value(self, number: int) -> float | None:
+        value = self.values[number]
+        return value if abs(value) < float("inf") else None
+
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         return torch.tensor([glance.window.fixation[:2] for glance in self.glances]), self.lattice.size
 
     def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        tensors = {f"object_{name}": getattr(self.objects, name) for name in _OBJECTS}
+        tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
@@ -216,5 +210,5 @@ class ZoomPath(GazeRecord):
                 for window, seen, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
             ),
             "values": tuple(tensors["values"].tolist()),
-            "objects": objects,
+            "candidates": objects,
         }

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.paths import ZoomPath
-from semfov.zoom.gist import FOUND
 
 WIDTH = 480
 """Width of the drawing in pixels of the screen."""
@@ -30,7 +29,7 @@ def path_html(path: ZoomPath) -> str:
         shapes.append(_rect(window, "#0072b2", unit))
         at = f'x="{window[0] + 3 * unit:.0f}" y="{window[1] + 11 * unit:.0f}"'
         shapes.append(f'<text {at} font-size="{10 * unit:.0f}" fill="#0072b2">{number}</text>')
-    sure = path.objects.above(FOUND)
+    sure = path.objects
     for box, label, score in zip(sure.boxes.tolist()[:_MOST], sure.labels.tolist(), sure.scores.tolist(), strict=False):
         shapes.append(_rect(box, "#d55e00", unit, f"<title>{escape(path.classes[label])} {score:.2f}</title>"))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'

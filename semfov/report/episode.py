@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.detection.objects import FAINTEST
 from semfov.detection.placement import resize
 from semfov.paths import Scanpath, sensor_in_words
 from semfov.viz.belief import class_posterior
@@ -19,9 +20,6 @@ from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import entropy
 
 Data = dict[str, Any]
-
-LEAST = 0.05
-"""Detections of lower confidence are left out."""
 
 
 class Pool:
@@ -191,7 +189,7 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
     looked, classes = scanpath.detections[fixation][0], scanpath.classes
     kept = []
     for box, vector in zip(looked.boxes[:most], looked.scores[:most], strict=True):
-        if float(vector[1:].max()) >= LEAST:
+        if float(vector[1:].max()) >= FAINTEST:
             best = vector.topk(min(scores, len(vector)))
             pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
             top = [[classes[index], rounded(score)] for score, index in pairs]

@@ -81,7 +81,8 @@ def _picture(data: Data, pool: Pool) -> str:
         x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
         shapes.append(f'<g class="window" data-look="{number}">{_framed(look["box"])}{_rect(tag, "tag")}{text}</g>')
-    label = f"The picture with {len(windows)} numbered windows and {data['count']} objects"
+    several = "s" if data["count"] != 1 else ""
+    label = f"The picture with {len(windows)} numbered windows and {data['count']} object{several}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
         f'{_image(pool.pictures[data["image"]], (width, height))}{"".join(shapes)}<g class="chosen"></g></svg>'

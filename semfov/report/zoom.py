@@ -9,13 +9,13 @@ from typing import Any
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.data.reduction import reduction_for
+from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.paths import ZoomPath
 from semfov.report.episode import Data, Pool, rounded, tagged
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import Objects
 
 _Frame = tuple[int, int, int, int]
 
@@ -67,17 +67,17 @@ def zoom_data(
     >>> objects = Objects(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
     >>> path = ZoomPath(
     ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
-    ...     objects=objects, ending="passes",
+    ...     candidates=objects, ending="passes",
     ... )
     >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
-    ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup found. The only pass was used.')
+    ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup from score 0.3. The only pass was used.')
     """
     source = open_large(picture)
     wide, high = path.lattice.size
     check(tuple(source.size) == (wide, high), "picture", f"the picture of the path, {wide} × {high} px", source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    sure = path.objects.above(FOUND)
+    sure = path.objects
     objects = _objects(sure, path.classes)
     found = None if path.decision is None else path.decision.box
     return {
@@ -111,8 +111,7 @@ def outcome_in_words(path: ZoomPath) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
     target = path.target_name
     if path.decision is None:
-        count = len(path.objects.above(FOUND))
-        told = f"{count} object{'s' if count != 1 else ''} found." if target is None else f"{count} × {target} found."
+        told = f"{path.objects_in_words()}."
     else:
         outcome, probability = path.decision.outcome, path.decision.probability
         told = f"“{target}” {outcome}, probability that the picture holds it: {probability:.2f}."

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import Objects, merge
+from semfov.zoom.objects import merge
 
 if TYPE_CHECKING:
     from semfov.zoom.export import export_look
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 __all__ = [
     "GlimpseEvidence",
     "Lattice",
-    "Objects",
     "WindowEye",
     "WindowView",
     "export_look",

@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 
 from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
 from semfov.decision import CloseUp, Decision
+from semfov.detection import Objects
 from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write_file
 from semfov.paths import GazeRecord, HeadPath, Moment, Record, ZoomPath
-from semfov.zoom import Lattice, Objects
+from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice
 
 CLASSES = ("background", "cup", "cat")
@@ -74,7 +75,7 @@ def zoom_path():
         target=1,
         glances=glances,
         values=(float("inf"), 0.1 + 0.2, 0.75),
-        objects=objects,
+        candidates=objects,
         decision=Decision("found", 0.9, None, BOX, 0.8),
         closer=(CloseUp(None, 1, None, BOX, 0.8, 0.9, number=2),),
         ending="decision",
@@ -155,7 +156,7 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
         assert record.summary() == f"{described}. {why}"
     first = repr(record).splitlines()[0]
     assert first.startswith(f"{type(record).__name__}: ")
-    assert make is head_path or first == f"{type(record).__name__}: {record.summary()}"
+    assert first == f"{type(record).__name__}: {record.summary()}"
     rows = record.rows()
     json.dumps(rows, allow_nan=False)
     assert all({"x", "y", "detections", "seen", "score"} <= row.keys() for row in rows)
@@ -289,7 +290,7 @@ def test_scanpaths_that_version_0_1_saved_are_loaded():
         "Scanpath: “cup” found after 1 gaze shift and 1 closer look (probability 0.94, 0.94 at this place). "
         "A closer look confirmed the target.",
         "  at (column, row): (1, 0) (0, 0) of 2 × 1 cells over 8 × 4 px",
-        "  seen last: cup 0.75",
+        "  objects from score 0.3: cup 0.94 (confirmed)",
     ]
     assert loaded.classes == ("background", "cup")
     assert loaded.grid.size == (8, 4)

@@ -12,10 +12,11 @@ from eval.comparison.summary import Curve
 from eval.search.config import SearchConfig
 from semfov import Detections, Grid, Scanpath
 from semfov.decision import Decision
+from semfov.detection import Objects
 from semfov.paths import ZoomPath
 from semfov.report import Pool, write_page, zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
-from semfov.zoom import Lattice, Objects
+from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, on_lattice
 from tests import small
 
@@ -98,7 +99,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         )
         for number, action in enumerate([(0, 0, 0), (1, 0, 0), (1, 16, 8)])
     )
-    objects = Objects(boxes[1:, 0], torch.tensor([0.8, 0.2]), torch.tensor([2, 2]), torch.tensor([1, 2]))
+    objects = Objects(boxes[1:, 0], torch.tensor([0.8, 0.4]), torch.tensor([2, 2]), torch.tensor([1, 2]))
     classes = ("background", "cat", hostile, "cup")
     decision = Decision("found", 0.93, None, boxes[1, 0])
     return ZoomPath(
@@ -107,7 +108,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         target=2,
         glances=glances,
         values=(float("inf"), 0.5, 0.25),
-        objects=objects,
+        candidates=objects,
         decision=decision,
     )
 

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 
 from semfov.decision import CloseUp, Decision
+from semfov.detection import Objects
 from semfov.errors import InputError
 from semfov.report import Pool, episode_data, page_html, zoom_data
 from semfov.report.zoom import LISTED, SHOWN
-from semfov.zoom import Objects
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -107,7 +107,7 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     many = LISTED + 7
-    scores = torch.linspace(0.9, 0.2, many)
+    scores = torch.linspace(0.9, 0.3, many)
     place = torch.tensor([[10.0, 10, 20, 20]]).expand(many, 4)
     objects = Objects(place, scores, torch.full((many,), 2), torch.zeros(many).long())
     first = zoom_path.glances[0]
@@ -118,12 +118,17 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
         mask=torch.ones(1, many, dtype=torch.bool),
     )
     glances = (replace(first, detections=seen), *zoom_path.glances[1:])
-    data = zoom_data(replace(zoom_path, objects=objects, glances=glances), large_picture, pool := Pool(), name="crowd")
+    data = zoom_data(
+        replace(zoom_path, candidates=objects, decision=None, glances=glances),
+        large_picture,
+        pool := Pool(),
+        name="crowd",
+    )
     page = page_html("crowd", [data], pool)
     assert "<p>7 less confident objects are left out.</p>" in page
     assert f"<p>{many - SHOWN} less confident detections are left out.</p>" in page
     assert page.count("0.90</td>") == 1
-    one = replace(zoom_path, objects=objects[torch.arange(LISTED + 1)])
+    one = replace(zoom_path, decision=None, candidates=objects[torch.arange(LISTED + 1)])
     page = page_html("crowd", [zoom_data(one, large_picture, pool := Pool(), name="crowd")], pool)
     assert "<p>1 less confident object is left out.</p>" in page
 
@@ -141,14 +146,14 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
         (Decision("undecided", 0.6), "decision", "0.60. No remaining look is worth a pass, but .* probably there.$"),
         (Decision("undecided", 0.2), "windows", "0.20. No remaining look can show the target.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
-        (None, "passes", "^0 × cat found. All 3 passes were used.$"),
-        (None, "worth", "^0 × cat found. No remaining look is expected to show enough new objects.$"),
-        (None, None, "^0 × cat found.$"),
+        (None, "passes", "^0 × cat from score 0.3. All 3 passes were used.$"),
+        (None, "worth", "^0 × cat from score 0.3. No remaining look is expected to show enough new objects.$"),
+        (None, None, "^0 × cat from score 0.3.$"),
     ],
 )
 def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, ending, told):
-    nothing = zoom_path.objects.above(1)
-    path = replace(zoom_path, target=1, decision=decision, objects=nothing, ending=ending)
+    nothing = zoom_path.candidates.above(1)
+    path = replace(zoom_path, target=1, decision=decision, candidates=nothing, ending=ending)
     data = zoom_data(path, large_picture, pool := Pool(), name="field.png")
     assert re.search(told, data["decision"])
     page = page_html("t", [data], pool)

@@ -168,10 +168,9 @@ def test_a_path_has_a_text_and_an_html_form(eye, picture):
     assert repr(path).startswith(f"ZoomPath: {path.describe()}")
     assert "All 9 passes were used." in repr(path)
     assert "All 9 passes were used." in path._repr_html_()
-    assert "blue" in repr(path)
     drawing = ElementTree.fromstring(path._repr_html_().replace("<br>", "<br/>")).find("svg")
     rectangles = drawing.findall("rect")
-    assert len(rectangles) == 1 + (path.passes - 1) + len(path.objects.above(0.1))
+    assert len(rectangles) == 1 + (path.passes - 1) + len(path.objects)
     assert len(drawing.findall("text")) == path.passes - 1
     for number in range(path.passes):
         box, action = path.region(number), path.glances[number].window

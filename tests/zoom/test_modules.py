@@ -47,4 +47,4 @@ class TestZoomAgent(BaseTester):
 
     @staticmethod
     def call(module, picture):
-        return module.explore(picture, passes=3, worth=0.0).objects.boxes
+        return module.explore(picture, passes=3, worth=0.0).candidates.boxes

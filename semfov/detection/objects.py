@@ -1,0 +1,235 @@
+"""Objects of a picture, merged from the boxes of many looks at it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from semfov.detection.overlaps import intersection, neighbours, survivors
+from semfov.errors import InputError, check, check_number, check_shape
+
+LEAST = 0.3
+"""Score from which on objects are shown, printed, drawn and counted, unless another one is given."""
+
+FAINTEST = 0.05
+"""Score from which on boxes are merged into candidates."""
+
+_BORDER = 2 / 416
+"""Boxes that come this near to a border of their window, in longer sides of the window, are cut by it."""
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Objects of a picture, most confident first.
+
+    Attributes:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        scores: `(M,)`, score of the class.
+        labels: `(M,)`, classes 1..K.
+        passes: `(M,)`, number of the look that each box comes from; the first one is 0.
+
+    >>> objects = Objects(torch.zeros(2, 4), torch.tensor([0.9, 0.2]), torch.tensor([1, 3]), torch.tensor([0, 4]))
+    >>> len(objects), len(objects.above(0.5)), len(objects.of([3]))
+    (2, 1, 1)
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    labels: Tensor
+    passes: Tensor
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    @classmethod
+    def none(cls) -> Objects:
+        """No objects.
+
+        Returns:
+            The objects of a picture in which nothing was found.
+        """
+        nothing = torch.zeros(0)
+        return cls(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
+
+    def above(self, score: float) -> Objects:
+        """Objects with at least a given score.
+
+        Args:
+            score: the lowest score.
+
+        Returns:
+            The objects.
+        """
+        return self[self.scores >= score]
+
+    def of(self, labels: Sequence[int]) -> Objects:
+        """Objects of some classes.
+
+        Args:
+            labels: the classes, 1..K; none stands for all classes.
+
+        Returns:
+            The objects.
+        """
+        return self[torch.isin(self.labels, torch.tensor(labels))] if len(labels) else self
+
+    def __getitem__(self, index: Tensor) -> Objects:
+        """Some of the objects."""
+        return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index])
+
+
+def merge_boxes(
+    boxes: ArrayLike | Tensor,
+    scores: ArrayLike | Tensor,
+    labels: ArrayLike | Tensor,
+    windows: ArrayLike | Tensor | None = None,
+    *,
+    size: tuple[float, float] | None = None,
+    score: float = FAINTEST,
+    iou: float = 0.5,
+    inside: float = 0.8,
+) -> Objects:
+    """Merge boxes from several windows of a picture into one box for each object.
+
+    The boxes may come from any detector, for instance from one that was applied to slices of the picture. They are
+    merged by the rule of `merge_looks`: of two boxes of the same object, a whole box is kept rather than one that the
+    border of its window cuts. If both or neither are cut, the box of the smaller window is kept, and within a window
+    the box with the higher score.
+
+    Args:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        scores: `(M,)`, scores from 0 to 1.
+        labels: `(M,)`, classes. Boxes of different classes are different objects.
+        windows: `(M, 4)`, the window that each box was seen in, in picture pixels; None for one look at the whole
+            picture.
+        size: `(width, height)` of the picture, whose border cuts no object; None takes the border of all windows.
+        score: boxes with a lower score are left out.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+
+    Returns:
+        Objects, most confident first. Their `passes` number the windows in the order in which they first appear.
+
+    Raises:
+        InputError: a shape is wrong, or a number is out of range.
+
+    >>> slices = [[0, 0, 640, 640], [400, 0, 1040, 640]]
+    >>> merged = merge_boxes([[500, 90, 639, 200], [502, 91, 700, 202]], [0.9, 0.8], [3, 3], slices, size=(1040, 640))
+    >>> merged.boxes.tolist(), merged.passes.tolist()
+    ([[502.0, 91.0, 700.0, 202.0]], [1])
+    """
+    box, value = _numbers(boxes, "boxes"), _numbers(scores, "scores")
+    label = torch.as_tensor(labels, dtype=torch.long, device="cpu")
+    box = box.view(0, 4) if not box.numel() else box
+    check_shape(box, "boxes", None, 4)
+    check_shape(value, "scores", len(box))
+    check_shape(label, "labels", len(box))
+    check(bool(((value >= 0) & (value <= 1)).all()), "scores", "numbers from 0 to 1", value.tolist()[:3])
+    for name, number in (("score", score), ("iou", iou), ("inside", inside)):
+        check_number(number, name, 0, 1)
+    looks, cut, sharpness = torch.zeros(len(box)).long(), torch.zeros(len(box)).bool(), torch.zeros(len(box))
+    if windows is not None and len(box):
+        window = _numbers(windows, "windows")
+        check_shape(window, "windows", len(box), 4)
+        side = (window[:, 2:] - window[:, :2]).amax(-1)
+        check(bool((side > 0).all()), "windows", "boxes (x1, y1, x2, y2) of some size", window.tolist()[:3])
+        low, high = (window[:, :2].amin(0), window[:, 2:].amax(0)) if size is None else (0.0, torch.tensor(size))
+        near, far = box - window <= _BORDER * side[:, None], box - window >= -_BORDER * side[:, None]
+        cut = (near[:, :2] & (window[:, :2] > low)).any(-1) | (far[:, 2:] & (window[:, 2:] < high)).any(-1)
+        numbers: dict[tuple[float, ...], int] = {}
+        looks = torch.tensor([numbers.setdefault(tuple(each), len(numbers)) for each in window.tolist()])
+        sharpness = -side
+    return merge_looks(box, value, label, looks, cut, sharpness, score=score, iou=iou, inside=inside)
+
+
+def merge_looks(
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    looks: Tensor,
+    cut: Tensor,
+    sharpness: Tensor,
+    *,
+    score: float = FAINTEST,
+    iou: float = 0.5,
+    inside: float = 0.8,
+    around: float | None = None,
+) -> Objects:
+    """Merge the boxes of several looks into one box for each object.
+
+    Two boxes of one class are the same object when their intersection over union is at least `iou`. Boxes of two looks
+    are also the same object when one of them is cut, and at least `inside` of its area lies in the other. Of two boxes
+    of the same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
+    sharply is kept, and of those the one with the higher score.
+
+    Args:
+        boxes: `(M, 4)`, in picture pixels.
+        scores: `(M,)`, scores.
+        labels: `(M,)`, classes.
+        looks: `(M,)`, number of the look of each box.
+        cut: `(M,)`, boolean, boxes that the border of their look cuts.
+        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
+        score: boxes with a lower score are left out.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+        around: width of a picture whose left and right borders meet; None for others.
+
+    Returns:
+        Objects, most confident first.
+    """
+    enough = (scores >= score).nonzero()[:, 0]
+    # Stable sorts, the last key first.
+    order = enough[scores[enough].argsort(descending=True, stable=True)]
+    order = order[sharpness[order].argsort(descending=True, stable=True)]
+    order = order[cut[order].int().argsort(stable=True)]
+    box, value, label, cut, number = boxes[order], scores[order], labels[order], cut[order], looks[order]
+    kept = _unlike(box, label, cut, number, iou, inside, around)
+    kept = kept[value[kept].argsort(descending=True, stable=True)]
+    return Objects(box[kept], value[kept], label[kept], number[kept])
+
+
+def _unlike(
+    box: Tensor, label: Tensor, cut: Tensor, number: Tensor, iou: float, inside: float, around: float | None
+) -> Tensor:
+    """Indices of the boxes that stay when each one, in order, removes later ones that are the same object."""
+    corners, labels, looks, broken = box.numpy(), label.numpy().astype(np.float64), number.numpy(), cut.numpy()
+    count = len(corners)
+    if around is not None:
+        # Every box is there a second time, one turn further, so that boxes meet across the seam.
+        turned = corners + np.array([around, 0, around, 0], corners.dtype)
+        corners, labels = np.concatenate([corners, turned]), np.tile(labels, 2)
+    # Classes are moved apart, so that neighbours along x are of one class.
+    shift = labels * (2 * np.abs(corners).max(initial=0) + 1)
+    start, end = corners[:, 0] + shift, corners[:, 2] + shift
+    order = start.argsort(kind="stable")
+    one, other = neighbours(start[order], end[order])
+    one, other = order[one], order[other]
+    x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
+    shared = intersection(x1, y1, x2, y2, one, other)
+    if around is not None:
+        one, other = one % count, other % count
+        apart = one != other
+        one, other, shared = one[apart], other[apart], shared[apart]
+    first, second = np.minimum(one, other), np.maximum(one, other)
+    area = ((x2 - x1) * (y2 - y1))[:count]
+    union = area[first] + area[second] - shared
+    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    part = shared / np.maximum(area, 1e-6)[second]
+    same |= (part >= np.float32(inside)) & broken[second] & (looks[first] != looks[second])
+    return torch.from_numpy(survivors(count, first[same], second[same]))
+
+
+def _numbers(given: ArrayLike | Tensor, name: str) -> Tensor:
+    """Numbers as a tensor of floats on the CPU."""
+    try:
+        tensor = torch.as_tensor(given, device="cpu").detach()
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{name}: expected numbers, got {given!r:.80}") from None
+    tensor = tensor if tensor.is_floating_point() else tensor.float()
+    check(bool(tensor.isfinite().all()), name, "finite numbers", "infinite ones or NaN")
+    return tensor

@@ -1,0 +1,162 @@
+"""Objects of a record: merged from the detections of its looks, and confirmed by closer looks and the decision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from semfov.decision import SAME, CloseUp, Decision
+from semfov.detection.detections import Detections
+from semfov.detection.objects import FAINTEST, Objects, merge_looks
+from semfov.observation.matching import box_iou
+
+CONFIRMED = 0.5
+"""Probability from which on a closer look confirms that the target is there."""
+
+
+class ConfirmedPlace(NamedTuple):
+    """A place that was confirmed.
+
+    Attributes:
+        box: `(4,)` in picture pixels.
+        label: class, 1..K.
+        probability: probability that the class is there.
+        look: number of the look that the box comes from.
+    """
+
+    box: Tensor
+    label: int
+    probability: float
+    look: int
+
+
+def merge_fixations(
+    looks: Sequence[Detections],
+    distances: Sequence[Tensor],
+    closer: Sequence[CloseUp] = (),
+    *,
+    cut: Sequence[Tensor] | None = None,
+    around: float | None = None,
+) -> Objects:
+    """Merge the detections of several fixations into one box for each object (`merge_looks`).
+
+    The nearest fixation sees a box most sharply, and a closer look more sharply still. The score of the box of a closer
+    look is the probability that the target is there, so a place that a closer look has refuted is no candidate.
+
+    Args:
+        looks: detections of each fixation, a batch of one, boxes in picture pixels.
+        distances: for each fixation, its distance `(L,)` to each of the boxes.
+        closer: closer looks.
+        cut: for each fixation, which of its boxes `(L,)` the border of the view cuts; None where views have no border.
+        around: width of a picture whose left and right borders meet; None for others.
+
+    Returns:
+        Objects, most confident first.
+
+    >>> far, near = torch.tensor([[[0.0, 0, 10, 10]]]), torch.tensor([[[0.0, 1, 11, 10]]])
+    >>> scores, one = torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool)
+    >>> looks = Detections(far, scores, one), Detections(near, scores, one)
+    >>> merge_fixations(looks, [torch.tensor([90.0]), torch.tensor([5.0])]).boxes
+    tensor([[ 0.,  1., 11., 10.]])
+    """
+    boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []
+    for number, (seen, distance) in enumerate(zip(looks, distances, strict=True)):
+        kept = seen.mask[0] & (seen.confidence[0] >= FAINTEST)
+        boxes.append(seen.boxes[0, kept].detach().float().cpu())
+        scores.append(seen.confidence[0, kept].detach().float().cpu())
+        labels.append(seen.labels[0, kept].cpu())
+        numbers.append(torch.full((len(boxes[-1]),), number))
+        sharpness.append(-distance[kept].detach().float().cpu())
+        broken.append(torch.zeros(len(boxes[-1])).bool() if cut is None else cut[number][kept].cpu())
+    for look in closer:
+        boxes.append(look.box[None].detach().float().cpu())
+        scores.append(torch.tensor([look.place]))
+        labels.append(torch.tensor([look.target]))
+        numbers.append(torch.tensor([number_of(look)]))
+        sharpness.append(torch.tensor([1.0]))
+        broken.append(torch.tensor([False]))
+    if not boxes:
+        return Objects.none()
+    parts = (torch.cat(part) for part in (boxes, scores, labels, numbers, broken, sharpness))
+    return merge_looks(*parts, score=0.0, around=around).above(FAINTEST)
+
+
+def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
+    """Distance of a point to boxes; 0 inside a box.
+
+    Args:
+        boxes: `(L, 4)`.
+        point: `(2,)`, `(x, y)`, in pixels whose centres are at integers.
+
+    Returns:
+        `(L,)`.
+
+    >>> distances_to(torch.tensor([[10.0, 10, 20, 20], [0, 0, 4, 5]]), torch.tensor([6.5, 8.5])).tolist()
+    [3.1622776985168457, 5.0]
+    """
+    at = (point + 0.5).to(boxes)
+    beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)
+    return torch.linalg.vector_norm(beside, dim=-1)
+
+
+def number_of(look: CloseUp) -> int:
+    """Number of the look that a closer look is, or after which it was made."""
+    return (look.fixation if look.number is None else look.number) or 0
+
+
+def places_confirmed(
+    decision: Decision | None, target: int | None, closer: Sequence[CloseUp], last: int
+) -> list[ConfirmedPlace]:
+    """The places that closer looks confirmed, and the one that the decision found.
+
+    Args:
+        decision: decision of a search; None without one.
+        target: class that it is about.
+        closer: closer looks.
+        last: number of the last look.
+
+    Returns:
+        The places, each one once.
+    """
+    found = decision.box if decision is not None and decision.outcome == "found" else None
+    others = [look for look in closer if look.place >= CONFIRMED and (found is None or not look.box.equal(found))]
+    places = [ConfirmedPlace(look.box, look.target, look.place, number_of(look)) for look in others]
+    if found is not None and decision is not None and target is not None:
+        last = next((number_of(look) for look in closer if look.box.equal(found)), last)
+        probability = decision.probability if decision.place is None else decision.place
+        places.append(ConfirmedPlace(found, target, probability, last))
+    return places
+
+
+def confirm(candidates: Objects, places: Sequence[ConfirmedPlace], least: float) -> tuple[Objects, Tensor]:
+    """The candidates that count as objects: those with a high score, and those that were confirmed.
+
+    Args:
+        candidates: the candidates.
+        places: places that were confirmed. The candidate that overlaps a place by half takes its probability as score,
+            if that is higher. A place without a candidate becomes an object.
+        least: score from which on others count.
+
+    Returns:
+        The objects, most confident first, and which of them were confirmed, `(M,)` boolean.
+    """
+    boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
+    sure = torch.zeros(len(candidates), dtype=torch.bool)
+    for place in places:
+        box, probability = place.box[None].to(boxes), scores.new_tensor([place.probability])
+        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != place.label, 0)
+        same = overlap.argmax()[None] if len(overlap) else overlap.long()
+        if not bool((overlap[same] >= SAME).any()):
+            same = torch.tensor([len(boxes)])
+            boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
+            labels = torch.cat([labels, labels.new_tensor([place.label])])
+            looks = torch.cat([looks, looks.new_tensor([place.look])])
+            sure = torch.cat([sure, torch.tensor([False])])
+        scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
+        sure[same] = True
+    order = scores.argsort(descending=True, stable=True)
+    order = order[((scores >= least) | sure)[order]]
+    return Objects(boxes, scores, labels, looks)[order], sure[order]

@@ -1,0 +1,136 @@
+"""Objects of records: one set, merged from all looks, and confirmed by closer looks and the decision."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.decision import CloseUp, Decision
+from semfov.head import Flat, Panorama, Views
+from semfov.paths import HeadPath
+from semfov.sensor.sphere import panorama_directions
+from tests import small
+
+CLASSES = ("background", "cup", "cat")
+LEFT, RIGHT = [10.0, 10, 30, 30], [50.0, 40, 70, 55]
+
+
+def look(*found):
+    """Detections of a look: box, class and score of each, the most confident first."""
+    rows = sorted(found, key=lambda each: -each[2])
+    scores = torch.zeros(1, len(rows), 3)
+    for number, (_, label, score) in enumerate(rows):
+        scores[0, number, 0], scores[0, number, label] = 1 - score, score
+    boxes = torch.tensor([box for box, *_ in rows]).view(1, -1, 4)
+    return Detections(boxes, scores, torch.ones(1, len(rows), dtype=torch.bool))
+
+
+def scanpath(*looks, cells=(0, 11), **options):
+    """Fixations on a grid of 4 × 3 cells over 80 × 60 px."""
+    return small.scanpath(Grid(4, 3, (80, 60)), torch.tensor(cells), CLASSES, detections=looks, **options)
+
+
+def shifted(box, by):
+    return [n + by for n in box]
+
+
+def test_the_nearest_fixation_and_the_closer_look_have_the_box():
+    near_left, near_right = (
+        look((LEFT, 1, 0.4), (shifted(RIGHT, 2), 1, 0.9)),
+        look((shifted(LEFT, 2), 1, 0.8), (RIGHT, 1, 0.5)),
+    )
+    path = scanpath(near_left, near_right, target=None)
+    assert path.objects.boxes.tolist() == [RIGHT, LEFT]
+    assert path.objects.passes.tolist() == [1, 0]
+    assert not path.confirmed.any()
+    box = torch.tensor(shifted(LEFT, 1))
+    sought = replace(path, target=1, closer=(CloseUp(1, 1, 0, box, 0.75, 0.9),))
+    assert sought.objects.boxes.tolist() == [box.tolist(), RIGHT]
+    assert sought.objects.scores.tolist() == [0.75, 0.5]
+    assert sought.confirmed.tolist() == [True, False]
+    assert sought.passes == 3
+    refuted = replace(sought, closer=(CloseUp(1, 1, 0, box, 0.01, 0.2),))
+    assert refuted.objects.boxes.tolist() == [RIGHT]
+
+
+def test_what_the_decision_found_is_among_the_objects():
+    """Also where no detection has the score, or there is none at the place."""
+    weak = scanpath(look((LEFT, 1, 0.2)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.31)), target=1)
+    assert weak.objects.boxes.tolist() == [RIGHT]
+    for box, boxes in ((shifted(LEFT, 1), [LEFT, RIGHT]), ([70.0, 0, 80, 9], [[70.0, 0, 80, 9], RIGHT])):
+        decided = replace(weak, decision=Decision("found", 0.8, 0, torch.tensor(box)))
+        assert decided.objects.boxes.tolist() == boxes
+        assert decided.confirmed.tolist() == [True, False]
+        assert decided.objects.scores.tolist() == pytest.approx([0.8, 0.31])
+    absent = replace(weak, decision=Decision("absent", 0.1, None, None))
+    assert absent.objects.boxes.tolist() == [RIGHT]
+
+
+def test_objects_are_those_of_the_targets_from_the_threshold_on():
+    path = scanpath(look((LEFT, 1, 0.4), (RIGHT, 2, 0.9)), look((shifted(LEFT, 40), 2, 0.06)), target=None)
+    assert len(path.candidates) == 3
+    assert path.objects.labels.tolist() == [2, 1]
+    assert path.expected == {"cat": 1.0, "cup": 1.0}
+    assert replace(path, least=0.5).describe().endswith(": 1 object from score 0.5")
+    assert replace(path, target=1).expected == {"cup": 1.0}
+    assert replace(path, targets=(1, 2)).objects_in_words() == "1 × cup, 1 × cat from score 0.3"
+    rows = path.object_rows()
+    json.dumps(rows)
+    assert rows[0]["class"] == "cat"
+    assert [rows[0][name] for name in ("x1", "y1", "x2", "y2")] == RIGHT
+    assert (rows[0]["x"], rows[0]["y"], rows[0]["look"], rows[0]["confirmed"]) == (60.0, 47.5, 0, False)
+    frame = path.to_frame("objects")
+    assert frame.to_dict("records") == rows
+
+
+def test_looks_are_given_one_by_one():
+    path = scanpath(look((LEFT, 1, 0.4)), look(), target=1, seconds=({"open": 0.5, "detect": 1.0}, {"detect": 0.25}))
+    first, second = path
+    assert first.fixation == tuple(path.fixations[0].tolist())
+    assert first.region == (0, 0, 80, 60)
+    assert (first.number, first.seconds, first.value) == (0, 1.5, None)
+    assert second.value == float(path.values[0, 11])
+    assert torch.equal(first.detections.boxes, path.detections[0].boxes)
+
+
+def head_path(world, actions, looks):
+    views = Views(world)
+    maps = torch.zeros(len(looks), len(world.scene))
+    parts = {"target": None, "classes": CLASSES, "maps": maps, "seconds": (0.5, 1.25)[: len(looks)]}
+    return HeadPath(views=views, actions=actions, detections=tuple(looks), **parts)
+
+
+def test_boxes_of_a_head_are_in_pixels_of_the_picture_and_meet_across_the_seam():
+    """Two views from either side of the seam of a panorama show one object on it."""
+    world = Panorama((256, 128), (64, 48))
+    views = Views(world)
+    behind = panorama_directions(torch.tensor([[252.5, 63.5]]), world.picture)
+    poses = [n for n, pose in enumerate(views.poses) if pose[1] == 0 and world.to_view(behind, pose)[1].all()]
+    looks, actions = [], []
+    for pose in poses[:2]:
+        x, y = world.to_view(behind, views.poses[pose])[0][0].tolist()
+        looks.append(look(([x - 6, y - 6, x + 7, y + 7], 1, 0.6)))
+        actions.append(pose * views.cells + 55)
+    path = head_path(world, tuple(actions), looks)
+    assert len(path) == 2
+    x1, y1, x2, y2 = path.objects.boxes[0].tolist()
+    assert len(path.objects) == 1
+    assert 0 <= x1 < 256 < x2
+    assert (x1 + x2) / 2 == pytest.approx(253, abs=1.0)
+    assert (y1 + y2) / 2 == pytest.approx(64, abs=0.5)
+    first, second = path
+    assert second.seconds == 0.75
+    assert first.region[2] - first.region[0] == pytest.approx(256 / 6, rel=0.05)
+
+
+def test_boxes_of_a_flat_scene_are_scaled():
+    world = Flat((640, 480), (40, 30), degree=8)
+    path = head_path(world, (455,), [look(([10.0, 10, 20, 20], 1, 0.6))])
+    x1, y1, x2, _ = path.region(0)
+    scale = (x2 - x1) / 40
+    assert path.objects.boxes[0].tolist() == pytest.approx(
+        [x1 + 10 * scale, y1 + 10 * scale, x1 + 20 * scale, y1 + 20 * scale]
+    )
+    assert path.size == (640, 480)
