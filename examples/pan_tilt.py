@@ -6,6 +6,10 @@ Run it from a checkout: python -m examples.pan_tilt PANORAMA.jpg cup --out found
 import argparse
 import math
 import random
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 import semfov
 from semfov.head import CameraFrame, Panoramas, PanTiltCamera, Speeds
@@ -48,7 +52,7 @@ class SimulatedCamera(PanTiltCamera):
         # The last movement: its start, its end, and where it leads from and to.
         self._move = (0.0, 0.0, self._sent, self._sent)
 
-    def look_at(self, direction: tuple[float, float], field: float) -> CameraFrame | object:
+    def look_at(self, direction: tuple[float, float], field: float) -> CameraFrame | NDArray[np.uint8]:
         """Turn to a direction, wait until the motors have stopped, and take the next frame that arrives."""
         if direction != self._sent:
             self._send(direction)
@@ -81,7 +85,7 @@ def main() -> None:
     """Search a panorama, or one made of embedded scenes if none is given, with a simulated camera."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("panorama", nargs="?", help="image file (default: embedded scenes on a sphere)")
-    parser.add_argument("target", nargs="?", default="cat", help="class to search for (default: cat)")
+    parser.add_argument("target", nargs="?", default="motorcycle", help="class to search for")
     parser.add_argument("--delay", type=float, default=0.3, help="age of frames in seconds (default: 0.3)")
     parser.add_argument("--noise", type=float, default=0.5, help="error of directions in degrees (default: 0.5)")
     parser.add_argument("--blind", action="store_true", help="the camera does not report its direction")
@@ -97,7 +101,7 @@ def main() -> None:
     panorama = semfov.Panorama(picture)
     camera = SimulatedCamera(panorama, delay=arguments.delay, noise=arguments.noise, reports=not arguments.blind)
 
-    path = agent.search(camera, arguments.target, duration=arguments.seconds, color="bgr")
+    path: Any = agent.search(camera, arguments.target, duration=arguments.seconds, color="bgr")
     for number, seconds in enumerate(path.seconds):
         pan, tilt, _ = path.pose(number).tolist()
         print(f"{seconds:5.2f} s: camera at pan {pan:.0f}°, tilt {tilt:.0f}°")
