@@ -178,12 +178,12 @@ class HeadPath(GazeRecord):
         Returns:
             The line.
         """
-        what = "exploration" if self.target is None else self.target_name
-        found = "" if self.target is None else (" found" if self.found else " not found")
         looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
-        objects = f", {self.objects_in_words()}" if self.target is None else ""
-        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}{objects}"
+        what = self.objects_in_words()
+        if self.decision is not None:
+            what = f"{self.target_name}: {self.decision.outcome} ({self.decision.probability:.2f})"
+        return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look.
