@@ -13,7 +13,7 @@ from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.observers.target import TargetLook
 from semfov.belief.target_evidence import Thresholds
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from tests import small
 
 GRID = Grid(6, 4, (90, 60))
@@ -298,31 +298,6 @@ def test_log_odds_equal_a_loop_in_float64(gathered, reference):
         assert cells[row].tolist() == pytest.approx(expected, abs=1e-7)
         assert emptied[row].tolist() == pytest.approx(following, abs=1e-7)
         assert float(image[row]) == pytest.approx(anywhere, abs=1e-7)
-
-
-@pytest.mark.parametrize("thresholds", [None, Thresholds(0.83, 0.05)], ids=["none", "chosen"])
-def test_a_model_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
-    torch.manual_seed(1)
-    model = TargetEvidence(8, 6, components=4, thresholds=thresholds).eval()
-    torch.nn.init.normal_(model.prior)
-    model.metadata = {"detector": {"name": "toy"}, "sensor": {}}
-    model.save(tmp_path / "model.safetensors")
-    loaded = TargetEvidence.from_pretrained(tmp_path / "model.safetensors")
-    assert loaded.metadata == model.metadata
-    assert loaded.thresholds == thresholds == Target(loaded).thresholds
-    assert loaded.widths == (8, 6)
-    assert loaded.prior.shape == (4,)
-    with torch.no_grad():
-        ours, theirs = (believe(Target(each), looks, (0, 1, 2), 3) for each in (model, loaded))
-    assert torch.equal(ours.present, theirs.present)
-    assert torch.equal(ours.following, theirs.following)
-    assert torch.equal(ours.anywhere, theirs.anywhere)
-    loaded.save(tmp_path / "again.safetensors")
-    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
-    with pytest.raises(InputError, match="fitted for 'toy'"):
-        loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
-    with pytest.raises(DataError):
-        TargetEvidence.from_pretrained(tmp_path / "none.safetensors")
 
 
 def test_bad_input(looks, model):

@@ -15,7 +15,7 @@ import scipy.stats
 import torch
 
 from semfov.belief.fusion import kaplan
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
@@ -348,26 +348,6 @@ def test_header_is_readable_json(tmp_path):
     assert record["metadata"]["detector"]["digest"] == DETECTOR["digest"]
     assert record["version"]
     assert record["epsilon"] == 1e-6
-
-
-def test_shipped_models_are_found_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(FovealObservationModel, "shipped", tmp_path)
-    FovealObservationModel(table(), EDGES, CLASSES).save(tmp_path / "toy-tiny.safetensors")
-    assert FovealObservationModel.from_pretrained("toy-tiny").classes == tuple(CLASSES)
-    with pytest.raises(InputError, match="did you mean 'toy-tiny'"):
-        FovealObservationModel.from_pretrained("toy-tyni")
-
-
-def test_bad_files_are_refused(tmp_path):
-    path = tmp_path / "model.safetensors"
-    with pytest.raises(DataError, match="no such file"):
-        FovealObservationModel.from_pretrained(path)
-    path.write_bytes(b"not a model")
-    with pytest.raises(DataError, match="not a readable"):
-        FovealObservationModel.from_pretrained(path)
-    DirichletStatistics((2,), 3).save(path)
-    with pytest.raises(DataError, match="expected a file of kind foveal-observation-model, got dirichlet-statistics"):
-        FovealObservationModel.from_pretrained(path)
 
 
 class Toy:
