@@ -190,13 +190,6 @@ def test_alpha_can_be_trained_and_stays_positive():
     assert losses[-1] < losses[0] / 2
 
 
-def test_likelihoods_compile_to_one_graph():
-    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
-    given = looks(dtype=torch.float32)
-    compiled = torch.compile(model.log_likelihood, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(*given), model.log_likelihood(*given))
-
-
 def test_calls_use_the_current_parameters():
     model = FovealObservationModel(table(), EDGES, CLASSES).eval()
     scores, distance = looks()
