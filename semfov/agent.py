@@ -17,7 +17,7 @@ from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
@@ -37,10 +37,10 @@ from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 KindOfLook = Literal["fovea", "windows", "head"]
-"""KindOfLook of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
+"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
 How = Literal["auto", "fovea", "windows", "head"]
-"""KindOfLook of look, or `auto` for the one that suits the picture."""
+"""Kind of look, or `auto` for the one that suits the picture."""
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
@@ -217,7 +217,7 @@ class ActivePerception(nn.Module):
     @property
     def zoom(self) -> ZoomAgent:
         """The part of the agent that looks at windows of large pictures."""
-        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)  # type: ignore[arg-type]
+        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)
 
     @property
     def head(self) -> HeadAgent:
@@ -404,7 +404,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         kind = self.kind_of_look(picture, how, every=True)
-        targets = _classes(target, self.classes)
+        targets = class_numbers(target, self.classes[1:], "target")
         _only_for(kind, "fovea", "passes", shifts=shifts)
         _only_for(kind, "head", "seconds", duration=duration)
         _only_for(kind, "windows", "passes", worth=worth)
@@ -417,7 +417,7 @@ class ActivePerception(nn.Module):
         if kind == "head":
             return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))  # type: ignore[arg-type]
+        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))
 
     def explore(
         self,
@@ -561,15 +561,6 @@ def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     wanted = [target] if isinstance(target, str | int) else list(target)
     check(len(wanted) == 1, "target", "one class for a search by windows or a head, or find_all", target)
     return class_index(wanted[0], classes[1:], "target")
-
-
-def _classes(target: Targets, classes: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the classes; none for all of them."""
-    if target is None:
-        return ()
-    wanted = [target] if isinstance(target, str | int) else list(target)
-    check(len(wanted) > 0, "target", "a class, several, or None for all", target)
-    return tuple(dict.fromkeys(class_index(each, classes[1:], "target") for each in wanted))
 
 
 def _large(picture: PictureLike, color: Color) -> LargePicture:

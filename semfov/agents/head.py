@@ -11,7 +11,7 @@ from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
@@ -195,8 +195,7 @@ class HeadAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        wanted = [] if target is None else [target] if isinstance(target, str | int) else [*target]
-        indices = tuple(dict.fromkeys(class_index(each, self.classes[1:], "target") for each in wanted))
+        indices = class_numbers(target, self.classes[1:], "target")
         limits = self._limits(passes, seconds, on_look)
         return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
 

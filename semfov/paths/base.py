@@ -64,8 +64,8 @@ class RecordedLook:
 class Record(ABC):
     """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
 
-    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts,
-    what `plot` draws, and what `objects` returns.
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe`
+    counts, what `plot` draws, and what `objects` returns.
 
     Attributes:
         classes: names of the classes, background first.
