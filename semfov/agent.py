@@ -487,6 +487,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
+        color: Color = "rgb",
     ) -> LivePerception:
         """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
 
@@ -502,6 +503,7 @@ class ActivePerception(nn.Module):
                 belief that fades can reach, or with rate 0 that of `search`.
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
                 evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
+            color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
             An object whose `step` takes the frames one by one.
@@ -520,7 +522,15 @@ class ActivePerception(nn.Module):
         at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
         parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
         return LivePerception(
-            *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer
+            *parts,
+            target=index,
+            rate=rate,
+            start=start,
+            seed=seed,
+            thresholds=at,
+            verification=model,
+            closer=closer,
+            color=color,
         )
 
     def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
