@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import InputError, check
+from semfov.paths.conversion import Conversion
 from semfov.paths.drawing import drawing_of
 from semfov.paths.endings import FIXATIONS, Ending, sentence
 from semfov.paths.files import Format
@@ -61,11 +62,11 @@ class RecordedLook:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Record(ABC):
+class Record(Conversion):
     """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
 
-    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts,
-    what `plot` draws, and what `objects` returns.
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: those that `describe`
+    counts, `plot` draws and `objects` returns.
 
     Attributes:
         classes: names of the classes, background first.
