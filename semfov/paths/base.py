@@ -152,9 +152,27 @@ class Record(Conversion):
         """The objects, and which of them were confirmed."""
         return confirm(self.candidates.of(self._sought()), self._confirmations(), self.least)
 
+    @property
+    def refuted(self) -> list[CloseUp]:
+        """The closer looks that did not confirm that the target is there."""
+        boxes = [place.box for place in self._confirmations()]
+        return [look for look in self._closer() if not any(look.box.equal(box) for box in boxes)]
+
     def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self.decision, self.target, (), self.passes - 1)
+        return places_confirmed(self._decision_in_picture(), self.target, self._closer(), self._last())
+
+    def _last(self) -> int:
+        """Number of the last look."""
+        return 0
+
+    def _closer(self) -> Sequence[CloseUp]:
+        """The closer looks."""
+        return ()
+
+    def _decision_in_picture(self) -> Decision | None:
+        """The decision, with its box in pixels of the picture."""
+        return self.decision
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say from which score on.
@@ -352,9 +370,13 @@ class GazeRecord(Record):
         """Value for which a look was chosen."""
         return None
 
-    def _confirmations(self) -> list[ConfirmedPlace]:
-        """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self.decision, self.target, self.closer, len(self) - 1)
+    def _last(self) -> int:
+        """Number of the last look."""
+        return len(self) - 1
+
+    def _closer(self) -> Sequence[CloseUp]:
+        """The closer looks."""
+        return self.closer
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended.

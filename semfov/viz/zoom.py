@@ -6,9 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from semfov.paths import ZoomPath
-from semfov.viz.drawing import photograph_of
-from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
+from semfov.belief.grid import Grid
+from semfov.paths import Record
+from semfov.viz.drawing import draw_image, photograph_of
+from semfov.viz.labels import LabelBox
+from semfov.viz.objects import draw_legend, draw_objects, object_entries
+from semfov.viz.style import GAZE, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,60 +19,69 @@ if TYPE_CHECKING:
 
 
 @styled
-def plot_zoom_path(
-    path: ZoomPath, image: Tensor | None = None, *, score: float = 0.1, ax: Axes | None = None
-) -> Figure:
-    """Plot the windows that were looked at, numbered in their order, and the objects that were found.
+def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
+    """Plot the windows that were looked at, numbered in their order, and the objects.
 
-    The first look, at the whole picture, is not drawn. Objects have names where all classes were looked for.
+    Looks at the whole picture have no window. A legend tells the objects that a closer look or the decision confirmed
+    from the others.
 
     Args:
         path: record of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; it must be given.
-        score: least score of the objects that are drawn.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; None takes the one that the record kept.
         ax: axes to draw in; None makes a figure.
 
     Returns:
         The figure.
 
     Raises:
-        InputError: the picture is not given.
+        InputError: the picture is neither given nor kept.
 
     Example::
 
         path = agent.search("harbour.tif", "person")
-        save_figure(plot_zoom_path(path, semfov.as_image("harbour_small.jpg")), "path.png")
+        save_figure(plot_zoom_path(path), "path.png")
+    """
+    image = photograph_of(path, image)
+    width, height = path.size
+    size = 7.2, 7.2 * height / width + 0.6
+    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
+    draw_image(axes, image, Grid(1, 1, (width, height)))
+    taken = draw_windows(axes, path)
+    axes.set_title(path.describe(), parse_math=False)
+    windows = [(GAZE, "-", "windows of the looks")] if taken else []
+    draw_legend(axes, [*windows, *object_entries(path)])
+    lay_out(figure)
+    draw_objects(axes, path, taken)
+    return figure
+
+
+def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[LabelBox]:
+    """Draw the windows of looks, numbered in their order.
+
+    Args:
+        axes: axes that hold the picture.
+        path: the record.
+        last: number of the last look that is drawn, with a wider frame; None draws all.
+
+    Returns:
+        Rectangles of the numbers.
     """
     from matplotlib.patches import Rectangle
 
-    image = photograph_of(path, image)
-    width, height = path.lattice.size
-    size = 7.2, 7.2 * height / width + 0.3
-    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
-    pixels = image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy()
-    axes.imshow(pixels, extent=(0, width, height, 0), interpolation="bilinear")
+    width, height = path.size
     taken: list[tuple[float, float]] = []
-    for number, glance in enumerate(path.glances):
-        if number == 0:
+    room = 0.025 * width
+    for look in path:
+        if look.region == (0, 0, width, height) or (last is not None and look.number > last):
             continue
-        box = path.region(number)
-        x1, y1, x2, y2 = box
-        line: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 0.8 + 0.5 * (glance.window.level == 1)}
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **line))
-        place = _free(box, taken, 0.025 * width)
+        x1, y1, x2, y2 = look.region
+        style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
+        place = _free(look.region, taken, room)
         taken.append(place)
-        axes.text(*place, str(number), color="white", fontsize=6, ha="center", va="center",
+        axes.text(*place, str(look.number), color="white", fontsize=6, ha="center", va="center",
                   bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
-    kept = path.objects.above(score)
-    for (x1, y1, x2, y2), label in zip(kept.boxes.tolist(), kept.labels.tolist(), strict=True):
-        colour = TARGET if label == path.target else FOUND
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=1.0))
-        if path.target is None:
-            axes.text(x1, y2, path.classes[label], color="white", fontsize=5, parse_math=False, va="top", clip_on=True,
-                      bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.5})  # fmt: skip
-    axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-    axes.set_title(path.describe(), parse_math=False)
-    return figure
+    return [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in taken]
 
 
 def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
