@@ -25,6 +25,8 @@ from semfov.paths.files import Format
 from semfov.paths.merging import ConfirmedPlace, confirm, places_confirmed
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -221,6 +223,59 @@ class Record(Conversion):
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
         return f"objects from score {self.least:g}: {', '.join([*named, *more]) or 'none'}"
 
+    def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
+        """Draw the looks and the objects on the picture.
+
+        Args:
+            ax: axes to draw in; None makes a new figure.
+            options: options of the function that draws this kind of records, such as `image`, the picture, which must
+                be given where the record does not keep it.
+
+        Returns:
+            The figure.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+        """
+        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
+        return figure
+
+    def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
+        """Make a film of the looks, one frame for each.
+
+        Args:
+            path: GIF file to write; None returns the film for a notebook.
+            options: options of the function that draws this kind of records: `seconds`, the duration of a frame;
+                `hold`, the additional duration of the last frame; and `image`, the picture, which must be given where
+                the record does not keep it.
+
+        Returns:
+            The path, or an object that a notebook shows as an animation.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+            DataError: the file cannot be written.
+        """
+        return drawing_of("animate", type(self))(self, path, **options)
+
+    def report(self, path: str | PathLike[str], **options: Any) -> Path:
+        """Write an HTML page of the looks and the objects, a single file that loads nothing from elsewhere.
+
+        Args:
+            path: the file.
+            options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
+                record keeps. `name`, the name of the picture on the page.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+            DataError: the file cannot be written.
+        """
+        written: Path = drawing_of("report", type(self))(self, path, **options)
+        return written
+
     def _repr_html_(self) -> str:
         """What a notebook shows."""
         return str(drawing_of("notebook", type(self))(self))
@@ -393,23 +448,6 @@ class GazeRecord(Record):
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
         return f"{self.describe()}. {self.why_it_ended()}".rstrip()
-
-    def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
-        """Draw the looks on the picture.
-
-        Args:
-            ax: axes to draw in; None makes a new figure.
-            options: options of the function that draws this kind of records, such as `image`, the picture, which must
-                be given where the record does not keep it.
-
-        Returns:
-            The figure.
-
-        Raises:
-            InputError: the picture was not kept, and none is given.
-        """
-        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
-        return figure
 
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
         """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.

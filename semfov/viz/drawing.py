@@ -137,8 +137,13 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
 
 
 def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """Draw a cross at the point of gaze."""
-    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
+    """Draw a cross at the point of gaze of a fixation."""
+    return draw_cross(axes, scanpath.fixations[fixation])
+
+
+def draw_cross(axes: Axes, point: Tensor) -> list[Artist]:
+    """Draw a cross at the point of gaze, `(x, y)` in pixels."""
+    x, y = (point.cpu() + 0.5).tolist()
     return [
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
         *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
@@ -169,7 +174,8 @@ def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6
         The artists drawn.
     """
     boxes, labels, scores = seen_well(scanpath, fixation, most)
-    tags, drawn = list[Tag](), list[Artist]()
+    tags: list[Tag] = []
+    drawn: list[Artist] = []
     for box, label, score in zip(boxes, labels, scores, strict=True):
         colour = TARGET if label == scanpath.target else OTHER
         x1, y1, x2, y2 = box.tolist()

@@ -44,7 +44,14 @@ def object_entries(record: Record) -> list[LegendEntry]:
     return entries
 
 
-def draw_objects(axes: Axes, record: Record, kept_free: Sequence[LabelBox] = ()) -> None:
+def draw_objects(
+    axes: Axes,
+    record: Record,
+    kept_free: Sequence[LabelBox] = (),
+    *,
+    last: int | None = None,
+    tagged: bool = True,
+) -> None:
     """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
 
     The figure must be laid out, because the positions of labels depend on the layout.
@@ -53,8 +60,10 @@ def draw_objects(axes: Axes, record: Record, kept_free: Sequence[LabelBox] = ())
         axes: axes that hold the picture.
         record: the record.
         kept_free: rectangles that labels must not cover.
+        last: number of the last look whose objects are drawn; None draws all.
+        tagged: whether objects have labels.
     """
-    rows = record.object_rows()
+    rows = [row for row in record.object_rows() if last is None or row["look"] <= last]
     width, height = record.size
     for look in record.refuted:
         draw_boxes(axes, look.box[None], FOUND, ":", 1.6)
@@ -69,7 +78,8 @@ def draw_objects(axes: Axes, record: Record, kept_free: Sequence[LabelBox] = ())
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             draw_boxes(axes, Tensor([box]), colour, width=line)
             tags.append(Tag(box, text, colour))
-    draw_tags(axes, tags[::-1][:_LABELLED], (width, height), kept_free, _SMALL if many else LABEL)
+    if tagged:
+        draw_tags(axes, tags[::-1][:_LABELLED], (width, height), kept_free, _SMALL if many else LABEL)
 
 
 def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.paths import Record
-from semfov.viz.drawing import draw_image, photograph_of
+from semfov.paths import Moment, Record
+from semfov.viz.animation import Film, render
+from semfov.viz.drawing import CONFIDENT, Tag, draw_boxes, draw_cross, draw_image, draw_tags, photograph_of
 from semfov.viz.labels import LabelBox
 from semfov.viz.objects import draw_legend, draw_objects, object_entries
-from semfov.viz.style import GAZE, lay_out, make_figure, only, styled
+from semfov.viz.style import GAZE, STYLE, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+_SHOWN = 15  # largest number of detections of a window that are drawn
 
 
 @styled
@@ -72,9 +78,9 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
     taken: list[tuple[float, float]] = []
     room = 0.025 * width
     for look in path:
-        if look.region == (0, 0, width, height) or (last is not None and look.number > last):
-            continue
         x1, y1, x2, y2 = look.region
+        if (x2 - x1 > width - 1 and y2 - y1 > height - 1) or (last is not None and look.number > last):
+            continue
         style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
         place = _free(look.region, taken, room)
@@ -104,3 +110,90 @@ def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float
         return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
 
     return max(places, key=far)
+
+
+@styled
+def plot_moment(moment: Moment, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
+    """Plot the point of gaze in a frame, and the objects.
+
+    Args:
+        moment: record of the frame.
+        image: `(3, h, w)`, RGB in [0, 1], the frame in any size; None takes the one that the record kept.
+        ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: the frame is neither given nor kept.
+
+    Example::
+
+        save_figure(plot_moment(live.step(frame)), "frame.png")
+    """
+    figure = plot_zoom_path(moment, image, ax=ax)
+    axes = figure.axes[0] if ax is None else ax
+    draw_cross(axes, moment.fixation)
+    return figure
+
+
+def animate_looks(
+    path: Record,
+    file: str | PathLike[str] | None = None,
+    *,
+    image: Tensor | None = None,
+    seconds: float = 0.8,
+    hold: float = 2.0,
+) -> Path | Film:
+    """Make a film of a record: for each look the picture with the windows so far, and the window with its detections.
+
+    Args:
+        path: the record.
+        file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; None takes the one that the record kept, in which
+            narrow windows are coarse.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The path of the GIF, or a film, which a notebook shows.
+
+    Raises:
+        InputError: the picture is neither given nor kept.
+        DataError: the file cannot be written.
+
+    Example::
+
+        animate_looks(agent.find_all("harbour.tif", "person"), "harbour.gif")
+    """
+    from matplotlib import rc_context
+
+    picture = photograph_of(path, image)
+    with rc_context(STYLE):
+        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
+    return film if file is None else film.save(file)[0]
+
+
+def _frames(path: Record, image: Tensor) -> Iterator[Figure]:
+    width, height = path.size
+    high = 4.8 * height / width
+    for look in path:
+        figure, (whole, window) = make_figure(1, 2, width=4.8 + 1.15 * high, height=high + 0.4, layout="compressed")
+        for axes in (whole, window):
+            draw_image(axes, image, Grid(1, 1, (width, height)))
+        taken = draw_windows(whole, path, look.number)
+        whole.set_title(f"look {look.number}")
+        x1, y1, x2, y2 = look.region
+        window.set(xlim=(x1, x2), ylim=(y2, y1), title="its window and detections")
+        lay_out(figure)
+        draw_objects(whole, path, taken, last=look.number, tagged=False)
+        seen = look.detections
+        sure = seen.confidence[0] >= CONFIDENT
+        boxes, labels = seen.boxes[0][sure][:_SHOWN], seen.labels[0][sure].tolist()
+        draw_boxes(window, boxes, TARGET)
+        tags = [
+            Tag(tuple(box), f"{path.classes[label]} {score:.2f}", TARGET)
+            for box, label, score in zip(boxes.tolist(), labels, seen.confidence[0][sure].tolist(), strict=False)
+        ]
+        draw_tags(window, tags, (x2, y2), [])
+        yield figure
