@@ -21,7 +21,7 @@ from semfov.paths.georeference import georeference
 if TYPE_CHECKING:
     import supervision
 
-PIXELS = "pixels of the picture: x to the right, y down"
+_PIXELS = "pixels of the picture: x to the right, y down"
 """What the coordinates of a GeoJSON file are whose picture has no georeference."""
 
 
@@ -145,7 +145,7 @@ class Conversion(ABC):
         names = "object", "class", "score", "confirmed", "look"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",
-            "coordinates": PIXELS if place is None else "longitude and latitude, WGS 84",
+            "coordinates": _PIXELS if place is None else "longitude and latitude, WGS 84",
             "features": [
                 {
                     "type": "Feature",

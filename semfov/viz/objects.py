@@ -93,7 +93,8 @@ def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
 
     if not entries:
         return
-    lines: list[Any] = [Line2D([], [], color=colour, linestyle=line, linewidth=1.8) for colour, line, _ in entries]
+    styles: list[dict[str, Any]] = [{"color": colour, "linestyle": line} for colour, line, _ in entries]
+    lines = [Line2D([], [], linewidth=1.8, **style) for style in styles]
     legend = axes.legend(
         lines,
         [text for _, _, text in entries],
