@@ -301,7 +301,8 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
-                tensor; a `semfov.data.large.LargePicture`; or a scene, such as `semfov.Panorama` or `semfov.Flat`.
+                tensor; a `semfov.data.large.LargePicture`; or a scene: a `semfov.Panorama`, a
+                `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
             target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
                 with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
                 the most probable of them.
@@ -355,8 +356,8 @@ class ActivePerception(nn.Module):
             )
         index = _one_class(target, self.classes)
         if kind == "head":
-            given = _given(start=start, confirm=confirm, **limits, duration=duration)
-            _only_for(kind, "fovea", "confirm", give_up=give_up, closer=closer)
+            given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
+            _only_for(kind, "fovea", "confirm", closer=closer)
             return self.head.search(_scene(picture, color), index, seed=seed, **given)
         _only_for(kind, "fovea", "passes", start=start)
         given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
@@ -487,6 +488,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
+        color: Color = "rgb",
     ) -> LivePerception:
         """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
 
@@ -502,6 +504,7 @@ class ActivePerception(nn.Module):
                 belief that fades can reach, or with rate 0 that of `search`.
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
                 evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
+            color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
             An object whose `step` takes the frames one by one.
@@ -520,7 +523,15 @@ class ActivePerception(nn.Module):
         at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
         parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
         return LivePerception(
-            *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer
+            *parts,
+            target=index,
+            rate=rate,
+            start=start,
+            seed=seed,
+            thresholds=at,
+            verification=model,
+            closer=closer,
+            color=color,
         )
 
     def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
