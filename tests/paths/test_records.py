@@ -93,6 +93,7 @@ def head_path(world=None):
         seconds=(0.2, 0.5, 1.25),
         detections=looks(3),
         maps=torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2)),
+        values=(float("inf"), 0.5, 0.25),
         ending="passes",
     )
 
