@@ -14,6 +14,7 @@ from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.detection.darknet_weights import read_weights
 from semfov.detection.detector import Detector
+from semfov.detection.modules import comes_from
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
@@ -70,8 +71,6 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
         check(not options, "options", "none for a detector that is made already", ", ".join(options))
         return model
     if not isinstance(model, str | PathLike):
-        from semfov.detection.modules import load_module
-
         return load_module(model, **options)
     name = known_name(model)
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
@@ -87,6 +86,39 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
 
         return load_hub(name, **options)
     return load_yolo(name, **options)
+
+
+def load_module(module: nn.Module, **options: Any) -> Detector:
+    """Make a detector of a torch module of another library; its library is recognised by the module of its class.
+
+    The module itself is used, not a copy, and set to `eval` mode.
+
+    Args:
+        module: a detection model of torchvision, an object detection model of transformers, or a model of Ultralytics.
+        options: options of `wrap_torchvision`, `wrap_transformers` or `wrap_ultralytics`.
+
+    Returns:
+        The detector, in `eval` mode.
+
+    Raises:
+        InputError: the library is unknown, or an option does not fit the module.
+    """
+    if comes_from(module, "torchvision.models.detection"):
+        from semfov.detection.torchvision import wrap_torchvision
+
+        return wrap_torchvision(module, **options)
+    if comes_from(module, "transformers.models"):
+        from semfov.detection.transformers import wrap_transformers
+
+        return wrap_transformers(module, **options)
+    if comes_from(module, "ultralytics"):
+        from semfov.detection.ultralytics import wrap_ultralytics
+
+        return wrap_ultralytics(module, **options)
+    raise InputError(
+        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(module).__module__}."
+        f"{type(module).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
+    )
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:

@@ -19,7 +19,6 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import DataError, InputError, check, check_shape
 
-PREFIX = "hf:"
 SOFTMAX = ("detr", "table-transformer", "yolos")
 """Kinds of models whose scores are a softmax over the classes and "no object"; the others have a sigmoid each."""
 _IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformable_detr", "dab-detr")
@@ -187,7 +186,7 @@ def load_hub(name: str, *, revision: str | None = None, **options: Any) -> Trans
 
         detector = semfov.load_detector("hf:PekingU/rtdetr_v2_r18vd")
     """
-    repository = name[len(PREFIX) :]
+    repository = name.removeprefix("hf:")
     check(bool(repository), "detector", "hf:owner/name", repr(name))
     try:
         from transformers import AutoImageProcessor, AutoModelForObjectDetection
