@@ -188,8 +188,3 @@ def test_bad_image() -> None:
         VOCUS2()(torch.zeros(3, 8, 8))
     with pytest.raises(InputError, match="channels"):
         twin_pyramids(torch.zeros(1, 3, 0, 8))
-
-
-def test_repr_shows_the_settings() -> None:
-    expected = "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean', color_space='opponent')"
-    assert repr(VOCUS2(3, 13)) == expected
