@@ -296,8 +296,9 @@ def search_windows(
     """Search a picture for one object of a class and decide whether it is there.
 
     Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
-    such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without closer looks it is `found` when the picture holds it with
-    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+    such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without closer looks it is
+    `found` when the picture holds it with a probability of at least `confirm` and a detection shows it
+    (`semfov.decision.settle`).
 
     When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
     if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the

@@ -158,7 +158,9 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     assert judge.best.place == pytest.approx(max(scores))
 
 
-@pytest.mark.parametrize(("scores", "outcome"), [([0.7, 0.5], 1), ([0.5, 0.1, 0.3, 0.65], 1), ([0.5, 0.1, 0.3, 0.4], 0)])
+@pytest.mark.parametrize(
+    ("scores", "outcome"), [([0.7, 0.5], 1), ([0.5, 0.1, 0.3, 0.65], 1), ([0.5, 0.1, 0.3, 0.4], 0)]
+)
 def test_closer_looks_go_on_until_a_place_is_probable_enough(scores, outcome):
     judge = verifier(FromScore(0.3), list(scores), most=9)
     judge.see(look(5, 0.9, 0.5, ONE, OTHER, *([x, 300.0, x + 40, 340] for x in (200.0, 700.0))))
