@@ -21,7 +21,7 @@ from semfov.errors import check, check_whole, lookup
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
-from semfov.paths import Moment
+from semfov.paths import Moment, reduced_copy
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
@@ -288,6 +288,7 @@ class LivePerception:
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=closer,
+            photograph=None if self._image is None else reduced_copy(self._image[0]),
         )
 
     def _decision(self, step: Step, grid: Grid) -> Decision | None:

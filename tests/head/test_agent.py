@@ -52,7 +52,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     found = agent.search(world, "blue", passes=5, confirm=0.0)
     assert found.found
     assert len(found) == 1
-    assert repr(found).startswith("HeadPath: blue found in ")
+    assert repr(found).startswith("HeadPath: blue: found (")
     explored = agent.explore(world, passes=3)
     assert explored.target is None
     assert len(explored) == 3
@@ -87,11 +87,11 @@ def test_paths_can_be_plotted_and_animated(agent, panorama, tmp_path):
     for path in (agent.search(world, "blue", passes=3, confirm=1.0), agent.explore(world, passes=2)):
         figure = plot_head_path(path, panorama)
         assert figure.axes[0].get_title() == path.describe()
-        film = animate_head(path, panorama)
+        film = animate_head(path, image=panorama)
         assert len(film) == len(path)
         frames = [frame.shape for frame in film.frames]
         assert len(set(frames)) == 1
-    written = animate_head(path, panorama, tmp_path / "head.gif")
+    written = animate_head(path, tmp_path / "head.gif", image=panorama)
     assert written.stat().st_size > 1000
     with pytest.raises(InputError, match="looks: expected a number from 1 to 2"):
         plot_head_path(path, panorama, looks=3)
