@@ -413,8 +413,7 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            one = targets[0] if len(targets) == 1 else None
-            return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))
         wanted = targets[0] if len(targets) == 1 else list(targets) or None

@@ -92,6 +92,7 @@ class ZoomPath(GazeRecord):
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
+    how = "windows"
     _format = _FORMAT
     _sentences = WINDOWS
 
