@@ -416,8 +416,7 @@ class ActivePerception(nn.Module):
             _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            one = targets[0] if len(targets) == 1 else None
-            return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             given = _given(worth=worth, duration=duration, **limits)
             return self.head.find_all(_scene(picture, color), targets, **given)

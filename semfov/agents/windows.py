@@ -214,7 +214,7 @@ class ZoomAgent(nn.Module):
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
             turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else ())
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence)
         ending: Ending | None = None
         with torch.inference_mode():
             for turn in turns:
@@ -320,7 +320,7 @@ def search_windows(
         The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
-    path = _Windows(glances, classes, target)
+    path = _Windows(glances, classes, target, (), evidence)
     seen, values = path.seen, path.values
 
     def close_up(box: Tensor) -> Detections:
@@ -412,9 +412,15 @@ class _Windows:
     """
 
     def __init__(
-        self, glances: Glances, classes: tuple[str, ...], target: int | None, targets: tuple[int, ...] = ()
+        self,
+        glances: Glances,
+        classes: tuple[str, ...],
+        target: int | None,
+        targets: tuple[int, ...] = (),
+        evidence: GlimpseEvidence | None = None,
     ) -> None:
         self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
+        self.certainty = None if evidence is None else evidence.certainty
         self.seen: list[Glance] = []
         self.values: list[float] = []
 
@@ -433,5 +439,6 @@ class _Windows:
             glances=tuple(self.seen),
             values=tuple(self.values),
             candidates=merge(self.seen, self.target),
+            certainty=self.certainty,
             ending=ending,
         )
