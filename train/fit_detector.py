@@ -7,11 +7,12 @@
 Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
 MODEL is a name or a file, as for `semfov.load_detector` (docs/detectors.md). A few dozen photographs with boxes are
-enough to begin with. The detector looks at every photograph from every cell. Five parts are fitted: an observation
+enough to begin with. The detector looks at every photograph from every cell. Six parts are fitted: an observation
 model with its miss rates, the exponent of its likelihoods, target evidence with the thresholds of decisions, the
-verification of targets by closer looks, and a map of all classes. Each part is compared with raw scores on held-out
-photographs, and the verification with the same agent without closer looks. The agent uses only the parts that are
-better.
+verification of targets by closer looks, a map of all classes, and, on mosaics of the photographs, the evidence by
+magnification for pictures larger than the detector's input. The last part needs 80 photographs; `--windows false`
+leaves it out. Each part is compared with raw scores on held-out photographs, and the verification with the same agent
+without closer looks. The agent uses only the parts that are better.
 
 The folder `out` gets the models, a manifest, a report and figures. If a run is interrupted, repeat the command to
 continue. `semfov.fit_detector` does the same in Python.

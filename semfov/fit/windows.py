@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -34,7 +34,7 @@ from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count, Share
+from semfov.runs.settings import Count, Range, Share
 from semfov.runs.setup import make_detector, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.window_looking import TileSize
@@ -52,8 +52,9 @@ class FitZoomConfig(FitConfig, WorkConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
-        data: photographs to compose the mosaics from; one in five is held out.
+        data: photographs to compose the mosaics from.
         detector: the detector.
+        holdout: one in every n photographs is held out.
         mosaics: number of training mosaics of 4 × 4 photographs.
         far: number of training mosaics of 8 × 6 photographs, in which objects are half as large.
         crowded: number of training mosaics of 4 × 4 photographs of the third that hold most objects, for fitting the
@@ -84,6 +85,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
     """
 
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
+    holdout: Annotated[int, Range(2, 10**9)] = 5
     mosaics: Count = 400
     far: Count = 40
     crowded: Count = 240
@@ -136,7 +138,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         The mosaics: `near`, `far` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of held-out
         photographs, and `searched` to fit decisions on.
     """
-    kept, held = split_photographs(config.data, classes, 5)
+    kept, held = split_photographs(config.data, classes, config.holdout)
     tile = config.tile, config.tile * 3 // 4
     return {
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
@@ -210,11 +212,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model.metadata.pop("verification", None)
     if "verification" in refit:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        prepare_worker()
-        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
-        parts += ["Closer looks:", "", fit_closer(model, mosaics, opened, config)]
-        if model.verification is not None:
-            model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+        parts += fit_closer_looks(config, model, eye, mosaics, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
@@ -307,6 +305,18 @@ def fit_decision(
         f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
         "",
     ]
+
+
+def fit_closer_looks(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit the probabilities after closer looks, with the arguments and the result of `fit_decision`."""
+    prepare_worker()
+    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+    text = fit_closer(model, mosaics, opened, config)
+    if model.verification is not None:
+        model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+    return ["Closer looks:", "", text]
 
 
 @torch.no_grad()

@@ -76,12 +76,12 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map"]
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map", "windows"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
         assert "held-out photographs" in part.why, (name, part.why)
-        assert (part.file is None) == (name == "tempering")
+        assert (part.file is None) == (name in ("tempering", "windows"))
     thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
     assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
@@ -168,6 +168,7 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
+    "windows": "fit_mosaics",
 }
 
 
