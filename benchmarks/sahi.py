@@ -27,11 +27,12 @@ from semfov.detection.detector import Detector
 from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
-from semfov.runs.zoom_orders import in_order, slices
+from semfov.runs.zoom_orders import in_order
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything
+from semfov.zoom.slices import slices
 
 try:
     from sahi.models.base import DetectionModel

@@ -41,7 +41,7 @@ def main() -> None:
     print(path)
     plot_head_path(path, image).savefig(arguments.out, dpi=88)
     if arguments.film:
-        animate_head(path, image, arguments.film)
+        animate_head(path, arguments.film, image=image)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
@@ -37,10 +37,10 @@ from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 KindOfLook = Literal["fovea", "windows", "head"]
-"""KindOfLook of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
+"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
 How = Literal["auto", "fovea", "windows", "head"]
-"""KindOfLook of look, or `auto` for the one that suits the picture."""
+"""Kind of look, or `auto` for the one that suits the picture."""
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
@@ -217,7 +217,7 @@ class ActivePerception(nn.Module):
     @property
     def zoom(self) -> ZoomAgent:
         """The part of the agent that looks at windows of large pictures."""
-        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)  # type: ignore[arg-type]
+        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)
 
     @property
     def head(self) -> HeadAgent:
@@ -301,7 +301,8 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
-                tensor; a `semfov.data.large.LargePicture`; or a scene, such as `semfov.Panorama` or `semfov.Flat`.
+                tensor; a `semfov.data.large.LargePicture`; or a scene: a `semfov.Panorama`, a
+                `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
             target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
                 with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
                 the most probable of them.
@@ -355,8 +356,8 @@ class ActivePerception(nn.Module):
             )
         index = _one_class(target, self.classes)
         if kind == "head":
-            given = _given(start=start, confirm=confirm, **limits, duration=duration)
-            _only_for(kind, "fovea", "confirm", give_up=give_up, closer=closer)
+            given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
+            _only_for(kind, "fovea", "confirm", closer=closer)
             return self.head.search(_scene(picture, color), index, seed=seed, **given)
         _only_for(kind, "fovea", "passes", start=start)
         given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
@@ -404,7 +405,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         kind = self.kind_of_look(picture, how, every=True)
-        targets = _classes(target, self.classes)
+        targets = class_numbers(target, self.classes[1:], "target")
         _only_for(kind, "fovea", "passes", shifts=shifts)
         _only_for(kind, "head", "seconds", duration=duration)
         _only_for(kind, "windows", "passes", worth=worth)
@@ -417,7 +418,7 @@ class ActivePerception(nn.Module):
         if kind == "head":
             return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))  # type: ignore[arg-type]
+        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))
 
     def explore(
         self,
@@ -487,6 +488,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
+        color: Color = "rgb",
     ) -> LivePerception:
         """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
 
@@ -502,6 +504,7 @@ class ActivePerception(nn.Module):
                 belief that fades can reach, or with rate 0 that of `search`.
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
                 evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
+            color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
             An object whose `step` takes the frames one by one.
@@ -520,7 +523,15 @@ class ActivePerception(nn.Module):
         at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
         parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
         return LivePerception(
-            *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer
+            *parts,
+            target=index,
+            rate=rate,
+            start=start,
+            seed=seed,
+            thresholds=at,
+            verification=model,
+            closer=closer,
+            color=color,
         )
 
     def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
@@ -561,15 +572,6 @@ def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     wanted = [target] if isinstance(target, str | int) else list(target)
     check(len(wanted) == 1, "target", "one class for a search by windows or a head, or find_all", target)
     return class_index(wanted[0], classes[1:], "target")
-
-
-def _classes(target: Targets, classes: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the classes; none for all of them."""
-    if target is None:
-        return ()
-    wanted = [target] if isinstance(target, str | int) else list(target)
-    check(len(wanted) > 0, "target", "a class, several, or None for all", target)
-    return tuple(dict.fromkeys(class_index(each, classes[1:], "target") for each in wanted))
 
 
 def _large(picture: PictureLike, color: Color) -> LargePicture:

@@ -2,7 +2,9 @@
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from time import perf_counter
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -11,20 +13,92 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.data.inputs import ImageLike, as_image
+from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.decision import MOST_CLOSER, CandidateCells, CloseUp, Decision, Verifier, conclude, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, Stopwatch, rollout
-from semfov.errors import check
+from semfov.errors import check, check_whole, lookup
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
-from semfov.paths import Moment
+from semfov.paths import Moment, reduced_copy
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
 
 _MOST = 1000  # largest number of looks whose detections are kept
+
+
+WARM_UP = 3
+"""Number of first frames of a stream that take longer than the others, because the detector gets ready."""
+
+
+class FrameRate:
+    """Counts the frames per second of a stream, without its first frames, in which the detector gets ready.
+
+    Args:
+        warm_up: number of first frames that do not count.
+        recent: number of frames over which the present rate is taken.
+        clock: gives the time in seconds.
+
+    Attributes:
+        frames: number of frames so far, the first ones included.
+
+    >>> rate = FrameRate(warm_up=1, clock=iter([2.5, 2.6, 2.8]).__next__)
+    >>> for _ in range(3):
+    ...     rate.add()
+    ...     print(rate)
+    warming up
+    10.0 frames/s
+    6.7 frames/s
+    >>> rate.summary()
+    '3 frames, 6.7 per second after the first'
+    """
+
+    def __init__(self, warm_up: int = WARM_UP, *, recent: int = 20, clock: Callable[[], float] = perf_counter) -> None:
+        check_whole(warm_up, "warm_up", 1, 1_000_000)
+        check_whole(recent, "recent", 1, 1_000_000)
+        self.warm_up, self.frames, self._clock = warm_up, 0, clock
+        self._warm = 0.0
+        self._ends: deque[float] = deque(maxlen=recent + 1)
+
+    def add(self) -> None:
+        """Count a frame that was looked at."""
+        now = self._clock()
+        self.frames += 1
+        if self.frames >= self.warm_up:
+            self._warm = now if self.frames == self.warm_up else self._warm
+            self._ends.append(now)
+
+    @property
+    def now(self) -> float | None:
+        """Frames per second of late; None before the first frame that counts."""
+        return _rate(len(self._ends) - 1, self._ends[-1] - self._ends[0]) if self._ends else None
+
+    @property
+    def mean(self) -> float | None:
+        """Frames per second of all frames that count; None before the first."""
+        return _rate(self.frames - self.warm_up, self._ends[-1] - self._warm) if self._ends else None
+
+    def __str__(self) -> str:
+        """The present rate in words."""
+        return "warming up" if self.now is None else f"{self.now:.1f} frames/s"
+
+    def summary(self) -> str:
+        """Describe the whole stream in words, and say which frames do not count.
+
+        Returns:
+            The words.
+        """
+        frames = f"{self.frames} frame{'' if self.frames == 1 else 's'}"
+        if self.mean is None:
+            return f"{frames}, all of them while the detector got ready"
+        first = "the first" if self.warm_up == 1 else f"the first {self.warm_up}"
+        return f"{frames}, {self.mean:.1f} per second after {first}"
+
+
+def _rate(frames: int, seconds: float) -> float | None:
+    return frames / seconds if frames > 0 and seconds > 0 else None
 
 
 class LivePerception:
@@ -55,6 +129,7 @@ class LivePerception:
             closer looks those of the observer.
         verification: probabilities after closer looks; None decides from the looks of the fovea alone.
         closer: largest number of closer looks in :math:`\ln 2 / r` frames.
+        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
     Example::
 
@@ -79,7 +154,9 @@ class LivePerception:
         thresholds: Thresholds | None = None,
         verification: Verification | None = None,
         closer: int = MOST_CLOSER,
+        color: Color = "rgb",
     ) -> None:
+        self.color = lookup(color, get_args(Color), "order of channels")
         self.eye, self.observer, self.policy = eye, observer, policy
         self.classes, self.cells, self.target = classes, cells, target
         self.forgetting = Forgetting(rate)
@@ -113,7 +190,7 @@ class LivePerception:
             DataError: the file of the frame cannot be read.
         """
         with torch.inference_mode():
-            image = as_image(frame, like=self.eye.sensor.like, argument="frame")[None]
+            image = as_image(frame, like=self.eye.sensor.like, argument="frame", color=self.color)[None]
             self._check_size(image)
             if self._verifier is not None:
                 self._verifier.wait()
@@ -211,6 +288,7 @@ class LivePerception:
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=closer,
+            photograph=None if self._image is None else reduced_copy(self._image[0]),
         )
 
     def _decision(self, step: Step, grid: Grid) -> Decision | None:

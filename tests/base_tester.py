@@ -5,13 +5,14 @@ the module is made (`make`), which tensors it takes (`inputs`) and how it is cal
 `module(*inputs)`). It inherits the tests. `GraphTester` is for modules that are one graph of differentiable
 operations, `TensorTester` for modules whose operations depend on values, `BaseTester` for modules that take images of
 bytes or scenes. A test that does not apply to a module is switched off by name, with the reason
-(`test_no_rows = None`).
+(`test_no_rows = None`). `make_testers` makes several classes that have nothing but `make`.
 A public module without a tester fails `tests/test_modules.py`.
 """
 
 import copy
 import io
 import pickle
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import pytest
@@ -91,6 +92,11 @@ class BaseTester:
                 if tensor.is_floating_point():
                     tensor.zero_()
         assert torch.equal(host(*inputs), before)
+
+
+def make_testers(base: type[BaseTester], makers: Mapping[str, Callable[[], nn.Module]]) -> dict[str, type]:
+    """Testers of modules that differ only in how they are made, to be added to the names of a test file."""
+    return {f"Test{name}": type(f"Test{name}", (base,), {"make": staticmethod(make)}) for name, make in makers.items()}
 
 
 class TensorTester(BaseTester):

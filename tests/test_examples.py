@@ -108,12 +108,24 @@ def test_a_trained_agent_finds_more_than_random_gaze(run, tmp_path):
         assert int(agent[3]) > int(random[3]) + 15
 
 
+def test_a_simulated_camera_is_searched_though_its_frames_are_late(run, tmp_path):
+    output = run("pan_tilt", "--out", tmp_path / "camera.png")
+    seconds = [float(value) for value in re.findall(r"([\d.]+) s: camera at pan", output)]
+    assert seconds == sorted(seconds)
+    assert "motorcycle: found" in output
+    clock, turns = re.search(r"clock says ([\d.]+) s, and (\d+) turns", output).groups()
+    assert int(turns) > 1
+    assert float(clock) == pytest.approx(seconds[-1], abs=1)
+    with Image.open(tmp_path / "camera.png") as picture:
+        assert min(picture.size) > 300
+
+
 def test_looking_around_turns_the_head_and_draws_it(run, tmp_path):
     output = run("look_around", "--seconds", 6, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
     seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]
     assert seconds == sorted(seconds)
     assert seconds[-1] <= 6
-    turns = re.search(r"HeadPath: exploration, \d+ looks, (\d+) turns? of the head", output)
+    turns = re.search(r"HeadPath: \d+ objects? from score 0.3 in [\d.]+ s: \d+ looks, (\d+) turns? of the head", output)
     assert int(turns.group(1)) > 0
     for name in ("head.png", "head.gif"):
         with Image.open(tmp_path / name) as picture:

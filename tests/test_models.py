@@ -43,6 +43,8 @@ def check_name(model, path):
     """The name of a model matches the detector and the sensor that it was trained for."""
     detector = path.stem.removesuffix("-published")
     assert model.metadata["detector"]["name"] == detector
+    assert model.metadata["training"]
+    assert all(bool(tensor.any()) for tensor in model.state_dict().values())
     assert learned_for(detector, model.metadata["sensor"]["growth"]) == path.stem
 
 

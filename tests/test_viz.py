@@ -100,12 +100,12 @@ def test_few_curves_are_all_named(count):
 def test_scanpath_shows_numbered_fixations(scanpath, image):
     figure = draw(plot_scanpath(scanpath, image, boxes=torch.tensor([[60.0, 45, 79, 59]])))
     axes = figure.axes[0]
-    assert [text.get_text() for text in axes.texts] == ["0", "1", "2", "cat 0.80", "cup 0.60"]
+    assert [text.get_text() for text in axes.texts] == ["0", "1", "2", "cup 0.60"]
     np.testing.assert_allclose([text.xy for text in axes.texts[:3]], scanpath.fixations + 0.5)
     np.testing.assert_allclose(axes.collections[-1].get_offsets(), scanpath.fixations + 0.5)
     framed = {patch.get_bbox().bounds: patch.get_linestyle() for patch in axes.patches}
-    assert framed == {(60, 45, 19, 14): "--", (10, 10, 20, 20): "-", (50, 40, 20, 15): "-"}
-    bare = draw(plot_scanpath(scanpath, image, detections=False))
+    assert framed == {(60, 45, 19, 14): "--", (50, 40, 20, 15): "-"}
+    bare = draw(plot_scanpath(scanpath, image, objects=False))
     assert len(bare.axes[0].texts) == 3
     assert axes.get_title() == "“cup” found after 2 gaze shifts"
     explored = draw(plot_scanpath(replace(scanpath, target=None, found=False), image))
@@ -160,17 +160,19 @@ def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
 
 def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
     decision = Decision("found", 0.9, 11, torch.tensor([50.0, 40, 70, 55]))
-    sought = replace(scanpath, decision=decision, ending="decision")
+    other = Detections(torch.tensor([[[0.0, 0, 9, 9]]]), torch.tensor([[[0.5, 0.1, 0.4]]]), torch.ones(1, 1).bool())
+    looks = (other, *scanpath.detections[1:])
+    sought = replace(scanpath, decision=decision, ending="decision", detections=looks)
     (axes,) = draw(plot_scanpath(sought, image, boxes=torch.tensor([[60.0, 45, 79, 59]]))).axes
     entries = {
         text.get_text(): line
         for text, line in zip(axes.get_legend().get_texts(), axes.get_legend().get_lines(), strict=True)
     }
-    assert list(entries) == ["annotated: cup", "where the cup was found", "last look: cup", "last look: other objects"]
+    assert list(entries) == ["annotated: cup", "confirmed: cup (1)", "not confirmed: cup from score 0.3 (1)"]
     for box in axes.patches:
         near = [line for line in entries.values() if to_rgba(line.get_color()) == box.get_edgecolor()]
         assert [line.get_linestyle() for line in near] == [box.get_linestyle()]
-    (bare,) = draw(plot_scanpath(scanpath, image, detections=False)).axes
+    (bare,) = draw(plot_scanpath(scanpath, image, objects=False)).axes
     assert bare.get_legend() is None
 
 

@@ -9,6 +9,7 @@ import torch
 
 from eval.decide.report import SHARES, telling
 from eval.decide.run import overlap
+from semfov.agents.limits import EpisodeLimits
 from semfov.agents.windows import search_windows
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER, OUTCOMES
@@ -51,7 +52,7 @@ def decide_all(
     records: list[ResultRecord] = []
     ways = {OURS: MOST_CLOSER} if evidence.verification is None else {OURS: MOST_CLOSER, UNVERIFIED: 0}
     for target, (way, closer) in product(targets, ways.items()):
-        path = search_windows(glances, evidence, classes, target, passes=passes, closer=closer)
+        path = search_windows(glances, evidence, classes, target, EpisodeLimits(passes), closer=closer)
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]

@@ -23,7 +23,7 @@ from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_zoom_observation
 from semfov.runs.window_looking import LEAST_CONFIDENCE, TileSize, WindowLooking, WindowLookingConfig, found_in
-from semfov.runs.zoom_orders import in_order, oracle, quad_tree, ranked, shuffled, slices
+from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -31,6 +31,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
+from semfov.zoom.slices import ranked, slices
 
 _Measure = Literal["recall", "hit", "decision"]
 
@@ -127,7 +128,7 @@ class ZoomRun(WindowLooking, SceneRun):
         orders = {
             "slices, raster": in_order(cut),
             "slices, random": shuffled(cut, [self.config.seed, index]),
-            "slices, ranked by the overview": ranked(cut, target, most=False),
+            "slices, ranked by the overview": ranked(cut, [] if target is None else [target]),
             "quad-tree, best first": quad_tree(lattice, target, most=False),
         }
         for name, order in orders.items():
@@ -187,7 +188,7 @@ class ZoomRun(WindowLooking, SceneRun):
             orders = {
                 "slices, raster": in_order(cut),
                 "slices, random": shuffled(cut, [self.config.seed, index, target]),
-                "slices, ranked by the overview": ranked(cut, target, most=True),
+                "slices, ranked by the overview": ranked(cut, [target], most=True),
                 "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
             }
             ways: dict[str, Iterator[Turn[Any]]] = {

@@ -11,7 +11,7 @@ from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
@@ -24,7 +24,7 @@ from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond,
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.shipped import shipped_model
-from semfov.paths import Ending, HeadPath
+from semfov.paths import Ending, HeadPath, reduced_copy
 from semfov.sensor.foveation import Foveation
 
 SIGMA = 100.0
@@ -135,7 +135,7 @@ class HeadAgent(nn.Module):
             duration: time limit of the scene in seconds, for the movements of eye and head and the looks, as its
                 `speeds` have it; a look that would end later is not taken.
             on_look: called after each look with the record so far; returning False ends the search.
-            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             confirm: probability at which the search ends as found; None takes 0.7.
             give_up: probability below which a cell is not worth a look; None takes `prior`.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
@@ -158,7 +158,7 @@ class HeadAgent(nn.Module):
         gain, observer = SearchGain(views, foresight), SceneObserver(Target(self.target_evidence), views, prior=prior)
         sure = CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
-        return self._look(observer, gain, index, start, limits, duration, seed, thresholds=thresholds)
+        return self._look(observer, gain, (index,), start, limits, duration, seed, thresholds=thresholds)
 
     def find_all(
         self,
@@ -184,7 +184,7 @@ class HeadAgent(nn.Module):
             duration: time limit of the scene in seconds, as for `search`.
             on_look: called after each look with the record so far; returning False ends it.
             worth: least gain for which a look is worth it, as for `explore`.
-            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
@@ -195,8 +195,7 @@ class HeadAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        wanted = [] if target is None else [target] if isinstance(target, str | int) else [*target]
-        indices = tuple(dict.fromkeys(class_index(each, self.classes[1:], "target") for each in wanted))
+        indices = class_numbers(target, self.classes[1:], "target")
         limits = self._limits(passes, seconds, on_look)
         return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
 
@@ -222,7 +221,7 @@ class HeadAgent(nn.Module):
             duration: time limit of the scene in seconds, as for `search`.
             on_look: called after each look with the record so far; returning False ends the exploration.
             worth: least expected number of additional correct cells, of average area, for which a look is worth it.
-            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
@@ -251,15 +250,14 @@ class HeadAgent(nn.Module):
     ) -> HeadPath:
         check_number(worth, "worth", 0, float("inf"))
         gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
-        target = targets[0] if len(targets) == 1 else None
-        return self._look(observer, gain, target, start, limits, duration, seed, worth=worth)
+        return self._look(observer, gain, targets, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()
     def _look(
         self,
         observer: SceneObserver,
         gain: LookGain,
-        target: int | None,
+        targets: tuple[int, ...],
         start: int | None,
         limits: EpisodeLimits,
         duration: float,
@@ -271,15 +269,15 @@ class HeadAgent(nn.Module):
         """Look around until a decision or a limit."""
         check_number(duration, "duration", 0, float("inf"))
         check_whole(seed, "seed", 0, 2**63 - 1)
-        views = observer.views
-        middle = views.tiling[0][len(views.tiling[0]) // 2]
-        first = middle[len(middle) // 2] * views.cells + views.cells // 2 + 5 if start is None else start
+        views, target = observer.views, targets[0] if len(targets) == 1 else None
+        first = views.ahead if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
         steps, maps = list[HeadStep](), list[Tensor]()
         decision: Decision | None = None
         ending: Ending | None = None
 
         def record() -> HeadPath:
+            picture = views.world.image()
             return HeadPath(
                 views=views,
                 target=target,
@@ -291,6 +289,8 @@ class HeadAgent(nn.Module):
                 found=decision is not None and decision.outcome == "found",
                 decision=decision,
                 ending=ending,
+                targets=targets if len(targets) > 1 else (),
+                photograph=None if picture is None else reduced_copy(picture),
             )
 
         for step in look_around(

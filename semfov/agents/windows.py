@@ -1,12 +1,15 @@
 """An agent for pictures larger than its detector's input."""
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
 from semfov.belief.target_evidence import Thresholds
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
 from semfov.decision import MOST_CLOSER, OUTCOMES, Decision, Verifier, check_thresholds, settle
@@ -16,6 +19,7 @@ from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
+from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.facts import SearchFacts
@@ -23,9 +27,13 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything, look_for
+from semfov.zoom.slices import ranked, usual_slices
 
-_LIMIT = 1_000_000
-"""Limit of passes and batches, more than any picture has windows."""
+USUAL_PASSES = 24
+"""Default for the largest number of passes of the detector."""
+
+NEW_OBJECTS = 0.01
+"""Default for the least number of new objects that a look must be expected to find."""
 
 _Picture = LargePicture | ImageLike
 
@@ -37,11 +45,13 @@ class ZoomAgent(nn.Module):
     """Search and explore pictures that are larger than the detector's input.
 
     Each look is a window at a magnification and costs one pass of the detector. The agent looks where it expects to
-    find most, as closely as it takes to find it.
+    find most, as closely as it takes to find it. Without evidence it learns nothing: after the overview it looks at
+    slices in the order of the overview's scores in them (`semfov.zoom.slices`). `semfov fit` makes evidence for a
+    detector of your own, with which fewer passes find as much, and searches end early and can decide `absent`.
 
     Args:
         eye: resamples a window and detects in it.
-        evidence: predicts from a look what closer looks will find.
+        evidence: predicts from a look what closer looks will find; None for slices.
 
     Raises:
         InputError: the evidence was made for other classes, or for another detector.
@@ -53,11 +63,12 @@ class ZoomAgent(nn.Module):
         print(path.objects.boxes, path.passes)
     """
 
-    def __init__(self, eye: WindowEye, evidence: GlimpseEvidence) -> None:
+    def __init__(self, eye: WindowEye, evidence: GlimpseEvidence | None = None) -> None:
         super().__init__()
-        kinds = len(eye.detector.classes)
-        check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
-        evidence.check_compatible(eye.settings())
+        if evidence is not None:
+            kinds = len(eye.detector.classes)
+            check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
+            evidence.check_compatible(eye.settings())
         self.eye = eye
         self.evidence = evidence
 
@@ -104,7 +115,9 @@ class ZoomAgent(nn.Module):
         picture: _Picture,
         target: str | int,
         *,
-        passes: int = 24,
+        passes: int | None = None,
+        seconds: float | None = None,
+        on_look: OnLook | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
@@ -117,9 +130,12 @@ class ZoomAgent(nn.Module):
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
-            passes: largest number of passes of the detector, closer looks included.
+            passes: largest number of passes of the detector, closer looks included; None takes 24.
+            seconds: longest time in seconds on this machine.
+            on_look: called after each look with the record so far; returning False ends the search.
             confirm: the class counts as found when the probability reaches this value: with closer looks, that it is at
-                the place; otherwise, that the picture holds it. None takes the threshold of the evidence.
+                the place; otherwise, that the picture holds it. None takes the threshold of the evidence. Without
+                evidence it is the least score of a detection; None takes 0.5.
             give_up: the search ends when no look shows the class with a probability of at least this value; None takes
                 the threshold of the evidence.
             closer: largest number of closer looks, 0 to 100. 0 decides without them, as does evidence without fitted
@@ -132,49 +148,92 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        check_whole(passes, "passes", 1, _LIMIT)
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
+            glances = self._open(picture)
+            if self.evidence is None:
+                return search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
             return search_windows(
-                self._open(picture),
+                glances,
                 self.evidence,
                 self.classes,
                 index,
-                passes=passes,
+                limits,
                 confirm=confirm,
                 give_up=give_up,
                 closer=closer,
             )
 
     def find_all(
-        self, picture: _Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
+        self,
+        picture: _Picture,
+        target: str | int | Sequence[str | int] | None = None,
+        *,
+        passes: int | None = None,
+        seconds: float | None = None,
+        on_look: OnLook | None = None,
+        batch: int = 1,
+        worth: float = NEW_OBJECTS,
     ) -> ZoomPath:
-        """Find all objects of a class (`semfov.agents.windows.find_all`).
+        """Find all objects of a class, of several or of all classes.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
-            target: name or index (1..K) of the class.
-            passes: largest number of passes of the detector.
+            target: name or index (1..K) of the class, several in a list, or None for all. Windows for several classes
+                are chosen as for all classes.
+            passes: largest number of passes of the detector; None takes 24.
+            seconds: longest time in seconds on this machine.
+            on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
 
         Returns:
-            The looks and the objects of the class.
+            The looks and the objects.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        return self._find(picture, class_index(target, self.classes[1:], "target"), passes, batch, worth)
+        targets = class_numbers(target, self.classes[1:], "target")
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
+        check_whole(batch, "batch", 1, MOST_PASSES)
+        check_number(worth, "worth", 0, float("inf"))
+        glances, one = self._open(picture), targets[0] if len(targets) == 1 else None
+        turns: Iterator[Turn[Any]]
+        if self.evidence is None:
+            turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
+        else:
+            turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else ())
+        ending: Ending | None = None
+        with torch.inference_mode():
+            for turn in turns:
+                path.add(turn)
+                ending = limits.reached(len(path.seen), path.record)
+                if ending is not None:
+                    break
+        return path.record(ending or ("windows" if self.evidence is None else "worth"))
 
-    def explore(self, picture: _Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
-        """Find all objects of all classes.
+    def explore(
+        self,
+        picture: _Picture,
+        *,
+        passes: int | None = None,
+        seconds: float | None = None,
+        on_look: OnLook | None = None,
+        batch: int = 1,
+        worth: float = NEW_OBJECTS,
+    ) -> ZoomPath:
+        """Find all objects of all classes; see `find_all`.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
-            passes: largest number of passes of the detector.
+            passes: largest number of passes of the detector; None takes 24.
+            seconds: longest time in seconds on this machine.
+            on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
 
@@ -185,15 +244,8 @@ class ZoomAgent(nn.Module):
             InputError: an argument does not fit.
             DataError: the file cannot be read.
         """
-        return self._find(picture, None, passes, batch, worth)
-
-    def _find(self, picture: _Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:
-        check_whole(passes, "passes", 1, _LIMIT)
-        check_whole(batch, "batch", 1, _LIMIT)
-        check_number(worth, "worth", 0, float("inf"))
-        return find_all(
-            self._open(picture), self.evidence, self.classes, target, passes=passes, batch=batch, worth=worth
-        )
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        return self.find_all(picture, None, batch=batch, worth=worth, **limits)
 
     def _open(self, picture: _Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
@@ -221,8 +273,8 @@ def search_windows(
     evidence: GlimpseEvidence,
     classes: tuple[str, ...],
     target: int,
+    limits: EpisodeLimits,
     *,
-    passes: int = 24,
     confirm: float | None = None,
     give_up: float | None = None,
     closer: int = MOST_CLOSER,
@@ -242,7 +294,7 @@ def search_windows(
         evidence: learned evidence by magnification.
         classes: names of the classes, background first.
         target: class 1..K.
-        passes: largest number of passes of the detector, closer looks included.
+        limits: limits of the search.
         confirm: probability from which on the target is found: with closer looks, that it is at the place; otherwise,
             that the picture holds it. None takes the threshold of the evidence.
         give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
@@ -253,8 +305,8 @@ def search_windows(
         The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
-    seen: list[Glance] = []
-    values: list[float] = []
+    path = _Windows(glances, classes, target)
+    seen, values = path.seen, path.values
 
     def close_up(box: Tensor) -> Detections:
         seen.append(look_closely(glances, box))
@@ -268,12 +320,12 @@ def search_windows(
         thresholds = thresholds.changed(confirm)
     facts: SearchFacts | None = None
     ended, presence = 0, None
+    ending: Ending | None = None
     for turn in look_for(glances, evidence, target, confirm=float("inf")):
         glance, ahead = turn.glance, turn.ahead
         facts = facts or SearchFacts(turn.belief)
         facts.add(glance)
-        seen.append(glance)
-        values.append(turn.worth)
+        path.add(turn)
         presence = None
         if facts.detected or ahead < thresholds.give_up:  # otherwise no probability ends the search
             presence = facts.presence(ahead)
@@ -281,11 +333,13 @@ def search_windows(
                 state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([ahead])
                 ended = int(settle(*state, thresholds))
             else:
-                room, look = passes - len(seen), WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
+                room = limits.room(len(seen))
+                look = WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
                 verifier.see(look, last=ahead == 0 or room <= 1)
                 values += [place.probability for place in verifier.look_closely(room)]
                 ended = verifier.outcome()
-        if ended or len(seen) == passes:
+        ending = limits.reached(len(seen), path.record)
+        if ended or ending is not None:
             break
     assert facts is not None
     if verifier is not None and verifier.looks:
@@ -293,61 +347,74 @@ def search_windows(
     else:
         presence = facts.presence(ahead) if presence is None else presence
         decision = Decision(OUTCOMES[ended], presence, None, facts.box if OUTCOMES[ended] == "found" else None)
-    decided = ended > 0 or decision.outcome == "found"
-    ending: Ending = "decision" if decided else "passes" if len(seen) == passes else "windows"
-    return ZoomPath(
-        lattice=glances.lattice,
-        classes=classes,
-        target=target,
-        glances=tuple(seen),
-        values=tuple(values),
-        candidates=merge(seen, target),
-        decision=decision,
-        ending=ending,
-        closer=() if verifier is None else tuple(verifier.looks),
-    )
+    if ended > 0 or decision.outcome == "found":
+        ending = "decision"
+    closely = () if verifier is None else tuple(verifier.looks)
+    return replace(path.record(ending or "windows"), decision=decision, closer=closely)
 
 
-def find_all(
-    glances: Glances,
-    evidence: GlimpseEvidence,
-    classes: tuple[str, ...],
-    target: int | None = None,
-    *,
-    passes: int = 24,
-    batch: int = 1,
-    worth: float = 0.01,
+def search_slices(
+    glances: Glances, classes: tuple[str, ...], target: int, limits: EpisodeLimits, confirm: float
 ) -> ZoomPath:
-    """Find all objects of a class, or of all classes, with a limited number of passes of the detector.
+    """Search a picture by slices, in the order of the overview's scores; nothing is learned, so nothing is `absent`.
 
     Args:
         glances: source of looks at the picture.
-        evidence: learned evidence by magnification.
         classes: names of the classes, background first.
-        target: class 1..K; None for all classes.
-        passes: largest number of passes of the detector.
-        batch: number of windows that are chosen jointly and looked at together.
-        worth: the exploration ends when no look is expected to find more new objects than this.
+        target: class 1..K.
+        limits: limits of the search.
+        confirm: score from which on a detection whose best class is the target ends the search as `found`.
 
     Returns:
-        The looks and the objects.
+        The looks, the objects of the class, and the decision: `found` or `undecided`, with the highest score.
     """
-    seen: list[Glance] = []
-    values: list[float] = []
-    ending: Ending = "worth"
-    with torch.inference_mode():
-        for turn in find_everything(glances, evidence, target, batch=batch, worth=worth):
-            seen.append(turn.glance)
-            values.append(turn.worth)
-            if len(seen) == passes:
-                ending = "passes"
-                break
-    return ZoomPath(
-        lattice=glances.lattice,
-        classes=classes,
-        target=target,
-        glances=tuple(seen),
-        values=tuple(values),
-        candidates=merge(seen, target),
-        ending=ending,
-    )
+    path, best, box = _Windows(glances, classes, target), 0.0, None
+    ending: Ending | None = None
+    for turn in look_by_look(glances, ranked(usual_slices(glances.lattice), [target]), None):
+        path.add(turn)
+        seen = turn.glance.detections
+        scores = seen.confidence[0].masked_fill(~seen.mask[0] | (seen.labels[0] != target), 0)
+        if len(scores) and float(scores.max()) > best:
+            best, box = float(scores.max()), seen.boxes[0, scores.argmax()]
+        ending = limits.reached(len(path.seen), path.record)
+        if best >= confirm:
+            ending = "detection"
+        if ending is not None:
+            break
+    found = best >= confirm
+    decision = Decision("found" if found else "undecided", best, None, box if found else None)
+    return replace(path.record(ending or "windows"), decision=decision)
+
+
+class _Windows:
+    """The looks of an episode so far, of which records are made.
+
+    Attributes:
+        seen: the looks.
+        values: their values when they were chosen.
+    """
+
+    def __init__(
+        self, glances: Glances, classes: tuple[str, ...], target: int | None, targets: tuple[int, ...] = ()
+    ) -> None:
+        self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
+        self.seen: list[Glance] = []
+        self.values: list[float] = []
+
+    def add(self, turn: Turn[Any]) -> None:
+        """Keep a look."""
+        self.seen.append(turn.glance)
+        self.values.append(turn.worth)
+
+    def record(self, ending: Ending | None = None) -> ZoomPath:
+        """The record so far."""
+        return ZoomPath(
+            lattice=self.glances.lattice,
+            classes=self.classes,
+            target=self.target,
+            targets=self.targets,
+            glances=tuple(self.seen),
+            values=tuple(self.values),
+            candidates=merge(self.seen, self.target),
+            ending=ending,
+        )

@@ -100,6 +100,33 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     raise InputError(_unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes))
 
 
+def class_numbers(
+    names: str | int | Sequence[str | int] | None, classes: Sequence[str], argument: str = "class"
+) -> tuple[int, ...]:
+    """Look up the indices of one class, of several, or of all classes.
+
+    Args:
+        names: name or index 1..K of a class, several of them, or None for all.
+        classes: names of the K classes.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The indices, each once, from 1; none stand for all classes.
+
+    Raises:
+        InputError: there is no such class, or the sequence is empty.
+
+    >>> class_numbers(["cups", 1, "cup"], ("person", "cup")), class_numbers(None, ("person", "cup"))
+    ((2, 1), ())
+    """
+    if names is None:
+        return ()
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        return (class_index(names, classes, argument),)
+    check(len(names) > 0, argument, "a class, several, or None for all", names)
+    return tuple(dict.fromkeys(class_index(name, classes, argument) for name in names))
+
+
 def _index(value: object, classes: int, argument: str) -> int:
     """An index 1..K from a whole number of any type."""
     value = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value

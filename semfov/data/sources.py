@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from semfov.data.images import read_image
+from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+_WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
+
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
@@ -122,40 +125,73 @@ class Stream:
     frames: Iterator[Picture]
 
 
-def open_stream(source: Path | int, most: int | None = None) -> Stream:
-    """Open a video by its file, or a camera by its number.
+def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
+    """Open a video by its file, a camera by its number, or a stream by its address.
 
     Args:
-        source: file of the video, or number of the camera.
+        source: file of the video, number of the camera, or an address such as `rtsp://user:password@camera/stream1`.
         most: largest number of frames; None for all.
 
     Returns:
-        The stream.
+        The stream. Its name has no password.
 
     Raises:
+        InputError: no stream has such an address.
         DataError: the source cannot be opened or has no frame, or OpenCV is not installed.
     """
-    name = f"camera {source}" if isinstance(source, int) else source.name
+    address = isinstance(source, str) and "://" in source
+    if not address and not isinstance(source, int):
+        source = Path(source)
+    name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
     try:
         import cv2
     except ImportError:
-        raise DataError(f"{name}: expected OpenCV for videos and cameras; pip install opencv-python-headless") from None
+        raise DataError(
+            f"{name}: expected OpenCV for videos, cameras and streams; pip install opencv-python-headless"
+        ) from None
     if isinstance(source, Path):
         check_there(source)
         check_regular(source)
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised below
     try:
-        recorder = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+        recorder = _recorder(cv2, source)
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not recorder.isOpened():
-        what = "it is connected and not in use" if isinstance(source, int) else "OpenCV reads videos of this format"
+        what = "OpenCV reads videos of this format"
+        if isinstance(source, int):
+            what = "it is connected and not in use"
+        elif address:
+            what = "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
         raise DataError(f"{name}: cannot be opened; check that {what}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
     frames = _record(recorder, name, most)
     first = next(frames)
     return Stream(name, rate if 0 < rate < 1000 else None, chain([first], frames))
+
+
+def _name(address: str) -> str:
+    """An address without user, password and query; raises `InputError` where no stream has it."""
+    kind, _, rest = address.partition("://")
+    kinds = (*STREAMS, "http", "https")
+    if kind not in kinds:
+        raise InputError(f"source: expected an address of a stream ({', '.join(kinds)}), got {kind}://…")
+    host, separator, path = rest.partition("/")
+    return f"{kind}://{host.rpartition('@')[2]}{separator}{path.partition('?')[0]}"
+
+
+def _recorder(cv2: Any, source: str | Path | int) -> Any:
+    """OpenCV's reader of a source. Of a camera or a stream it keeps the newest frame alone, where it can."""
+    if isinstance(source, Path):
+        return cv2.VideoCapture(str(source))
+    if isinstance(source, int):
+        recorder = cv2.VideoCapture(source)
+    else:
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
+        recorder = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+    recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    return recorder
 
 
 def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:

@@ -61,13 +61,10 @@ class Exchange:
 
             picture = supervision.BoxAnnotator().annotate(picture, seen.to_supervision(detector.classes))
         """
-        library = _supervision()
         boxes, vectors, labels, scores = (tensor.detach().cpu() for tensor in self._of_one_image())
-        data: dict[str, Any] = {SCORES: vectors.numpy()}
         if classes is not None:
             _check_names(classes, vectors.shape[-1] - 1)
-            data["class_name"] = np.array([classes[index] for index in (labels - 1).tolist()], dtype=str)
-        return library.Detections(boxes.numpy(), None, scores.numpy(), (labels - 1).numpy(), data=data)
+        return named_detections(boxes, labels, scores, classes, {SCORES: vectors.numpy()})
 
     @classmethod
     def from_supervision(cls, detections: supervision.Detections, classes: int) -> Self:
@@ -157,12 +154,7 @@ class Exchange:
         ids = category_ids(categories, classes)
         count = vectors.shape[-1] - 1
         check(len(ids) == count, "categories", f"one id for each of {count} classes", len(ids))
-        size = boxes[:, 2:] - boxes[:, :2]
-        placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
-        return [
-            {"image_id": image_id, "category_id": ids[label - 1], "bbox": box, "score": score}
-            for label, box, score in zip(labels.tolist(), placed, scores.double().tolist(), strict=True)
-        ]
+        return coco_results(image_id, boxes, labels, scores, dict(enumerate(ids, 1)))
 
     @classmethod
     def _one_image(cls, boxes: Tensor, vectors: Tensor) -> Self:
@@ -171,6 +163,55 @@ class Exchange:
         order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
         mask = torch.ones(1, len(boxes), dtype=torch.bool, device=boxes.device)
         return cls(boxes[order][None], vectors[order][None], mask)  # type: ignore[call-arg]
+
+
+def named_detections(
+    boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, Any]
+) -> supervision.Detections:
+    """Make `supervision.Detections`, which number classes from 0.
+
+    Args:
+        boxes: `(L, 4)`.
+        labels: `(L,)`, classes 1..K.
+        scores: `(L,)`, scores of the classes.
+        classes: names of the K classes, for `data["class_name"]`; None leaves them out.
+        data: further data of the boxes.
+
+    Returns:
+        The detections for Supervision.
+
+    Raises:
+        InputError: Supervision is not installed.
+    """
+    library, numbers = _supervision(), (labels - 1).numpy()
+    names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
+    made: supervision.Detections = library.Detections(
+        boxes.numpy(), None, scores.numpy(), numbers, data={**data, **names}
+    )
+    return made
+
+
+def coco_results(
+    image_id: int, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int]
+) -> list[dict[str, Any]]:
+    """Make COCO results.
+
+    Args:
+        image_id: id of the image.
+        boxes: `(L, 4)`, corners.
+        labels: `(L,)`, classes 1..K.
+        scores: `(L,)`, scores of the classes.
+        ids: category id by class.
+
+    Returns:
+        One result for each box, with the box as `[x, y, width, height]`.
+    """
+    size = boxes[:, 2:] - boxes[:, :2]
+    placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
+    return [
+        {"image_id": image_id, "category_id": ids[label], "bbox": box, "score": score}
+        for label, box, score in zip(labels.tolist(), placed, scores.double().tolist(), strict=True)
+    ]
 
 
 def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:

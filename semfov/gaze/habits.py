@@ -83,6 +83,7 @@ class GazeHabits(Pretrained):
         self.columns = columns
         self.metadata = dict(metadata or {})
         check_shape(place, "place", None)
+        check(len(place) > 0, "place", "at least one cell", len(place))
         check(columns >= 1 and len(place) % columns == 0, "columns", f"a divisor of {len(place)} cells", columns)
         for name, table, borders, low in (("edges", step, edges, 0.0), ("ages", back, ages, 1.0)):
             ends = torch.as_tensor(borders, dtype=place.dtype)

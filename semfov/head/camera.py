@@ -6,12 +6,11 @@ from typing import Protocol, TypeAlias, cast
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large
 from semfov.errors import DataError, check
-from semfov.head.scenes import Flat, Panorama, thumbnail
+from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
 from semfov.head.sphere import AROUND, Sphere
 from semfov.head.world import FIELDS, World
@@ -21,7 +20,7 @@ TRIES = 25
 """Largest number of frames that are asked for until one is from the right direction."""
 
 _WIDEST = 8192  # pixels of the panorama in which objects are located
-_KEPT = 320  # longer side of the frames that are kept for drawing
+_DRAWN = 1280  # pixels across the panorama of its frames
 
 
 @dataclass(frozen=True)
@@ -142,11 +141,11 @@ class CameraScene(Sphere):
         raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
 
     def _seen(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """A frame as an image of the right size, and its pose; a reduced copy is kept for drawing."""
+        """A frame as an image of the right size, and its pose; a copy is kept for drawing."""
         image = as_image(picture, color=self.color, argument="frame")
         got = image.shape[-1], image.shape[-2]
         check(got == tuple(self.size), "frame", f"{self.size[0]} × {self.size[1]} pixels, as `size` has it", got)
-        self._frames[tuple(pose.tolist())] = thumbnail(image, _KEPT).float().cpu(), at
+        self._frames[tuple(pose.tolist())] = image.mul(255).byte().cpu(), at
         return image, at
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
@@ -156,20 +155,18 @@ class CameraScene(Sphere):
             pan = torch.minimum(pan, 360 - pan)
         return torch.maximum(pan, (one[..., 1] - other[..., 1]).abs())
 
-    def image(self, side: int) -> Tensor | None:
+    def image(self) -> Tensor | None:
         """A panorama of the last frames from all poses, grey where the camera never looked; None before the first."""
         if not self._frames:
             return None
-        size = min(side, self.picture[0]) // 2 * 2, min(side, self.picture[0]) // 2
+        size = min(_DRAWN, self.picture[0]), min(_DRAWN, self.picture[0]) // 2
         y, x = torch.meshgrid(torch.arange(size[1]), torch.arange(size[0]), indexing="ij")
         directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), size)
         canvas = torch.full((3, size[0] * size[1]), 0.5)
         for frame, at in self._frames.values():
-            shape = frame.shape[-1], frame.shape[-2]
-            points, inside = Camera(at, shape).points(directions)
-            place = 2 * (points[inside] + 0.5) / points.new_tensor(shape) - 1
-            sampled = F.grid_sample(frame[None], place[None, None], padding_mode="border", align_corners=False)
-            canvas[:, inside] = sampled[0, :, 0]
+            points, inside = Camera(at, self.size).points(directions)
+            x, y = points[inside].round().long().unbind(-1)
+            canvas[:, inside] = frame[:, y.clamp(0, self.size[1] - 1), x.clamp(0, self.size[0] - 1)].float() / 255
         return canvas.unflatten(-1, size[::-1])
 
 

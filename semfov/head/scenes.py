@@ -85,9 +85,9 @@ class Panorama(Sphere):
             raise InputError(BLANK)
         return sample(self._source, pose, self.size).clamp(0, 1), pose
 
-    def image(self, side: int) -> Tensor | None:
-        """The panorama, reduced."""
-        return None if self._source is None else thumbnail(self._source[:, 1:-1, 1:-1], side)
+    def image(self) -> Tensor | None:
+        """The panorama."""
+        return None if self._source is None else self._source[:, 1:-1, 1:-1]
 
 
 @dataclass(frozen=True)
@@ -227,12 +227,9 @@ class Flat(World):
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 
-    def image(self, side: int) -> Tensor | None:
-        """The picture, reduced."""
-        if self.opened is None:
-            return None
-        reduction = self.opened.reduction(max(1.0, max(self.picture) / side))
-        return thumbnail(self.opened.read((0, 0, *self.picture), reduction).float() / 255, side)
+    def image(self) -> LargePicture | None:
+        """The picture."""
+        return self.opened
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of the view that show points of the picture."""
@@ -286,12 +283,3 @@ class Flat(World):
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
         """Boxes of the picture."""
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
-
-
-def thumbnail(image: Tensor, side: int) -> Tensor:
-    """An image `(3, H, W)` with its longer side reduced to `side` pixels, if it is longer."""
-    scale = side / max(image.shape[-2:])
-    if scale >= 1:
-        return image
-    shape = [max(1, round(n * scale)) for n in image.shape[-2:]]
-    return F.interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

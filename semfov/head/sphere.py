@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.large import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.head.world import FIELDS, World
@@ -74,7 +75,7 @@ class Sphere(World):
         """Raise an error, because directions alone show nothing."""
         raise InputError(BLANK)
 
-    def image(self, side: int) -> Tensor | None:
+    def image(self) -> Tensor | LargePicture | None:
         """Nothing, because directions alone show nothing."""
         return None
 

@@ -96,6 +96,14 @@ class Views:
         return len(self.view_grid)
 
     @cached_property
+    def ahead(self) -> int:
+        """Action in the middle of the view nearest to straight ahead, of those that tile the scene."""
+        poses = [pose for row in self.tiling[0] for pose in row]
+        middle = torch.tensor([0.0, 0.0, self.fields[0]]).expand(len(poses), 3)
+        nearest = poses[int(self.world.turn(self.poses[poses], middle).argmin())]
+        return nearest * self.cells + self.cells // 2 + CELL_POINTS // 2
+
+    @cached_property
     def reachable(self) -> Tensor:
         """Cells of the scene that at least one view shows, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)

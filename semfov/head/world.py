@@ -6,6 +6,7 @@ from typing import Protocol
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.large import LargePicture
 from semfov.head.speeds import Speeds
 
 FIELDS = (60.0,)
@@ -178,12 +179,9 @@ class World(ABC):
         """
 
     @abstractmethod
-    def image(self, side: int) -> Tensor | None:
-        """The whole scene, reduced, for drawing.
-
-        Args:
-            side: largest number of pixels along a side.
+    def image(self) -> Tensor | LargePicture | None:
+        """The picture of the whole scene, as far as it is known, for drawing.
 
         Returns:
-            `(3, H, W)`, RGB in [0, 1]; None where the scene has its geometry alone.
+            An opened picture, or `(3, H, W)`, RGB in [0, 1]; None where the scene has its geometry alone.
         """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,15 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import InputError, check
+from semfov.paths.conversion import Conversion
 from semfov.paths.drawing import drawing_of
 from semfov.paths.endings import FIXATIONS, Ending, sentence
 from semfov.paths.files import Format
 from semfov.paths.merging import ConfirmedPlace, confirm, places_confirmed
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -61,11 +64,11 @@ class RecordedLook:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Record(ABC):
+class Record(Conversion):
     """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
 
-    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: what `describe` counts,
-    what `plot` draws, and what `objects` returns.
+    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: those that `describe`
+    counts, `plot` draws and `objects` returns.
 
     Attributes:
         classes: names of the classes, background first.
@@ -151,9 +154,27 @@ class Record(ABC):
         """The objects, and which of them were confirmed."""
         return confirm(self.candidates.of(self._sought()), self._confirmations(), self.least)
 
+    @property
+    def refuted(self) -> list[CloseUp]:
+        """The closer looks that did not confirm that the target is there."""
+        boxes = [place.box for place in self._confirmations()]
+        return [look for look in self._closer() if not any(look.box.equal(box) for box in boxes)]
+
     def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self.decision, self.target, (), self.passes - 1)
+        return places_confirmed(self._decision_in_picture(), self.target, self._closer(), self._last())
+
+    def _last(self) -> int:
+        """Number of the last look."""
+        return 0
+
+    def _closer(self) -> Sequence[CloseUp]:
+        """The closer looks."""
+        return ()
+
+    def _decision_in_picture(self) -> Decision | None:
+        """The decision, with its box in pixels of the picture."""
+        return self.decision
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say from which score on.
@@ -201,6 +222,59 @@ class Record(ABC):
         ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
         return f"objects from score {self.least:g}: {', '.join([*named, *more]) or 'none'}"
+
+    def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
+        """Draw the looks and the objects on the picture.
+
+        Args:
+            ax: axes to draw in; None makes a new figure.
+            options: options of the function that draws this kind of records, such as `image`, the picture, which must
+                be given where the record does not keep it.
+
+        Returns:
+            The figure.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+        """
+        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
+        return figure
+
+    def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
+        """Make a film of the looks, one frame for each.
+
+        Args:
+            path: GIF file to write; None returns the film for a notebook.
+            options: options of the function that draws this kind of records: `seconds`, the duration of a frame;
+                `hold`, the additional duration of the last frame; and `image`, the picture, which must be given where
+                the record does not keep it.
+
+        Returns:
+            The path, or an object that a notebook shows as an animation.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+            DataError: the file cannot be written.
+        """
+        return drawing_of("animate", type(self))(self, path, **options)
+
+    def report(self, path: str | PathLike[str], **options: Any) -> Path:
+        """Write an HTML page of the looks and the objects, a single file that loads nothing from elsewhere.
+
+        Args:
+            path: the file.
+            options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
+                record keeps. `name`, the name of the picture on the page.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: the picture was not kept, and none is given.
+            DataError: the file cannot be written.
+        """
+        written: Path = drawing_of("report", type(self))(self, path, **options)
+        return written
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -351,9 +425,13 @@ class GazeRecord(Record):
         """Value for which a look was chosen."""
         return None
 
-    def _confirmations(self) -> list[ConfirmedPlace]:
-        """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self.decision, self.target, self.closer, len(self) - 1)
+    def _last(self) -> int:
+        """Number of the last look."""
+        return len(self) - 1
+
+    def _closer(self) -> Sequence[CloseUp]:
+        """The closer looks."""
+        return self.closer
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended.
@@ -370,23 +448,6 @@ class GazeRecord(Record):
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
         return f"{self.describe()}. {self.why_it_ended()}".rstrip()
-
-    def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
-        """Draw the looks on the picture.
-
-        Args:
-            ax: axes to draw in; None makes a new figure.
-            options: options of the function that draws this kind of records, such as `image`, the picture, which must
-                be given where the record does not keep it.
-
-        Returns:
-            The figure.
-
-        Raises:
-            InputError: the picture was not kept, and none is given.
-        """
-        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
-        return figure
 
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
         """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.

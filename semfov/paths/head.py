@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
@@ -22,7 +23,7 @@ from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
-from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
+from semfov.paths.merging import distances_to, merge_fixations
 
 _BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
@@ -178,12 +179,12 @@ class HeadPath(GazeRecord):
         Returns:
             The line.
         """
-        what = "exploration" if self.target is None else self.target_name
-        found = "" if self.target is None else (" found" if self.found else " not found")
         looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
-        objects = f", {self.objects_in_words()}" if self.target is None else ""
-        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}{objects}"
+        what = self.objects_in_words()
+        if self.decision is not None:
+            what = f"{self.target_name}: {self.decision.outcome} ({self.decision.probability:.2f})"
+        return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look.
@@ -224,11 +225,11 @@ class HeadPath(GazeRecord):
     def _duration(self, number: int) -> float | None:
         return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
 
-    def _confirmations(self) -> list[ConfirmedPlace]:
+    def _decision_in_picture(self) -> Decision | None:
         decision = self.decision
-        if decision is not None and decision.box is not None:
-            decision = replace(decision, box=self.views.world.boxes(decision.box[None], self.pose(-1))[0])
-        return places_confirmed(decision, self.target, self.closer, len(self) - 1)
+        if decision is None or decision.box is None:
+            return decision
+        return replace(decision, box=self.views.world.boxes(decision.box[None], self.pose(-1))[0])
 
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         width, height = (int(side) for side in self.views.world.scene.extent)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.paths.base import Record, RecordedLook
-from semfov.paths.merging import ConfirmedPlace, distances_to, merge_fixations, places_confirmed
+from semfov.paths.merging import distances_to, merge_fixations
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -78,7 +78,7 @@ class Moment(Record):
     def candidates(self) -> Objects:
         """Objects of the frame, of all scores from 0.05 on, with boxes in pixels of the frame."""
         distances = distances_to(self.detections.boxes[0], self.fixation)
-        return merge_fixations([self.detections], [distances], [] if self.closer is None else [self.closer])
+        return merge_fixations([self.detections], [distances], self._closer())
 
     @property
     def probability(self) -> Tensor:
@@ -105,9 +105,8 @@ class Moment(Record):
         row, column = divmod(self.cell, self.grid.columns)
         return [f"frame {self.number}, at (column, row): ({column}, {row})", self._listed()]
 
-    def _confirmations(self) -> list[ConfirmedPlace]:
-        closer = [] if self.closer is None else [self.closer]
-        return places_confirmed(self.decision, self.target, closer, 0)
+    def _closer(self) -> Sequence[CloseUp]:
+        return () if self.closer is None else (self.closer,)
 
     def rows(self) -> list[dict[str, Any]]:
         """The frame as a table of plain values.

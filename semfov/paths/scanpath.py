@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,13 +16,9 @@ from semfov.episode import STAGES
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
 from semfov.paths.base import GazeRecord
-from semfov.paths.drawing import drawing_of
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import Stimulus
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _SENSOR = {
     "sigma": POSITIVE,
@@ -190,22 +185,6 @@ class Scanpath(GazeRecord):
     def _place(self, cell: int) -> str:
         row, column = divmod(cell, self.grid.columns)
         return f"({column}, {row})"
-
-    def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
-        """Draw the episode as an animation, one frame for each fixation.
-
-        Args:
-            path: path of the GIF to write; None returns the animation for a notebook.
-            options: `seconds`, the duration of a frame; `hold`, the additional duration of the last frame; and `boxes`
-                `(M, 4)`, the true boxes of the target.
-
-        Returns:
-            The path, or an object that a notebook shows as an animation.
-
-        Raises:
-            InputError: the photograph was not kept.
-        """
-        return drawing_of("animate", type(self))(self, path, **options)
 
     def rows(self) -> list[dict[str, Any]]:
         """The episode as a table of plain values, one row for each fixation.

@@ -47,7 +47,7 @@ _FORMAT = Format.of(
         "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
         "windows": Array(Object(_WINDOW, None, tuple(_WINDOW)), "n"),
     },
-    endings=("decision", "worth", "passes", "windows", "seconds", "stopped"),
+    endings=("decision", "detection", "worth", "passes", "windows", "seconds", "stopped"),
     closer=("number", "target", "place", "presence"),
 )
 """Format of the files of paths through large pictures."""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from html import escape
 
-from semfov.paths import HeadPath, Record, Scanpath, ZoomPath
+from semfov.paths import HeadPath, Moment, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
 from semfov.report.drawing import path_html
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import page_html
 from semfov.viz.animation import animate
-from semfov.viz.head import plot_head_path
+from semfov.viz.head import animate_head, plot_head_path
 from semfov.viz.scanpath import plot_scanpath
-from semfov.viz.zoom import plot_zoom_path
+from semfov.viz.zoom import animate_looks, plot_moment, plot_zoom_path
 
 MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
@@ -83,4 +83,7 @@ draws("notebook", ZoomPath, path_html)
 draws("plot", Scanpath, plot_scanpath)
 draws("plot", ZoomPath, plot_zoom_path)
 draws("plot", HeadPath, plot_head_path)
+draws("plot", Moment, plot_moment)
+draws("animate", Record, animate_looks)
 draws("animate", Scanpath, animate)
+draws("animate", HeadPath, animate_head)

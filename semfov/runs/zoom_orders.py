@@ -7,22 +7,10 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
-from semfov.zoom.glances import Glance, Glances, Window, around, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import Choice
-
-
-def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
-    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
-    width, height = lattice.size
-    step = max(1, int(side * (1 - overlap)))
-
-    def starts(length: int) -> list[int]:
-        last = max(length - side, 0)
-        return sorted({*range(0, last, step), last})
-
-    boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in starts(height) for x in starts(width)]
-    return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+from semfov.zoom.slices import raw
 
 
 def in_order(windows: Sequence[Window]) -> Order:
@@ -34,29 +22,6 @@ def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
     """The windows in random order."""
     order = np.random.Generator(np.random.PCG64(list(seed))).permutation(len(windows))
     return in_order([windows[n] for n in order])
-
-
-def ranked(windows: Sequence[Window], target: int | None, *, most: bool) -> Order:
-    """The windows in descending order of the overview's raw scores in them.
-
-    Args:
-        windows: windows to look at.
-        target: class 1..K; None: any class.
-        most: rank a window by its highest score; false: by the sum of its scores.
-
-    Returns:
-        The order.
-    """
-    ranking: list[Choice] = []
-
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
-        if len(looks) == 1:
-            values = torch.tensor([raw(looks[0], window, target, most=most) for window in windows])
-            places = values.argsort(descending=True, stable=True).tolist()
-            ranking.extend((windows[place], float(values[place])) for place in places)
-        return ranking[len(looks) - 1 : len(looks)]
-
-    return order
 
 
 def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
@@ -99,23 +64,7 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
         }
     )
     windows = [on_lattice(lattice, (level, column, row)) for row, column in places]
-    return [(raw(glance, window, target, most=most), window) for window in windows]
-
-
-def raw(glance: Glance, window: Window, target: int | None, *, most: bool) -> float:
-    """Raw value of a window: the highest score, or the sum of the scores, that a look's gist has in it."""
-    look = glance.gist
-    assert look is not None
-    x1, y1, x2, y2 = window.cells
-    left, top = look.first
-    box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
-    columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
-    rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
-    part = look.scores[rows, columns]
-    scores = part.amax(-1) if target is None else part[..., target - 1]
-    if not scores.numel():
-        return 0.0
-    return float(scores.max() if most else scores.sum())
+    return [(raw(glance, window, [] if target is None else [target], most=most), window) for window in windows]
 
 
 def oracle(glances: Glances, windows: Sequence[Window], found: Callable[[Glance], Tensor], most: int) -> Order:

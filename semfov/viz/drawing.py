@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape
-from semfov.paths import GazeRecord, Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
@@ -22,10 +23,11 @@ if TYPE_CHECKING:
 CONFIDENT = 0.1
 """Detections of lower confidence are not drawn."""
 
-_LABEL_POINTS = 6.5
+LABEL = 6.5
+"""Font size of the labels of boxes."""
 
 
-def photograph_of(record: GazeRecord, image: Tensor | None) -> Tensor:
+def photograph_of(record: Record, image: Tensor | None) -> Tensor:
     """The given image, or the one that the record kept.
 
     Args:
@@ -135,8 +137,13 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
 
 
 def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """Draw a cross at the point of gaze."""
-    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
+    """Draw a cross at the point of gaze of a fixation."""
+    return draw_cross(axes, scanpath.fixations[fixation])
+
+
+def draw_cross(axes: Axes, point: Tensor) -> list[Artist]:
+    """Draw a cross at the point of gaze, `(x, y)` in pixels."""
+    x, y = (point.cpu() + 0.5).tolist()
     return [
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
         *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
@@ -151,50 +158,81 @@ def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, lis
     return detections.boxes[0][sure][:most].cpu(), labels, detections.confidence[0][sure][:most].tolist()
 
 
-def draw_detections(
-    axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: list[LabelBox] | None = None
-) -> list[Artist]:
+def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6) -> list[Artist]:
     """Draw the most confident detections of a look, each labelled with its best class other than background.
 
-    Labels cover neither the point of gaze nor the rectangles of `kept_free`. The figure must be laid out, because the
-    positions of labels depend on the layout.
+    Labels do not cover the point of gaze. The figure must be laid out, because the positions of labels depend on the
+    layout.
 
     Args:
         axes: to draw in.
         scanpath: the episode.
         fixation: number of the look.
         most: largest number of detections.
-        kept_free: rectangles that labels must not cover.
 
     Returns:
         The artists drawn.
     """
     boxes, labels, scores = seen_well(scanpath, fixation, most)
-    texts = [f"{scanpath.classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
-    frame = tuple(scanpath.grid.extent.tolist())
-    sizes = [text_size(axes, text, _LABEL_POINTS) for text in texts]
+    tags: list[Tag] = []
+    drawn: list[Artist] = []
+    for box, label, score in zip(boxes, labels, scores, strict=True):
+        colour = TARGET if label == scanpath.target else OTHER
+        x1, y1, x2, y2 = box.tolist()
+        tags.append(Tag((x1, y1, x2, y2), f"{scanpath.classes[label]} {score:.2f}", colour))
+        drawn += draw_boxes(axes, box[None], colour)
     reach = 8 * per_point(axes)
     x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
-    marks = [(x - reach, y - reach, x + reach, y + reach), *(kept_free or [])]
-    places = place_labels([tuple(box) for box in boxes.tolist()], sizes, frame, marks)
-    drawn: list[Artist] = []
-    for box, label, text, (left, top, _, _) in zip(boxes, labels, texts, places, strict=True):
-        colour = TARGET if label == scanpath.target else OTHER
-        drawn += draw_boxes(axes, box[None], colour)
-        written = axes.text(
+    width, height = scanpath.grid.extent.tolist()
+    return [*drawn, *draw_tags(axes, tags, (width, height), [(x - reach, y - reach, x + reach, y + reach)])]
+
+
+class Tag(NamedTuple):
+    """The label of a box in a figure.
+
+    Attributes:
+        box: `(x1, y1, x2, y2)` of the box.
+        text: text of the label.
+        colour: colour of the box.
+    """
+
+    box: LabelBox
+    text: str
+    colour: str
+
+
+def draw_tags(
+    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], kept_free: Sequence[LabelBox], points: float = LABEL
+) -> list[Artist]:
+    """Write the labels of boxes, so that none covers another; the figure must be laid out.
+
+    Args:
+        axes: to draw in.
+        tags: the labels.
+        frame: `(width, height)` of the picture.
+        kept_free: rectangles that labels must not cover.
+        points: font size.
+
+    Returns:
+        The texts.
+    """
+    sizes = [text_size(axes, tag.text, points) for tag in tags]
+    places = place_labels([tag.box for tag in tags], sizes, frame, kept_free)
+    return [
+        axes.text(
             left,
             top,
-            text,
-            color="white" if colour == TARGET else "black",
-            fontsize=_LABEL_POINTS,
+            tag.text,
+            color="white" if lightness(tag.colour) < 0.5 else "black",
+            fontsize=points,
             va="top",
             clip_on=True,
             parse_math=False,
             zorder=4,
-            bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
+            bbox={"facecolor": tag.colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
         )
-        drawn.append(written)
-    return drawn
+        for tag, (left, top, _, _) in zip(tags, places, strict=True)
+    ]
 
 
 def text_size(axes: Axes, text: str, points: float) -> tuple[float, float]:

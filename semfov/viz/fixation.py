@@ -20,8 +20,9 @@ from semfov.viz.drawing import (
     photograph_of,
     picture_array,
 )
+from semfov.viz.objects import draw_legend
 from semfov.viz.path import path_of
-from semfov.viz.scanpath import MOST_BOXES, draw_legend, draw_place
+from semfov.viz.scanpath import MOST_BOXES, annotation_entries, draw_place
 from semfov.viz.semantic import draw_semantic_map, most_probable, write_names
 from semfov.viz.style import lay_out, make_figure, styled
 
@@ -102,7 +103,7 @@ class FixationFigure:
                 panel.xaxis.set_visible(False)
                 panel.yaxis.set_visible(False)
         draw_place(path, scanpath, image, boxes)
-        draw_legend(path, scanpath, boxes, None)
+        draw_legend(path, annotation_entries(scanpath, boxes))
         self.view = draw_image(seen, view, scanpath.grid)
         seen.set_title("what the eye sees")
         if scanpath.target is None:

@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import ImageLike, as_image
+from semfov.detection.placement import resize
 from semfov.errors import check
+from semfov.head.scenes import Panorama
 from semfov.paths import HeadPath
 from semfov.viz.animation import Film, render
 from semfov.viz.drawing import draw_image, photograph_of, picture_array
-from semfov.viz.style import FOUND, GAZE, OTHER, STYLE, TARGET, make_figure, only, styled
+from semfov.viz.objects import draw_legend, draw_objects, object_entries
+from semfov.viz.style import GAZE, OTHER, STYLE, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +34,8 @@ def plot_head_path(
 
     Args:
         path: record of a search or an exploration.
-        image: the scene's picture in any size, of any common kind (`semfov.as_image`); it must be given.
+        image: the scene's picture in any size, of any common kind (`semfov.as_image`); None takes the one that the path
+            kept.
         looks: number of looks to draw, from the first; None draws all.
         ax: axes to draw in; None makes a figure.
 
@@ -39,22 +43,25 @@ def plot_head_path(
         The figure.
 
     Raises:
-        InputError: the picture is not given, or there are fewer looks.
+        InputError: the picture is neither given nor kept, or there are fewer looks.
 
     Example::
 
         path = agent.search(Panorama("street.jpg"), "bicycle")
-        save_figure(plot_head_path(path, "street.jpg"), "path.png")
+        save_figure(plot_head_path(path), "path.png")
     """
     picture = photograph_of(path, None if image is None else as_image(image))
     count = len(path) if looks is None else looks
     check(1 <= count <= len(path), "looks", f"a number from 1 to {len(path)}", count)
     width, height = path.views.world.scene.extent.tolist()
     figure, (axes,) = make_figure(
-        1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed", given=only(ax)
+        1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", given=only(ax)
     )
     draw_path(axes, path, picture, count)
     axes.set_title(path.describe(), parse_math=False)
+    draw_legend(axes, [(GAZE, "-", "views of the head"), *object_entries(path)])
+    lay_out(figure)
+    draw_objects(axes, path, last=count - 1)
     return figure
 
 
@@ -67,11 +74,6 @@ def draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
         now = pose == path.actions[count - 1] // path.views.cells
         frame = world.places(torch.tensor([[0.0, 0.0, *map(float, world.size)]]), path.views.poses[pose])
         _outline(axes, path, frame, color=GAZE, linewidth=1.6 if now else 0.7, alpha=1.0 if now else 0.6)
-    for look in range(count):
-        places, *_ = path.places(look, 0.3)
-        for number in range(len(places)):
-            colour = TARGET if path.target is not None else FOUND
-            _outline(axes, path, places[torch.tensor([number])], color=colour, linewidth=0.8)
     points = torch.stack([world.pixels_of(path.gaze(look)[None])[0] for look in range(count)]) + 0.5
     for one, other in pairwise(points):
         x, y = _unwrapped(torch.stack([one, other]), path)
@@ -110,9 +112,9 @@ def _unwrapped(points: Tensor, path: HeadPath) -> tuple[Any, Any]:
 
 def animate_head(
     path: HeadPath,
-    image: ImageLike,
     file: str | PathLike[str] | None = None,
     *,
+    image: ImageLike | None = None,
     seconds: float = 0.8,
     hold: float = 2.0,
 ) -> Path | Film:
@@ -120,8 +122,8 @@ def animate_head(
 
     Args:
         path: record of a search or an exploration.
-        image: the scene's picture, of any common kind (`semfov.as_image`).
         file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
+        image: the scene's picture, of any common kind (`semfov.as_image`); None takes the one that the path kept.
         seconds: duration of each frame.
         hold: additional seconds of the last frame.
 
@@ -129,17 +131,19 @@ def animate_head(
         The path of the GIF, or a film, which a notebook shows.
 
     Raises:
+        InputError: the picture is neither given nor kept.
         DataError: the file cannot be written.
 
     Example::
 
         path = agent.search(Panorama("street.jpg"), "bicycle")
-        animate_head(path, "street.jpg", "path.gif")
+        animate_head(path, "path.gif")
     """
     from matplotlib import rc_context
 
+    picture = photograph_of(path, None if image is None else as_image(image))
     with rc_context(STYLE):
-        film = Film(render(_frames(path, as_image(image))), seconds, hold, path.describe())
+        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
     return film if file is None else film.save(file)[0]
 
 
@@ -149,6 +153,7 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
     world = path.views.world
     width, height = world.scene.extent.tolist()
     high = 7.2 * height / width
+    views = head_views(path, image)
     for look, action in enumerate(path.actions):
         figure = Figure(figsize=(7.2, high + 3.1), layout="constrained")
         parts: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
@@ -156,8 +161,10 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         axes = above.subplots()
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
+        lay_out(figure)
+        draw_objects(axes, path, last=look, tagged=False)
         left, right = below.subplots(1, 2, width_ratios=[1, 1.25])
-        left.imshow(picture_array(world.view(path.pose(look))[0]))
+        left.imshow(picture_array(next(views)))
         x, y = path.views.view_grid.centres[action % path.views.cells].tolist()
         left.plot([x], [y], marker="+", markersize=14, color=TARGET, markeredgewidth=2)
         left.set(xticks=[], yticks=[], title="what the head sees")
@@ -166,3 +173,27 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         what = "any object" if path.target is None else path.classes[path.target]
         right.set(xticks=[], yticks=[], title=f"P({what})")
         yield figure
+
+
+def head_views(path: HeadPath, image: Tensor) -> Iterator[Tensor]:
+    """Render what the head saw in each look from a picture of the scene.
+
+    Args:
+        path: the record.
+        image: `(3, H, W)`, RGB in [0, 1], the scene's picture in any size.
+
+    Yields:
+        One view `(3, h, w)` in [0, 1] for each look.
+    """
+    world, (width, height) = path.views.world, path.size
+    if world.closed:
+        # Poses are angles, which do not depend on the size of the picture.
+        scene = Panorama(image[..., : image.shape[-1] // 2 * 2], world.size, reach=90)
+        yield from (scene.view(path.pose(look))[0] for look in range(len(path)))
+        return
+    across, down = image.shape[-1] / width, image.shape[-2] / height
+    for look in range(len(path)):
+        x1, y1, x2, y2 = path.region(look)
+        left, top = min(round(x1 * across), image.shape[-1] - 1), min(round(y1 * down), image.shape[-2] - 1)
+        right, bottom = max(round(x2 * across), left + 1), max(round(y2 * down), top + 1)
+        yield resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)

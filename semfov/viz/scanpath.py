@@ -9,7 +9,6 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
-from semfov.decision import CloseUp
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
 from semfov.viz.belief import draw_belief
@@ -22,11 +21,11 @@ from semfov.viz.drawing import (
     draw_image,
     draw_scale,
     photograph_of,
-    seen_well,
 )
+from semfov.viz.objects import LegendEntry, draw_legend, draw_objects, object_entries
 from semfov.viz.path import GazePath, path_of
 from semfov.viz.semantic import draw_semantic_map, write_names
-from semfov.viz.style import FOUND, OTHER, TARGET, TRUTH, lay_out, make_figure, only, root, styled
+from semfov.viz.style import TRUTH, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,19 +41,19 @@ def plot_scanpath(
     image: Tensor | None = None,
     *,
     boxes: Tensor | None = None,
-    detections: bool = True,
+    objects: bool = True,
     ax: Axes | None = None,
 ) -> Figure:
-    """Plot numbered fixations on the photograph, coloured by time, with the grid and the last look's detections.
+    """Plot numbered fixations on the photograph, coloured by time, with the grid and the objects.
 
-    A legend explains the colours of the boxes. Fixations of people have no grid and no detections; their target's box
-    is drawn dashed.
+    A legend explains the colours of the boxes: those of objects that a closer look or the decision confirmed, and
+    others. Fixations of people have no grid and no objects; their target's box is drawn dashed.
 
     Args:
         scanpath: the episode, or the fixations of a person (`semfov.data.fixations`).
         image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own. Fixations of people need it.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
-        detections: whether to draw the detections of the last fixation.
+        objects: whether to draw the objects of the scanpath.
         ax: axes to draw in; None makes a figure.
 
     Returns:
@@ -74,17 +73,12 @@ def plot_scanpath(
     height = 6.4 * image.shape[-2] / image.shape[-1] + 0.6
     figure, (axes,) = make_figure(1, 1, width=6.4, height=height, layout="compressed", given=only(ax))
     draw_place(axes, scanpath, image, boxes)
-    box = found_box(scanpath)
-    if box is not None:
-        draw_boxes(axes, box[None], FOUND, width=2.0)
-    for look in dismissed(scanpath):
-        draw_boxes(axes, look.box[None], FOUND, ":", 1.6)
     axes.set_title(scanpath.describe(), parse_math=False)
-    draw_legend(axes, scanpath, boxes, len(scanpath) - 1 if detections else None)
+    draw_legend(axes, [*annotation_entries(scanpath, boxes), *(object_entries(scanpath) if objects else [])])
     lay_out(figure)
     path = path_of(axes, scanpath)
-    if detections:
-        draw_detections(axes, scanpath, len(scanpath) - 1, MOST_BOXES, kept_free=path.taken)
+    if objects:
+        draw_objects(axes, scanpath, path.taken)
     return figure
 
 
@@ -200,7 +194,7 @@ def plot_episode(
     first = left.subplots()
     draw_place(first, scanpath, image, boxes)
     first.set_title(scanpath.describe(), parse_math=False)
-    draw_legend(first, scanpath, boxes, None)
+    draw_legend(first, annotation_entries(scanpath, boxes))
     panels = right.subplots(2, len(shown), squeeze=False)
     for (above, below), fixation in zip(panels.T, shown, strict=True):
         draw_view(above, scanpath, fixation, views[fixation])
@@ -226,50 +220,10 @@ def draw_place(axes: Axes, scanpath: Scanpath, image: Tensor, boxes: Tensor | No
         draw_boxes(axes, boxes, TRUTH, "--", 1.8)
 
 
-def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: int | None) -> None:
-    """Draw a legend of the boxes below the picture; detections of `fixation` are named as those of the last look."""
-    from matplotlib.lines import Line2D
-
+def annotation_entries(scanpath: Scanpath, boxes: Tensor | None) -> list[LegendEntry]:
+    """Entries of a legend for the true boxes of the target, where there are any."""
     name = "target" if scanpath.target is None else scanpath.classes[scanpath.target]
-    kinds: list[tuple[str, Any, str]] = []
-    if boxes is not None and len(boxes):
-        kinds.append((TRUTH, "--", f"annotated: {name}"))
-    if fixation is not None:
-        found = found_box(scanpath) is not None
-        if found:
-            kinds.append((FOUND, "-", f"where the {name} was found"))
-        if dismissed(scanpath):
-            kinds.append((FOUND, ":", "another closer look" if found else "not confirmed by a closer look"))
-        _, labels, _ = seen_well(scanpath, fixation, MOST_BOXES)
-        if scanpath.target in labels:
-            kinds.append((TARGET, "-", f"last look: {name}"))
-        if any(label != scanpath.target for label in labels):
-            kinds.append((OTHER, "-", "last look: other objects" if scanpath.target else "last look: objects"))
-    if kinds:
-        lines = [Line2D([], [], color=colour, linestyle=line, linewidth=1.8) for colour, line, _ in kinds]
-        legend = axes.legend(
-            lines,
-            [text for _, _, text in kinds],
-            loc="upper center",
-            bbox_to_anchor=(0.5, 0),
-            ncols=len(kinds) if len(kinds) < 4 else 2,
-            frameon=False,
-            handlelength=1.6,
-        )
-        for text in legend.get_texts():
-            text.set_parse_math(False)
-
-
-def found_box(scanpath: Scanpath) -> Tensor | None:
-    """The box of the decision, where the target was found with one."""
-    return None if scanpath.decision is None else scanpath.decision.box
-
-
-def dismissed(scanpath: Scanpath) -> list[CloseUp]:
-    """The closer looks of a scanpath, without the one at the target that was found."""
-    decision = scanpath.decision
-    found = None if decision is None else decision.box
-    return [look for look in scanpath.closer if found is None or not look.box.equal(found)]
+    return [(TRUTH, "--", f"annotated: {name}")] if boxes is not None and len(boxes) else []
 
 
 def draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:

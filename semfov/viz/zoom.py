@@ -2,74 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from semfov.paths import ZoomPath
-from semfov.viz.drawing import photograph_of
-from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
+from semfov.belief.grid import Grid
+from semfov.paths import Moment, Record
+from semfov.viz.animation import Film, render
+from semfov.viz.drawing import CONFIDENT, Tag, draw_boxes, draw_cross, draw_image, draw_tags, photograph_of
+from semfov.viz.labels import LabelBox
+from semfov.viz.objects import draw_legend, draw_objects, object_entries
+from semfov.viz.style import GAZE, STYLE, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_SHOWN = 15  # largest number of detections of a window that are drawn
+
 
 @styled
-def plot_zoom_path(
-    path: ZoomPath, image: Tensor | None = None, *, score: float = 0.1, ax: Axes | None = None
-) -> Figure:
-    """Plot the windows that were looked at, numbered in their order, and the objects that were found.
+def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
+    """Plot the windows that were looked at, numbered in their order, and the objects.
 
-    The first look, at the whole picture, is not drawn. Objects have names where all classes were looked for.
+    Looks at the whole picture have no window. A legend tells the objects that a closer look or the decision confirmed
+    from the others.
 
     Args:
         path: record of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; it must be given.
-        score: least score of the objects that are drawn.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; None takes the one that the record kept.
         ax: axes to draw in; None makes a figure.
 
     Returns:
         The figure.
 
     Raises:
-        InputError: the picture is not given.
+        InputError: the picture is neither given nor kept.
 
     Example::
 
         path = agent.search("harbour.tif", "person")
-        save_figure(plot_zoom_path(path, semfov.as_image("harbour_small.jpg")), "path.png")
+        save_figure(plot_zoom_path(path), "path.png")
+    """
+    image = photograph_of(path, image)
+    width, height = path.size
+    size = 7.2, 7.2 * height / width + 0.6
+    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
+    draw_image(axes, image, Grid(1, 1, (width, height)))
+    taken = draw_windows(axes, path)
+    axes.set_title(path.describe(), parse_math=False)
+    windows = [(GAZE, "-", "windows of the looks")] if taken else []
+    draw_legend(axes, [*windows, *object_entries(path)])
+    lay_out(figure)
+    draw_objects(axes, path, taken)
+    return figure
+
+
+def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[LabelBox]:
+    """Draw the windows of looks, numbered in their order.
+
+    Args:
+        axes: axes that hold the picture.
+        path: the record.
+        last: number of the last look that is drawn, with a wider frame; None draws all.
+
+    Returns:
+        Rectangles of the numbers.
     """
     from matplotlib.patches import Rectangle
 
-    image = photograph_of(path, image)
-    width, height = path.lattice.size
-    size = 7.2, 7.2 * height / width + 0.3
-    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
-    pixels = image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy()
-    axes.imshow(pixels, extent=(0, width, height, 0), interpolation="bilinear")
+    width, height = path.size
     taken: list[tuple[float, float]] = []
-    for number, glance in enumerate(path.glances):
-        if number == 0:
+    room = 0.025 * width
+    for look in path:
+        x1, y1, x2, y2 = look.region
+        if (x2 - x1 > width - 1 and y2 - y1 > height - 1) or (last is not None and look.number > last):
             continue
-        box = path.region(number)
-        x1, y1, x2, y2 = box
-        line: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 0.8 + 0.5 * (glance.window.level == 1)}
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **line))
-        place = _free(box, taken, 0.025 * width)
+        style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
+        place = _free(look.region, taken, room)
         taken.append(place)
-        axes.text(*place, str(number), color="white", fontsize=6, ha="center", va="center",
+        axes.text(*place, str(look.number), color="white", fontsize=6, ha="center", va="center",
                   bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
-    kept = path.objects.above(score)
-    for (x1, y1, x2, y2), label in zip(kept.boxes.tolist(), kept.labels.tolist(), strict=True):
-        colour = TARGET if label == path.target else FOUND
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=1.0))
-        if path.target is None:
-            axes.text(x1, y2, path.classes[label], color="white", fontsize=5, parse_math=False, va="top", clip_on=True,
-                      bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.5})  # fmt: skip
-    axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-    axes.set_title(path.describe(), parse_math=False)
-    return figure
+    return [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in taken]
 
 
 def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
@@ -92,3 +110,90 @@ def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float
         return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
 
     return max(places, key=far)
+
+
+@styled
+def plot_moment(moment: Moment, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
+    """Plot the point of gaze in a frame, and the objects.
+
+    Args:
+        moment: record of the frame.
+        image: `(3, h, w)`, RGB in [0, 1], the frame in any size; None takes the one that the record kept.
+        ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: the frame is neither given nor kept.
+
+    Example::
+
+        save_figure(plot_moment(live.step(frame)), "frame.png")
+    """
+    figure = plot_zoom_path(moment, image, ax=ax)
+    axes = figure.axes[0] if ax is None else ax
+    draw_cross(axes, moment.fixation)
+    return figure
+
+
+def animate_looks(
+    path: Record,
+    file: str | PathLike[str] | None = None,
+    *,
+    image: Tensor | None = None,
+    seconds: float = 0.8,
+    hold: float = 2.0,
+) -> Path | Film:
+    """Make a film of a record: for each look the picture with the windows so far, and the window with its detections.
+
+    Args:
+        path: the record.
+        file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; None takes the one that the record kept, in which
+            narrow windows are coarse.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The path of the GIF, or a film, which a notebook shows.
+
+    Raises:
+        InputError: the picture is neither given nor kept.
+        DataError: the file cannot be written.
+
+    Example::
+
+        animate_looks(agent.find_all("harbour.tif", "person"), "harbour.gif")
+    """
+    from matplotlib import rc_context
+
+    picture = photograph_of(path, image)
+    with rc_context(STYLE):
+        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
+    return film if file is None else film.save(file)[0]
+
+
+def _frames(path: Record, image: Tensor) -> Iterator[Figure]:
+    width, height = path.size
+    high = 4.8 * height / width
+    for look in path:
+        figure, (whole, window) = make_figure(1, 2, width=4.8 + 1.15 * high, height=high + 0.4, layout="compressed")
+        for axes in (whole, window):
+            draw_image(axes, image, Grid(1, 1, (width, height)))
+        taken = draw_windows(whole, path, look.number)
+        whole.set_title(f"look {look.number}")
+        x1, y1, x2, y2 = look.region
+        window.set(xlim=(x1, x2), ylim=(y2, y1), title="its window and detections")
+        lay_out(figure)
+        draw_objects(whole, path, taken, last=look.number, tagged=False)
+        seen = look.detections
+        sure = seen.confidence[0] >= CONFIDENT
+        boxes, labels = seen.boxes[0][sure][:_SHOWN], seen.labels[0][sure].tolist()
+        draw_boxes(window, boxes, TARGET)
+        tags = [
+            Tag(tuple(box), f"{path.classes[label]} {score:.2f}", TARGET)
+            for box, label, score in zip(boxes.tolist(), labels, seen.confidence[0][sure].tolist(), strict=False)
+        ]
+        draw_tags(window, tags, (x2, y2), [])
+        yield figure

@@ -1,12 +1,13 @@
-"""Beliefs of every kind: the probability of a target, indexing, mapping and fading."""
+"""Beliefs of every kind of observer: batches, indexing, mapping and fading, and looks that are joined."""
 
 import pytest
 import torch
 
 from semfov import Detections, Grid, InputError
-from semfov.belief import Belief, ContextPrior, DirichletBelief, TargetEvidence
+from semfov.belief import Belief, ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.belief import dirichlet_belief, pick
-from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
+from tests import small
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -35,14 +36,26 @@ def tensors_of(belief):
     found = []
     for name in belief.__dataclass_fields__:
         part = getattr(belief, name)
-        found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
+        if name != "weights":
+            for each in part if isinstance(part, tuple) else (part,):
+                found += [each] if isinstance(each, torch.Tensor) else tensors_of(each)
     return found
 
 
-def target_observer():
+def equal(one, other):
+    return all(torch.equal(mine, theirs) for mine, theirs in zip(tensors_of(one), tensors_of(other), strict=True))
+
+
+def target_observer(**options):
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return Target(TargetEvidence(8, 6).double().requires_grad_(False))
+        return Target(TargetEvidence(48, 24).double().requires_grad_(False), **options)
+
+
+def map_observer(**options):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return LearnedMap(MapEvidence(48, 24, components=4).double().requires_grad_(False), **options)
 
 
 def context_observer():
@@ -50,7 +63,118 @@ def context_observer():
     return Context(Semantic(4), prior)
 
 
-OBSERVERS = {"all classes": lambda: Semantic(4), "target": target_observer, "context": context_observer}
+OBSERVERS = {
+    "all classes": lambda: Semantic(4),
+    "soft": lambda: Semantic(4, footprint="soft"),
+    "misses": lambda: Semantic(4, misses=small.model().double().requires_grad_(False), memory="closest"),
+    "target": target_observer,
+    "map": map_observer,
+    "context": context_observer,
+    "landing": lambda: Landing(3),
+    "any of targets": lambda: AnyOf(target_observer(), {1: 0.3, 2: 1.0}),
+    "any of a map": lambda: AnyOf(map_observer(), {1: 0.3, 2: 1.0}),
+}
+TARGETS = (1, 2, 3, 1)
+CELLS = torch.tensor([0, 9, 5, 7])
+
+
+@pytest.fixture
+def four(random_looks):
+    """Four looks with up to five detections and padding, from four cells; the third has no detections."""
+    return random_looks(GRID, components=4, dtype=torch.float64), GRID.centres[CELLS].double()
+
+
+def looked(observer, four, rows, target):
+    """Looks of some of the four episodes, weighed for one target."""
+    seen, fixations = four
+    return observer.weigh(seen[rows], fixations[rows], GRID, target)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_a_batch_of_episodes_equals_each_of_them_alone(kind, four):
+    """Bit for bit, after two looks of each, for targets of their own."""
+    observer = OBSERVERS[kind]()
+
+    def watched(rows):
+        belief = observer.start(len(rows), GRID, four[0].scores)
+        for turn in (0, 1):
+            each = [looked(observer, four, torch.tensor([(row + turn) % 4]), TARGETS[row]) for row in rows]
+            belief = observer.update(belief, type(each[0]).join(each))
+        return belief
+
+    batch = watched(range(4))
+    for row in range(4):
+        assert equal(batch[row : row + 1], watched([row]))
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_looks_weighed_in_a_batch_equal_looks_weighed_alone(kind, four):
+    """Bit for bit, so that looks can be weighed once, selected and used by many episodes, which may be selected too."""
+    observer = OBSERVERS[kind]()
+    together = looked(observer, four, slice(None), 2)
+    alone = [looked(observer, four, slice(row, row + 1), 2) for row in range(4)]
+    start = observer.start(4, GRID, four[0].scores)
+    belief = observer.update(start, together)
+    assert equal(observer.update(start, type(together).join(alone)), belief)
+    for row in range(4):
+        for look in (alone[row], together[row : row + 1], together[torch.tensor([row])]):
+            assert equal(observer.update(start[row : row + 1], look), belief[row : row + 1])
+    index = torch.tensor([2, 0])
+    assert equal(observer.update(belief[index], together[index]), observer.update(belief, together)[index])
+
+
+@pytest.mark.parametrize("make", [target_observer, map_observer])
+def test_episodes_computed_together_are_close_to_those_computed_apart(make, four):
+    apart, joint = (
+        observer.update(observer.start(4, GRID, four[0].scores), looked(observer, four, slice(None), 2))
+        for observer in (make(), make(together=True))
+    )
+    for one, other in zip(tensors_of(apart), tensors_of(joint), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_padding_does_not_change_the_belief(kind, four):
+    seen, fixations = four
+    observer, wider = (
+        OBSERVERS[kind](),
+        Detections(
+            torch.cat([seen.boxes, torch.full((4, 2, 4), 30.0)], 1),
+            torch.cat([seen.scores, torch.full((4, 2, 4), 0.9)], 1),
+            torch.cat([seen.mask, torch.zeros(4, 2, dtype=torch.bool)], 1),
+        ),
+    )
+    start = observer.start(4, GRID, seen.scores)
+    belief = observer(start, seen, fixations, GRID, 2)
+    assert equal(observer(start, wider, fixations, GRID, 2), belief)
+    nothing = Detections.empty(1, 3, like=seen.boxes)
+    assert equal(observer(start[:1], nothing, fixations[2:3], GRID, 2), belief[2:3])
+
+
+@pytest.mark.parametrize("grid", [Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_looks_without_detections_on_grids_of_one_row_or_column(kind, grid, dtype, device):
+    observer = OBSERVERS[kind]().to(device, dtype)
+    nothing = Detections.empty(2, 3, like=torch.empty(0, dtype=dtype, device=device))
+    belief = observer.start(2, grid, nothing.scores)
+    for cell in (0, len(grid) - 1):
+        belief = observer(belief, nothing, grid.centres[[cell, cell]].to(nothing.boxes), grid, 2)
+    present = belief.probability(2)
+    assert (present.shape, present.dtype, present.device.type) == ((2, len(grid)), dtype, device.type)
+    assert bool(((present >= 0) & (present < 1)).all())
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_before_the_first_look_all_cells_are_alike_and_infinitely_far(kind):
+    belief = OBSERVERS[kind]().start(2, GRID, torch.empty(0, dtype=torch.float64))
+    present = belief.probability(2)
+    assert torch.equal(present, present[:1, :1].expand(2, 12))
+    assert torch.equal(belief.chance(2), present)
+    assert present.dtype == torch.float64
+    assert bool(belief.closest.isposinf().all())
 
 
 def test_probability_of_a_target_equals_a_loop():
@@ -130,11 +254,12 @@ def test_calling_an_observer_equals_weigh_and_update(kind):
 def test_an_observer_refuses_beliefs_and_looks_of_another_kind(kind):
     observer = OBSERVERS[kind]()
     own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
-    for make in (make for name, make in OBSERVERS.items() if name != kind):
-        with pytest.raises(InputError, match="belief: expected "):
-            observer.update(seen(make()), said)
-        with pytest.raises(InputError, match=f"look: expected {type(said).__name__}"):
-            observer.update(own, make().weigh(looks(), FIXATIONS, GRID, 2))
+    for other in (make() for make in OBSERVERS.values()):
+        if not isinstance(other, type(observer)):
+            with pytest.raises(InputError, match="belief: expected "):
+                observer.update(seen(other), said)
+            with pytest.raises(InputError, match=f"look: expected {type(said).__name__}"):
+                observer.update(own, other.weigh(looks(), FIXATIONS, GRID, 2))
 
 
 @pytest.mark.parametrize("kind", ["target", "context"])
@@ -185,7 +310,7 @@ def test_put_replaces_the_beliefs_of_the_given_episodes():
     assert torch.equal(before.beta, rand(4, 3, 2))
 
 
-@pytest.mark.parametrize("kind", OBSERVERS)
+@pytest.mark.parametrize("kind", [kind for kind in OBSERVERS if kind != "landing"])
 def test_fading_by_a_factor_of_one_changes_nothing(kind):
     observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)

@@ -7,8 +7,7 @@ import torch
 from semfov import Grid
 from semfov.belief.look_features import class_features
 from semfov.belief.map_evidence import MapEvidence
-from semfov.errors import DataError, InputError
-from semfov.io.storage import write_file
+from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -199,61 +198,6 @@ def test_gradients(toy_map, gathered):
 
 def remaining_fields(said):
     return said.score, said.looks, said.visited, said.target
-
-
-def test_a_model_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
-    model = toy_map(widths=(7, 5), metadata={"detector": {"name": "toy"}, "sensor": {}, "training": {"steps": 3}})
-    path = tmp_path / "model.safetensors"
-    model.save(path)
-    loaded = MapEvidence.from_pretrained(path)
-    assert loaded.metadata == model.metadata
-    assert loaded.widths == (7, 5)
-    assert loaded.prior.shape == (5,)
-    assert not loaded.training
-    for name, tensor in model.state_dict().items():
-        assert torch.equal(tensor, loaded.state_dict()[name]), name
-    said = gathered(dtype=torch.float32)
-    with torch.no_grad():
-        assert torch.equal(model.log_odds(said, 6, 4), loaded.log_odds(said, 6, 4))
-    loaded.save(tmp_path / "again.safetensors")
-    assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
-    loaded.check_compatible({"detector": {"name": "toy"}, "sensor": {}})
-    with pytest.raises(InputError, match=r"model of map evidence.*fitted for 'toy'"):
-        loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
-
-
-def test_files_of_another_kind_and_damaged_ones_are_refused(tmp_path, toy_map):
-    model = toy_map()
-    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
-    other = tmp_path / "other.safetensors"
-    write_file(other, tensors, {"kind": "target-evidence", "version": "0", **model._record(), "metadata": {}})
-    with pytest.raises(DataError, match=r"other\.safetensors"):
-        MapEvidence.from_pretrained(other)
-    model.save(tmp_path / "whole.safetensors")
-    cut = tmp_path / "cut.safetensors"
-    cut.write_bytes((tmp_path / "whole.safetensors").read_bytes()[:-40])
-    with pytest.raises(DataError, match=r"cut\.safetensors"):
-        MapEvidence.from_pretrained(cut)
-    with pytest.raises(DataError):
-        MapEvidence.from_pretrained(tmp_path / "none.safetensors")
-    with pytest.raises(InputError, match="yolox-nano"):
-        MapEvidence.from_pretrained("yolox-nan")
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in MapEvidence.shipped.glob("*.safetensors")))
-def test_shipped_maps_load(name):
-    model = MapEvidence.from_pretrained(name)
-    assert not model.training
-    assert name.startswith(model.metadata["detector"]["name"])
-    assert model.prior.shape == (81,)
-    assert {"detector", "sensor", "training"} <= set(model.metadata)
-    for key, tensor in model.state_dict().items():
-        assert bool(tensor.isfinite().all()), key
-        assert float(tensor.abs().sum()) > 0, key
-
-
-def test_a_map_for_yolox_nano_is_shipped():
-    assert (MapEvidence.shipped / "yolox-nano.safetensors").is_file()
 
 
 @pytest.mark.parametrize(

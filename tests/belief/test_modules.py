@@ -4,7 +4,7 @@ import torch
 
 from semfov.belief import Verification
 from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
-from tests.base_tester import GraphTester
+from tests.base_tester import GraphTester, make_testers
 from tests.small import GRID, context, detections, evidence, look, mapping, model, observing, rand
 
 
@@ -69,11 +69,6 @@ class ObserverTester(LookTester):
         return belief.probability(2)
 
 
-class TestSemantic(ObserverTester):
-    def make(self):
-        return observing()
-
-
 class TestSemanticOfAllClasses(LookTester):
     def make(self):
         return observing()
@@ -83,36 +78,18 @@ class TestSemanticOfAllClasses(LookTester):
         return module(module.start(len(scores), GRID, scores), detections(scores, boxes), fixation, GRID).beta
 
 
-class TestSemanticWithMisses(ObserverTester):
-    def make(self):
-        return Semantic(4, misses=model().requires_grad_(False), memory="closest")
-
-
-class TestTarget(ObserverTester):
-    def make(self):
-        return Target(evidence())
-
-
-class TestContext(ObserverTester):
-    def make(self):
-        return Context(observing(), context())
-
-
-class TestLanding(ObserverTester):
-    def make(self):
-        return Landing(3)
-
-
-class TestLearnedMap(ObserverTester):
-    def make(self):
-        return LearnedMap(mapping())
-
-
-class TestAnyOf(ObserverTester):
-    def make(self):
-        return AnyOf(Target(evidence()), {1: 0.3, 2: 1.0})
-
-
-class TestAnyOfOneMap(ObserverTester):
-    def make(self):
-        return AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0})
+globals().update(
+    make_testers(
+        ObserverTester,
+        {
+            "Semantic": observing,
+            "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
+            "Target": lambda: Target(evidence()),
+            "Context": lambda: Context(observing(), context()),
+            "Landing": lambda: Landing(3),
+            "LearnedMap": lambda: LearnedMap(mapping()),
+            "AnyOf": lambda: AnyOf(Target(evidence()), {1: 0.3, 2: 1.0}),
+            "AnyOfOneMap": lambda: AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0}),
+        },
+    )
+)

@@ -1,7 +1,6 @@
 """Learned target evidence: memory against loops in scalars, read-out against numpy and scipy."""
 
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -10,10 +9,9 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.evidence import Gathered
-from semfov.belief.observers import Target, TargetBelief
-from semfov.belief.observers.target import TargetLook
+from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from tests import small
 
 GRID = Grid(6, 4, (90, 60))
@@ -120,16 +118,6 @@ def test_belief_equals_a_loop_over_looks_and_cells(looks, model, reference, orde
     assert belief.presence(7) is belief.presence(torch.tensor([2])) is belief.anywhere
 
 
-def test_belief_before_the_first_look(model):
-    belief = Target(model).start(2, GRID, torch.empty(0, dtype=torch.float64))
-    assert torch.equal(belief.present, torch.full((2, 24), 0.5, dtype=torch.float64))
-    assert torch.equal(belief.anywhere, torch.full((2,), 0.5, dtype=torch.float64))
-    assert torch.equal(belief.following, belief.present)
-    assert bool(belief.closest.isinf().all())
-    assert not belief.looks.any()
-    assert not belief.visited.any()
-
-
 def test_without_learned_corrections_the_closest_look_decides(looks, model):
     """Without corrections a cell has the evidence of its closest look, and the image that of its most probable cell."""
     with torch.no_grad():
@@ -157,68 +145,6 @@ def test_the_prior_of_a_class_changes_only_that_class(looks, model):
     assert torch.equal(before[1].anywhere, after[1].anywhere)
     assert not torch.isclose(before[2].present, after[2].present).any()
     assert not torch.isclose(before[2].anywhere, after[2].anywhere).any()
-
-
-def test_looks_without_detections_on_grids_of_one_row_or_column(model):
-    """The looks have no detections, not even padding."""
-    for grid in (Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))):
-        observer = Target(model)
-        nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 4), torch.zeros(2, 0, dtype=torch.bool))
-        with torch.no_grad():
-            belief = observer(observer.start(2, grid, torch.empty(0)), nothing, grid.centres[[0, 0]], grid, 1)
-        assert belief.present.shape == (2, len(grid))
-        assert torch.equal(belief.score, torch.zeros(2))
-        for tensor in (belief.present, belief.following, belief.anywhere):
-            assert bool(((tensor > 0) & (tensor < 1)).all())
-
-
-def batches(looks):
-    """Two looks of each of three episodes, each of its own target."""
-    observer_looks = []
-    for order in ([0, 1, 2], [1, 2, 0]):
-        index = torch.tensor(order)
-        observer_looks.append((looks[index], FIXATIONS[index]))
-    return observer_looks
-
-
-def run_together(observer, looks):
-    belief = observer.start(3, GRID, looks.scores)
-    for seen, fixation in batches(looks):
-        said = [observer.weigh(seen[row : row + 1], fixation[row : row + 1], GRID, row + 1) for row in range(3)]
-        belief = observer.update(belief, TargetLook.join(said))
-    return belief
-
-
-def run_apart(observer, looks, row):
-    belief = observer.start(1, GRID, looks.scores)
-    for seen, fixation in batches(looks):
-        part = slice(row, row + 1)
-        belief = observer.update(belief, observer.weigh(seen[part], fixation[part], GRID, row + 1))
-    return belief
-
-
-def test_a_batch_equals_its_episodes_run_one_by_one(looks, model):
-    with torch.no_grad():
-        batch, joint = run_together(Target(model), looks), run_together(Target(model, together=True), looks)
-        for row in range(3):
-            alone = run_apart(Target(model), looks, row)
-            for part in fields(TargetBelief):
-                mine, one = getattr(batch, part.name)[row : row + 1], getattr(alone, part.name)
-                assert torch.equal(mine, one), part.name
-                torch.testing.assert_close(getattr(joint, part.name)[row : row + 1], one, atol=1e-5, rtol=1e-5)
-
-
-def test_looks_and_beliefs_can_be_indexed_by_episode(looks, model):
-    observer = Target(model)
-    index = torch.tensor([2, 0])
-    with torch.no_grad():
-        said = observer.weigh(looks, FIXATIONS, GRID, 2)
-        belief = observer.update(observer.start(3, GRID, looks.scores), said)
-        some = observer.update(observer.start(2, GRID, looks.scores), said[index])
-    for part in fields(TargetBelief):
-        assert torch.equal(getattr(belief[index], part.name), getattr(some, part.name)), part.name
-    assert said[index].columns == 6
-    assert said[index].target.tolist() == [2, 2]
 
 
 def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
@@ -298,31 +224,6 @@ def test_log_odds_equal_a_loop_in_float64(gathered, reference):
         assert cells[row].tolist() == pytest.approx(expected, abs=1e-7)
         assert emptied[row].tolist() == pytest.approx(following, abs=1e-7)
         assert float(image[row]) == pytest.approx(anywhere, abs=1e-7)
-
-
-@pytest.mark.parametrize("thresholds", [None, Thresholds(0.83, 0.05)], ids=["none", "chosen"])
-def test_a_model_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
-    torch.manual_seed(1)
-    model = TargetEvidence(8, 6, components=4, thresholds=thresholds).eval()
-    torch.nn.init.normal_(model.prior)
-    model.metadata = {"detector": {"name": "toy"}, "sensor": {}}
-    model.save(tmp_path / "model.safetensors")
-    loaded = TargetEvidence.from_pretrained(tmp_path / "model.safetensors")
-    assert loaded.metadata == model.metadata
-    assert loaded.thresholds == thresholds == Target(loaded).thresholds
-    assert loaded.widths == (8, 6)
-    assert loaded.prior.shape == (4,)
-    with torch.no_grad():
-        ours, theirs = (believe(Target(each), looks, (0, 1, 2), 3) for each in (model, loaded))
-    assert torch.equal(ours.present, theirs.present)
-    assert torch.equal(ours.following, theirs.following)
-    assert torch.equal(ours.anywhere, theirs.anywhere)
-    loaded.save(tmp_path / "again.safetensors")
-    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
-    with pytest.raises(InputError, match="fitted for 'toy'"):
-        loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
-    with pytest.raises(DataError):
-        TargetEvidence.from_pretrained(tmp_path / "none.safetensors")
 
 
 def test_bad_input(looks, model):

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from semfov import Detections
 from semfov.belief import TargetEvidence, Verification
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import closer_features
-from semfov.errors import DataError
 
 
 def seen(count, seed):
@@ -66,23 +64,6 @@ def test_detections_that_are_masked_change_nothing():
         closer_features(0.5, 0.5, 0.5, closer, box, 1), closer_features(0.5, 0.5, 0.5, alone, box, 1), strict=True
     ):
         assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize("thresholds", [None, Thresholds(0.7, 0.3, 0.2)])
-def test_the_model_survives_a_file(tmp_path, thresholds):
-    model = Verification(thresholds=thresholds, metadata={"detector": {"name": "mine"}, "sensor": {}})
-    model.save(tmp_path / "mine.safetensors")
-    loaded = Verification.from_pretrained(tmp_path / "mine.safetensors")
-    features = torch.randn(3, 7)
-    assert torch.equal(loaded(features), model(features))
-    assert (loaded.thresholds, loaded.metadata) == (thresholds, model.metadata)
-    assert not loaded.training
-
-
-def test_files_of_other_models_are_refused(tmp_path):
-    TargetEvidence(4, 4, components=3).save(tmp_path / "other.safetensors")
-    with pytest.raises(DataError, match=r"verification"):
-        Verification.from_pretrained(tmp_path / "other.safetensors")
 
 
 def test_shipped_models_are_loaded_by_name_and_others_are_none():

@@ -1,6 +1,8 @@
 """Pictures from files, folders, videos and embedded scenes, and the errors for unreadable sources."""
 
 import builtins
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -47,6 +49,31 @@ def test_frames_of_a_video_are_read_in_order(video):
     assert [picture.name for picture in taken] == [f"video.avi, frame {number}" for number in range(8)]
     assert len(list(open_stream(video, 3).frames)) == 3
     assert len(list(open_stream(video, 100).frames)) == 8
+
+
+def test_streams_are_opened_by_their_address(video):
+    class Quiet(SimpleHTTPRequestHandler):
+        def __init__(self, *rest):
+            super().__init__(*rest, directory=video.parent)
+
+        def log_message(self, *rest):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        stream = open_stream(f"http://admin:secret@127.0.0.1:{server.server_port}/video.avi?key=secret")
+        assert stream.name == f"http://127.0.0.1:{server.server_port}/video.avi"
+        assert len(list(stream.frames)) == 8
+        server.shutdown()
+
+
+def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():
+    pytest.importorskip("cv2")
+    with pytest.raises(DataError, match=r"rtsp://127.0.0.1:9/a: cannot be opened; check that address, user") as caught:
+        open_stream("rtsp://admin:secret@127.0.0.1:9/a")
+    assert "secret" not in str(caught.value)
+    with pytest.raises(InputError, match=r"expected an address of a stream .*, got gopher"):
+        open_stream("gopher://secret@camera")
 
 
 def test_unreadable_sources_are_errors(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from semfov import Detections, Grid, rollout
 from semfov.belief.observers import Semantic
 from semfov.episode import StoredLooks
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from semfov.gaze import GazeHabits, Greedy, Habitual, acquisition
 from semfov.gaze.choice import drawn_by
 from semfov.gaze.habits import standardised
@@ -125,19 +125,6 @@ def test_habits_with_a_strong_pull_are_a_greedy_searcher():
         pull=900.0, place=torch.zeros(12), step=torch.tensor([-1e3, 0.0, 0.0, 0.0]) * 9, back=9 * never
     )
     assert torch.equal(walk(Habitual(noise(), strict, GRID), 3, 9, values), walk(Greedy(noise()), 3, 9, values))
-
-
-def test_saved_habits_load_unchanged(tmp_path):
-    habits = make_habits()
-    habits.metadata["policy"] = "kl-raw"
-    habits.save(tmp_path / "habits.safetensors")
-    again = GazeHabits.from_pretrained(tmp_path / "habits.safetensors")
-    assert again.metadata == {"policy": "kl-raw"}
-    values, cell, age = make_state()
-    assert torch.equal(again(values, cell, age, GRID), habits(values, cell, age, GRID))
-    (tmp_path / "habits.safetensors").write_bytes(b"no")
-    with pytest.raises(DataError, match=r"habits\.safetensors"):
-        GazeHabits.from_pretrained(tmp_path / "habits.safetensors")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from semfov.belief import DirichletBelief
 from semfov.belief.observers import LearnedMap
 from semfov.gaze import IVSN, GazeHabits
 from semfov.gaze.templates import ClassTemplates
-from tests.base_tester import GraphTester, TensorTester
+from tests.base_tester import GraphTester, TensorTester, make_testers
 from tests.small import GRID, detections, look, mapping, memory, model, rand
 
 
@@ -25,26 +25,11 @@ class AcquisitionTester(GraphTester):
         return module(DirichletBelief(beta, closest), closest == 0)
 
 
-class TestTargetPosterior(AcquisitionTester):
-    def make(self):
-        return acquisition.TargetPosterior(2)
-
-
 class TestPredictedTargetPosterior(AcquisitionTester):
     autocast = 0.05
 
     def make(self):
         return acquisition.PredictedTargetPosterior(2, model())
-
-
-class TestNeighbourhoodPosterior(AcquisitionTester):
-    def make(self):
-        return acquisition.NeighbourhoodPosterior(2, model(), GRID)
-
-
-class TestFovealHit(AcquisitionTester):
-    def make(self):
-        return acquisition.FovealHit(2, model(), GRID)
 
 
 class TestPlaceInformation(AcquisitionTester):
@@ -54,39 +39,25 @@ class TestPlaceInformation(AcquisitionTester):
         return acquisition.PlaceInformation(2, model(), GRID)
 
 
-class TestEntropyLimit(AcquisitionTester):
-    def make(self):
-        return acquisition.EntropyLimit(2, model(), GRID)
-
-
-class TestSaliencyPrior(AcquisitionTester):
-    def make(self):
-        return acquisition.SaliencyPrior(acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5)
-
-
-class TestTemplateAttention(AcquisitionTester):
-    def make(self):
-        return acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID)
-
-
-class TestObjectEvidence(AcquisitionTester):
-    def make(self):
-        return acquisition.ObjectEvidence()
-
-
-class TestCloserLook(AcquisitionTester):
-    def make(self):
-        return acquisition.CloserLook(GRID)
-
-
-class TestStatic(AcquisitionTester):
-    def make(self):
-        return acquisition.Static(rand(len(GRID)))
-
-
-class TestUniform(AcquisitionTester):
-    def make(self):
-        return acquisition.Uniform()
+globals().update(
+    make_testers(
+        AcquisitionTester,
+        {
+            "TargetPosterior": lambda: acquisition.TargetPosterior(2),
+            "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(2, model(), GRID),
+            "FovealHit": lambda: acquisition.FovealHit(2, model(), GRID),
+            "EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID),
+            "SaliencyPrior": lambda: acquisition.SaliencyPrior(
+                acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5
+            ),
+            "TemplateAttention": lambda: acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID),
+            "ObjectEvidence": acquisition.ObjectEvidence,
+            "CloserLook": lambda: acquisition.CloserLook(GRID),
+            "Static": lambda: acquisition.Static(rand(len(GRID))),
+            "Uniform": acquisition.Uniform,
+        },
+    )
+)
 
 
 class LookAheadTester(AcquisitionTester):
@@ -95,39 +66,20 @@ class LookAheadTester(AcquisitionTester):
     autocast = 0.1
 
 
-class TestKLDivergence(LookAheadTester):
-    def make(self):
-        return acquisition.KLDivergence(model(), GRID)
-
-
-class TestBayesianSurprise(LookAheadTester):
-    def make(self):
-        return acquisition.BayesianSurprise(model(), GRID)
-
-
-class TestNegativeEntropy(LookAheadTester):
-    def make(self):
-        return acquisition.NegativeEntropy(model(), GRID)
-
-
-class TestTwoPeaks(LookAheadTester):
-    def make(self):
-        return acquisition.TwoPeaks(model(), GRID)
-
-
-class TestUpperConfidenceBound(LookAheadTester):
-    def make(self):
-        return acquisition.UpperConfidenceBound(model(), GRID)
-
-
-class TestProbabilityOfImprovement(LookAheadTester):
-    def make(self):
-        return acquisition.ProbabilityOfImprovement(model(), GRID)
-
-
-class TestExpectedAccuracy(LookAheadTester):
-    def make(self):
-        return acquisition.ExpectedAccuracy(model(), GRID)
+globals().update(
+    make_testers(
+        LookAheadTester,
+        {
+            "KLDivergence": lambda: acquisition.KLDivergence(model(), GRID),
+            "BayesianSurprise": lambda: acquisition.BayesianSurprise(model(), GRID),
+            "NegativeEntropy": lambda: acquisition.NegativeEntropy(model(), GRID),
+            "TwoPeaks": lambda: acquisition.TwoPeaks(model(), GRID),
+            "UpperConfidenceBound": lambda: acquisition.UpperConfidenceBound(model(), GRID),
+            "ProbabilityOfImprovement": lambda: acquisition.ProbabilityOfImprovement(model(), GRID),
+            "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID),
+        },
+    )
+)
 
 
 class TestCorrectLocalisation(AcquisitionTester, TensorTester):
@@ -164,41 +116,6 @@ class PolicyTester(AcquisitionTester):
         return module(2, GRID)(DirichletBelief(beta, closest), closest == 0)
 
 
-class TestRandom(PolicyTester):
-    def make(self):
-        return policies.Random()
-
-
-class TestNonPredictive(PolicyTester):
-    def make(self):
-        return policies.NonPredictive()
-
-
-class TestPredictive(PolicyTester):
-    def make(self):
-        return policies.Predictive(model())
-
-
-class TestNeighbourhood(PolicyTester):
-    def make(self):
-        return policies.Neighbourhood(model())
-
-
-class TestFovealHits(PolicyTester):
-    def make(self):
-        return policies.FovealHits(model())
-
-
-class TestInformationOnPlace(PolicyTester):
-    def make(self):
-        return policies.InformationOnPlace(model())
-
-
-class TestEntropyLimitMinimisation(PolicyTester):
-    def make(self):
-        return policies.EntropyLimitMinimisation(model().requires_grad_(False))
-
-
 class TestIdealObserver(TensorTester):
     batched = (0, 1)
     inputs = PolicyTester.inputs
@@ -217,59 +134,40 @@ class TableTester(PolicyTester):
         return module.in_scene(2, GRID, table, torch.tensor([3, 5]))(DirichletBelief(beta, closest), closest == 0)
 
 
-class TestSaliencyMaximum(TableTester):
-    def make(self):
-        return policies.SaliencyMaximum()
+globals().update(
+    make_testers(
+        TableTester,
+        {
+            "SaliencyMaximum": policies.SaliencyMaximum,
+            "TemplateSearch": policies.TemplateSearch,
+        },
+    )
+)
 
 
-class TestTemplateSearch(TableTester):
-    def make(self):
-        return policies.TemplateSearch()
-
-
-class TestCloser(PolicyTester):
-    def make(self):
-        return policies.Closer()
-
-
-class TestObjectSeeking(PolicyTester):
-    def make(self):
-        return policies.ObjectSeeking()
-
-
-class TestKL(PolicyTester):
-    def make(self):
-        return policies.KL(model())
-
-
-class TestSurprise(PolicyTester):
-    def make(self):
-        return policies.Surprise(model())
-
-
-class TestNegentropy(PolicyTester):
-    def make(self):
-        return policies.Negentropy(model())
-
-
-class TestPeaks(PolicyTester):
-    def make(self):
-        return policies.Peaks(model())
-
-
-class TestConfidenceBound(PolicyTester):
-    def make(self):
-        return policies.ConfidenceBound(model())
-
-
-class TestImprovement(PolicyTester):
-    def make(self):
-        return policies.Improvement(model())
-
-
-class TestAccuracy(PolicyTester):
-    def make(self):
-        return policies.Accuracy(model().requires_grad_(False))
+globals().update(
+    make_testers(
+        PolicyTester,
+        {
+            "Random": policies.Random,
+            "NonPredictive": policies.NonPredictive,
+            "Predictive": lambda: policies.Predictive(model()),
+            "Neighbourhood": lambda: policies.Neighbourhood(model()),
+            "FovealHits": lambda: policies.FovealHits(model()),
+            "InformationOnPlace": lambda: policies.InformationOnPlace(model()),
+            "EntropyLimitMinimisation": lambda: policies.EntropyLimitMinimisation(model().requires_grad_(False)),
+            "Closer": policies.Closer,
+            "ObjectSeeking": policies.ObjectSeeking,
+            "KL": lambda: policies.KL(model()),
+            "Surprise": lambda: policies.Surprise(model()),
+            "Negentropy": lambda: policies.Negentropy(model()),
+            "Peaks": lambda: policies.Peaks(model()),
+            "ConfidenceBound": lambda: policies.ConfidenceBound(model()),
+            "Improvement": lambda: policies.Improvement(model()),
+            "Accuracy": lambda: policies.Accuracy(model().requires_grad_(False)),
+        },
+    )
+)
 
 
 class TestGain(TestExpectedGain):

@@ -52,7 +52,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     found = agent.search(world, "blue", passes=5, confirm=0.0)
     assert found.found
     assert len(found) == 1
-    assert repr(found).startswith("HeadPath: blue found in ")
+    assert repr(found).startswith("HeadPath: blue: found (")
     explored = agent.explore(world, passes=3)
     assert explored.target is None
     assert len(explored) == 3
@@ -87,11 +87,11 @@ def test_paths_can_be_plotted_and_animated(agent, panorama, tmp_path):
     for path in (agent.search(world, "blue", passes=3, confirm=1.0), agent.explore(world, passes=2)):
         figure = plot_head_path(path, panorama)
         assert figure.axes[0].get_title() == path.describe()
-        film = animate_head(path, panorama)
+        film = animate_head(path, image=panorama)
         assert len(film) == len(path)
         frames = [frame.shape for frame in film.frames]
         assert len(set(frames)) == 1
-    written = animate_head(path, panorama, tmp_path / "head.gif")
+    written = animate_head(path, tmp_path / "head.gif", image=panorama)
     assert written.stat().st_size > 1000
     with pytest.raises(InputError, match="looks: expected a number from 1 to 2"):
         plot_head_path(path, panorama, looks=3)
@@ -152,3 +152,45 @@ def test_without_a_find_the_rule_of_all_searches_decides(agent, panorama, examin
     decision = decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
     assert decision.outcome == outcome
     assert decision.cell == (here if outcome == "found" else None)
+
+
+def test_every_limit_ends_an_episode_and_a_search_has_a_decision_all_the_same(agent, panorama):
+    world, seen = Panorama(panorama), []
+    endings = {
+        "passes": {"passes": 2},
+        "seconds": {"seconds": 0.0},
+        "duration": {"duration": 1.0},
+        "stopped": {"on_look": lambda path: seen.append(len(path)) or len(path) < 3},
+    }
+    for ending, limit in endings.items():
+        path = agent.search(world, "green", confirm=1.0, **limit)
+        assert (path.ending, path.decision.outcome) == (ending, "undecided")
+        explored = agent.explore(world, **limit)
+        assert (explored.ending, explored.decision) == (ending, None)
+    assert seen == [1, 2, 3] * 2
+    assert agent.explore(world, worth=1e6).ending == "worth"
+    whole = agent.explore(world, passes=10)
+    gains = agent.explore(world, passes=10, worth=1e-6)
+    assert gains.actions == whole.actions
+
+
+def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
+    whole = agent.search(Panorama(panorama), "green", prior=0.3, confirm=1.0, passes=8)
+    sure = [float(chances.max()) < 0.5 for chances in whole.maps]
+    path = agent.search(Panorama(panorama), "green", prior=0.3, give_up=0.99, confirm=1.0, passes=8)
+    assert [*sure, True].index(True) == len(path) - 1 if any(sure) else len(path) == 8
+    assert path.decision.outcome == ("absent" if any(sure) else "undecided")
+
+
+def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
+    world = Panorama(panorama)
+    everything = agent.find_all(world, passes=30)
+    both = agent.find_all(world, ["red", "blue"], passes=30)
+    blue = agent.find_all(world, "blue", passes=30)
+    assert everything.actions == both.actions == blue.actions == agent.explore(world, passes=30).actions
+    assert (both.target, both.targets, blue.target) == (None, (1, 3), 3)
+    assert both.decision is None
+    assert set(both.objects.labels.tolist()) == {1, 3}
+    assert set(blue.objects.labels.tolist()) == {3}
+    middles = (blue.objects.boxes[:, :2] + blue.objects.boxes[:, 2:]) / 2
+    assert ((middles - torch.tensor([210.0, 90])).abs() < 15).all()

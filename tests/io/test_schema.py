@@ -7,14 +7,18 @@ import torch
 from safetensors.torch import save_file
 
 from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
-from semfov.belief import ContextPrior
+from semfov.belief import ContextPrior, MapEvidence, Verification
+from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
+from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io import storage
 from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
 from semfov.zoom import GlimpseEvidence
 
 CLASSES = ["cup", "cat"]
+METADATA = {"detector": {"name": "toy", "digest": "1"}, "sensor": {}}
 
 
 def observation():
@@ -23,22 +27,53 @@ def observation():
 
 
 def evidence():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return TargetEvidence(3, 2, components=3, metadata={"detector": {"name": "toy"}})
+    return TargetEvidence(3, 2, components=3, thresholds=Thresholds(0.83, 0.05), metadata=METADATA)
+
+
+def everything():
+    return MapEvidence(3, 2, components=3, metadata=METADATA)
 
 
 def context():
-    return ContextPrior(CLASSES, torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1], weights={"map": (1.0, 0.5)})
+    places, pairs = torch.randn(3, 2, 2).half().float(), torch.randn(3, 3, 2).half().float()
+    return ContextPrior(CLASSES, places, pairs, [0.1], weights={"map": (1.0, 0.5)})
 
 
 def glimpses():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
+    return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
 
 
-MODELS = {make.__name__: make for make in (observation, evidence, context, glimpses)}
+def verification():
+    return Verification(thresholds=Thresholds(0.7, 0.3, 0.2), metadata=METADATA)
+
+
+def templates():
+    return ClassTemplates(torch.randn(2, 5), torch.randn(5), CLASSES, metadata=METADATA)
+
+
+def habits():
+    place, step, back = torch.randn(12), torch.randn(3), torch.randn(2)
+    sizes = {"edges": [0.1, 0.3], "ages": [2.0], "columns": 4}
+    return GazeHabits(place=place, step=step, back=back, pull=0.8, metadata={"policy": "kl"}, **sizes)
+
+
+def seeded(make):
+    """The same model whenever it is made, with random numbers also where a new model has zeros."""
+
+    def made():
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            model = make()
+            for name, tensor in model.state_dict().items():
+                if name in ("prior", "linear.bias"):
+                    tensor.normal_()
+            return model
+
+    return made
+
+
+EVERY = (observation, evidence, everything, context, glimpses, verification, templates, habits)
+MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
 
@@ -63,11 +98,51 @@ def message_of_refused_file(name, tmp_path, tensors, record):
 def test_saved_models_load_bit_identically(name, tmp_path):
     model, path = MODELS[name](), tmp_path / "model.safetensors"
     model.save(path)
+    whole = path.read_bytes()
     again = LOADERS[name].from_pretrained(path)
+    assert not again.training
     assert {k: v.tolist() for k, v in again.state_dict().items()} == {
         k: v.tolist() for k, v in model.state_dict().items()
     }
     assert again._record() == json.loads(json.dumps(model._record())) or again._record() == model._record()
+    assert (again.metadata, again.digest()) == (model.metadata, model.digest())
+    again.save(path)
+    assert path.read_bytes() == whole
+    assert [each.name for each in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_missing_damaged_and_other_files_are_refused(name, tmp_path):
+    path, other = tmp_path / "model.safetensors", tmp_path / "other.safetensors"
+    with pytest.raises(DataError, match=r"model\.safetensors: no such file"):
+        LOADERS[name].from_pretrained(path)
+    MODELS[name]().save(path)
+    whole = path.read_bytes()
+    for damaged in (b"no", whole[:-40]):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"model\.safetensors: not a readable"):
+            LOADERS[name].from_pretrained(path)
+    DirichletStatistics((2,), 3).save(other)
+    with pytest.raises(DataError, match=f"expected a file of kind {LOADERS[name].kind}, got dirichlet-statistics"):
+        LOADERS[name].from_pretrained(other)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_shipped_models_are_found_by_name(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(LOADERS[name], "shipped", tmp_path)
+    MODELS[name]().save(tmp_path / "toy-tiny.safetensors")
+    assert LOADERS[name].from_pretrained("toy-tiny").digest() == MODELS[name]().digest()
+    assert LOADERS[name].if_shipped("no such model") is None
+    with pytest.raises(InputError, match="did you mean 'toy-tiny'"):
+        LOADERS[name].from_pretrained("toy-tyni")
+
+
+@pytest.mark.parametrize("name", [name for name, kind in LOADERS.items() if issubclass(kind, PretrainedForEye)])
+def test_models_of_an_eye_refuse_another_detector(name):
+    model = MODELS[name]()
+    model.check_compatible(METADATA)
+    with pytest.raises(InputError, match=f"{model.title}.*fitted for 'toy'"):
+        model.check_compatible({"detector": {"name": "other", "digest": "2"}, "sensor": {}})
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -94,7 +169,7 @@ def test_missing_tensors_and_tensors_of_another_shape_or_type_are_refused(name, 
             assert key in message_of_refused_file(name, tmp_path, {**tensors, key: whole.to(other)}, record)
         if whole.dtype == torch.float32:
             assert "type" in message_of_refused_file(name, tmp_path, {**tensors, key: whole.double()}, record)
-        for other in (whole[None], whole.new_zeros(0), whole.repeat(*(2,) * whole.ndim) if whole.ndim else whole[None]):
+        for other in (whole[None], whole.new_zeros(0), torch.cat([whole, whole[:1]]) if whole.ndim else whole[None]):
             message_of_refused_file(name, tmp_path, {**tensors, key: other.clone()}, record)
     tensors, record = parts(MODELS[name]())
     assert "surplus" in message_of_refused_file(name, tmp_path, {**tensors, "surplus": torch.zeros(1)}, record)

@@ -10,10 +10,11 @@ from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.config import DataConfig
-from semfov.runs.zoom_orders import in_order, quad_tree, ranked, shuffled, slices
+from semfov.runs.zoom_orders import in_order, quad_tree, shuffled
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")
@@ -138,7 +139,7 @@ def test_orders_look_at_every_slice_once(config):
     run = ZoomRun(config)
     glances = run.glances(0)
     cut = run.slices(0, glances.lattice)
-    for order in (in_order(cut), shuffled(cut, [1]), ranked(cut, None, most=False)):
+    for order in (in_order(cut), shuffled(cut, [1]), ranked(cut)):
         windows = [turn.glance.window for turn in look_by_look(glances, order, None)]
         assert windows[0].level == 0
         assert set(windows[1:]) == set(cut)

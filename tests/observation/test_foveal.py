@@ -15,7 +15,7 @@ import scipy.stats
 import torch
 
 from semfov.belief.fusion import kaplan
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
@@ -190,13 +190,6 @@ def test_alpha_can_be_trained_and_stays_positive():
     assert losses[-1] < losses[0] / 2
 
 
-def test_likelihoods_compile_to_one_graph():
-    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
-    given = looks(dtype=torch.float32)
-    compiled = torch.compile(model.log_likelihood, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(*given), model.log_likelihood(*given))
-
-
 def test_calls_use_the_current_parameters():
     model = FovealObservationModel(table(), EDGES, CLASSES).eval()
     scores, distance = looks()
@@ -348,26 +341,6 @@ def test_header_is_readable_json(tmp_path):
     assert record["metadata"]["detector"]["digest"] == DETECTOR["digest"]
     assert record["version"]
     assert record["epsilon"] == 1e-6
-
-
-def test_shipped_models_are_found_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(FovealObservationModel, "shipped", tmp_path)
-    FovealObservationModel(table(), EDGES, CLASSES).save(tmp_path / "toy-tiny.safetensors")
-    assert FovealObservationModel.from_pretrained("toy-tiny").classes == tuple(CLASSES)
-    with pytest.raises(InputError, match="did you mean 'toy-tiny'"):
-        FovealObservationModel.from_pretrained("toy-tyni")
-
-
-def test_bad_files_are_refused(tmp_path):
-    path = tmp_path / "model.safetensors"
-    with pytest.raises(DataError, match="no such file"):
-        FovealObservationModel.from_pretrained(path)
-    path.write_bytes(b"not a model")
-    with pytest.raises(DataError, match="not a readable"):
-        FovealObservationModel.from_pretrained(path)
-    DirichletStatistics((2,), 3).save(path)
-    with pytest.raises(DataError, match="expected a file of kind foveal-observation-model, got dirichlet-statistics"):
-        FovealObservationModel.from_pretrained(path)
 
 
 class Toy:

@@ -124,7 +124,7 @@ WORDS = {
         "A closer look confirmed the target.",
     ),
     "zoom_path": ("cup: found (0.90) in 3 passes", "A closer look confirmed the target."),
-    "head_path": ("cat not found in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
+    "head_path": ("3 × cat from score 0.3 in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
     "moment": ("cup: undecided, p 0.25", None),
 }
 

@@ -99,7 +99,7 @@ def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):
     (page,) = pypdf.PdfReader(path).pages
     text = page.extract_text()
     assert "found after 2 gaze shifts" in text
-    assert "cat 0.80" in text
+    assert "cup 0.60" in text
     fonts = [font.get_object() for font in page["/Resources"]["/Font"].get_object().values()]
     assert fonts
     for font in fonts:

@@ -67,7 +67,7 @@ def test_a_path_tells_why_it_ended(agent, picture):
     # Without a limit to what is worth a look, a search looks at everything.
     everything = agent.search(picture, "green", passes=10_000, confirm=1.0, give_up=0.0)
     assert (everything.ending, everything.decision.outcome) == ("windows", "undecided")
-    assert everything.why_it_ended() == "No remaining look can show the target."
+    assert everything.why_it_ended() == "No window is left that can show more."
     assert agent.explore(picture, passes=1).why_it_ended() == "The only pass was used."
     assert agent.find_all(picture, "blue", worth=1e9).ending == "worth"
     assert agent.find_all(picture, "blue", passes=3, worth=0.0).ending == "passes"
@@ -110,8 +110,10 @@ def test_invalid_arguments_are_refused(agent, picture):
     for worth in (-1, float("nan"), "much"):
         with pytest.raises(InputError, match="worth: expected a number"):
             agent.explore(picture, worth=worth)
-    for target in (0, 4, 1.0, True, None):
-        with pytest.raises(InputError, match="target: expected a name, or a whole number from 1 to 3"):
+    for target in (0, 4, 1.0, True, [], [1, 4]):
+        with pytest.raises(
+            InputError, match=r"target: expected a (name, or a whole number from 1 to 3|class, several)"
+        ):
             agent.find_all(picture, target)
     for image, message in (
         (picture * 255, "picture: expected RGB in .*; divide by"),

@@ -64,17 +64,6 @@ def test_the_likeliest_class_takes_the_weights_into_account(inner, looks):
         assert believed(AnyOf(inner, weights), looks, None).likeliest().tolist() == [best]
 
 
-def test_joined_looks_give_the_same_belief_as_separate_looks(inner, looks):
-    observer = AnyOf(inner, WEIGHTS)
-    whole = observer.weigh(looks, FIXATIONS, GRID)
-    parts = [whole[torch.tensor([n])] for n in range(3)]
-    start = observer.start(3, GRID, looks.scores)
-    both = observer.update(start, type(whole).join(parts))
-    for row in range(3):
-        alone = observer.update(start[row : row + 1], parts[row])
-        torch.testing.assert_close(both[row : row + 1].probability(1), alone.probability(1))
-
-
 def test_belief_fades_like_that_of_the_inner_observer(inner, looks):
     observer = AnyOf(inner, WEIGHTS)
     visited = torch.zeros(1, 20, dtype=torch.bool)
@@ -116,24 +105,17 @@ def test_bad_input(inner):
             weights_by_class(target, classes)
 
 
-def test_beliefs_can_be_indexed_and_unknown_classes_are_refused(inner, looks):
-    observer = AnyOf(inner, WEIGHTS)
-    belief = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID))
-    assert torch.equal(belief[1:].closest, belief.closest[1:])
-    look = observer.weigh(looks, FIXATIONS, GRID)
-    joined = observer.update(observer.start(3, GRID, looks.scores), type(look).join([look]))
-    assert torch.equal(joined.probability(1), belief.probability(1))
+def test_unknown_classes_are_refused():
     with pytest.raises(InputError, match=r"^target:"):
         weights_by_class({99: 1.0}, ("cup", "wine glass"))
 
 
-def test_beliefs_and_looks_of_other_observers_are_refused(inner, looks):
+def test_beliefs_and_looks_of_other_observers_do_not_fade(inner, looks):
     observer, visited = AnyOf(inner, WEIGHTS), torch.zeros(3, 20, dtype=torch.bool)
     belief, look = observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID)
     other = Landing(3)
     strange = other.start(3, GRID, looks.scores), other.weigh(looks, FIXATIONS, GRID)
-    for call in (observer.update, lambda *given: observer.fade(*given, 0.5, visited)):
-        with pytest.raises(InputError, match=r"^belief: expected AnyBelief"):
-            call(strange[0], look)
-        with pytest.raises(InputError, match=r"^look: expected AnyLook"):
-            call(belief, strange[1])
+    with pytest.raises(InputError, match=r"^belief: expected AnyBelief"):
+        observer.fade(strange[0], look, 0.5, visited)
+    with pytest.raises(InputError, match=r"^look: expected AnyLook"):
+        observer.fade(belief, strange[1], 0.5, visited)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import Detections, Grid
-from semfov.belief.observers import Landing, LandingBelief, Semantic
+from semfov.belief.observers import Landing, LandingBelief
 from semfov.errors import InputError
 from semfov.gaze.acquisition import ObjectEvidence
 from semfov.gaze.policies import ObjectSeeking
@@ -126,10 +126,3 @@ def test_evidence_is_computed_in_the_precision_of_the_scores():
 
 def test_settings_at_their_limits():
     assert Landing(1, 1, 1).reach == 1
-
-
-def test_looks_of_other_observers_are_refused():
-    grid, observer, nothing = Grid(2, 2, (40, 40)), Landing(3), Detections.empty(1, 3)
-    belief = observer.start(1, grid, torch.zeros(1))
-    with pytest.raises(InputError, match=r"^look:"):
-        observer.update(belief, Semantic(4).weigh(nothing, torch.zeros(1, 2), grid))

@@ -11,7 +11,7 @@ from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Semantic, Target
+from semfov.belief.observers import LearnedMap, MapBelief, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import KLDivergence
 from tests import small
@@ -99,20 +99,6 @@ def test_episodes_are_computed_one_by_one_unless_together_is_set(make):
         assert observer.each(lambda rows: torch.tensor([len(rows)]), torch.zeros(3, 2)).tolist() == sizes
 
 
-def test_belief_before_the_first_look(toy_map, device):
-    like = torch.empty(0, dtype=torch.float64, device=device)
-    belief = LearnedMap(toy_map()).start(2, GRID, like)
-    assert belief.probabilities.shape == (2, 24, 5)
-    assert bool((belief.probabilities == 0.2).all())
-    assert belief.probabilities.dtype == torch.float64
-    assert bool(belief.closest.isinf().all())
-    assert not belief.looks.any()
-    assert not belief.visited.any()
-    for part in fields(MapBelief):
-        assert getattr(belief, part.name).device.type == device.type
-        assert len(getattr(belief, part.name)) == 2
-
-
 def test_belief_has_a_probability_for_every_class(random_looks, toy_map):
     with torch.no_grad():
         belief = believe(LearnedMap(toy_map()), random_looks(), (0, 1, 3))[torch.tensor([0, 0, 0])]
@@ -142,73 +128,6 @@ def run(observer, looks, rows=slice(None)):
     for seen, fixation in sequence(looks):
         belief = observer(belief, seen[rows], fixation[rows], GRID)
     return belief
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_a_batch_equals_its_episodes_run_one_by_one(random_looks, toy_map):
-    looks, model = random_looks(), toy_map(widths=(48, 24))
-    with torch.no_grad():
-        batch, joint = run(LearnedMap(model), looks), run(LearnedMap(model, together=True), looks)
-        for row in range(4):
-            alone = run(LearnedMap(model), looks, slice(row, row + 1))
-            for part in fields(MapBelief):
-                mine, one = getattr(batch, part.name)[row : row + 1], getattr(alone, part.name)
-                assert torch.equal(mine, one), part.name
-                torch.testing.assert_close(getattr(joint, part.name)[row : row + 1], one, atol=1e-5, rtol=1e-4)
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_looks_weighed_in_a_batch_equal_looks_weighed_alone(random_looks, toy_map):
-    """Bit for bit, so that looks can be weighed once and used by many episodes."""
-    looks, model = random_looks(), toy_map(widths=(48, 24))
-    observer = LearnedMap(model)
-    with torch.no_grad():
-        batch = observer.weigh(looks, FIXATIONS, GRID)
-        apart = [observer.weigh(looks[n : n + 1], FIXATIONS[n : n + 1], GRID, target=2) for n in range(4)]
-        near = LearnedMap(model, together=True).weigh(looks, FIXATIONS, GRID)
-    joined = MapLook.join(apart)
-    for part in fields(MapLook):
-        if part.name == "columns":
-            assert batch.columns == joined.columns == 6
-            continue
-        tensor = getattr(batch, part.name)
-        assert torch.equal(tensor, getattr(joined, part.name)), part.name
-        torch.testing.assert_close(getattr(near, part.name), tensor, atol=1e-5, rtol=1e-4)
-        index = torch.tensor([3, 0])
-        assert torch.equal(getattr(batch[index], part.name), tensor[index]), part.name
-        assert torch.equal(getattr(batch[1:3], part.name), tensor[1:3]), part.name
-    assert torch.equal(batch.fixated, torch.tensor(FIXATED))
-    assert torch.equal(batch.target, CLASSES.expand(4, -1))
-    assert bool((batch.stands_for == 1).all())
-    assert torch.equal(batch.score, highest_score(looks, CLASSES))
-    assert torch.equal(batch.distance, GRID.distance(FIXATIONS))
-
-
-def test_selected_episodes_of_a_batch_can_continue(random_looks, toy_map):
-    """Beliefs can be selected from a batch; `map` and `detach` apply to every tensor."""
-    looks, observer, index = random_looks(), LearnedMap(toy_map()), torch.tensor([2, 0])
-    with torch.no_grad():
-        belief = run(observer, looks)
-        after = observer(belief[index], looks[index], FIXATIONS[index], GRID)
-        whole = observer(belief, looks, FIXATIONS, GRID)
-    for part in fields(MapBelief):
-        assert torch.equal(getattr(belief[index], part.name), getattr(belief, part.name)[index]), part.name
-        assert torch.equal(getattr(belief[1:3], part.name), getattr(belief, part.name)[1:3]), part.name
-        assert torch.equal(getattr(after, part.name), getattr(whole, part.name)[index]), part.name
-    moved = belief.map(lambda tensor: tensor.flip(0))
-    assert isinstance(moved, MapBelief)
-    for part in fields(MapBelief):
-        assert torch.equal(getattr(moved, part.name), getattr(belief, part.name).flip(0)), part.name
-    alive = run(observer, looks)
-    assert alive.probabilities.requires_grad
-    constant = alive.detach()
-    assert not any(getattr(constant, part.name).requires_grad for part in fields(MapBelief))
-    assert torch.equal(constant.probabilities, alive.probabilities)
-    # A belief from before the first look can be indexed, too.
-    start = observer.start(4, GRID, looks.scores)[index]
-    with torch.no_grad():
-        first = observer(start, looks[index], FIXATIONS[index], GRID)
-    assert first.probabilities.shape == (2, 24, 5)
 
 
 def test_belief_does_not_depend_on_the_order_of_looks_at_different_cells(random_looks, toy_map):
@@ -245,38 +164,6 @@ def test_several_classes_share_a_cell():
     assert float(beliefs["one"][2]) < 0.1
     # A cell where nothing was seen is believed to be empty.
     assert float(belief.probabilities[0, 23, 0]) > 0.9
-
-
-@pytest.mark.parametrize("grid", [Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))], ids=str)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_looks_without_detections_on_grids_of_one_row_or_column(toy_map, grid, dtype, device):
-    """The looks have no detections, not even padding."""
-    observer = LearnedMap(toy_map().to(device, dtype))
-    nothing = Detections.empty(2, 4, like=torch.empty(0, dtype=dtype, device=device))
-    belief = observer.start(2, grid, nothing.scores)
-    with torch.no_grad():
-        for cell in (0, len(grid) - 1):
-            belief = observer(belief, nothing, grid.centres[[cell, cell]].to(nothing.boxes), grid)
-    assert belief.probabilities.shape == (2, len(grid), 5)
-    assert belief.probabilities.dtype == dtype
-    assert torch.equal(belief.score, nothing.boxes.new_zeros(2, 4))
-    assert bool(((belief.probabilities > 0) & (belief.probabilities < 1)).all())
-
-
-def test_padding_does_not_change_the_belief(random_looks, toy_map):
-    looks, observer = random_looks(), LearnedMap(toy_map())
-    wide = Detections(
-        torch.cat([looks.boxes, torch.full((4, 2, 4), 30.0)], 1),
-        torch.cat([looks.scores, torch.full((4, 2, 5), 0.9)], 1),
-        torch.cat([looks.mask, torch.zeros(4, 2, dtype=torch.bool)], 1),
-    )
-    with torch.no_grad():
-        assert torch.equal(
-            believe(observer, looks, (0, 2, 1)).probabilities, believe(observer, wide, (0, 2, 1)).probabilities
-        )
-        empty = believe(observer, looks, (2,))
-        none = observer(observer.start(1, GRID, looks.scores), Detections.empty(1, 4), FIXATIONS[2:3], GRID)
-    assert torch.equal(empty.probabilities, none.probabilities)
 
 
 def test_gradients_through_the_scores(toy_map):
@@ -348,16 +235,9 @@ def test_a_look_compiles_to_one_graph_and_vectorises(random_looks, toy_map):
         torch.testing.assert_close(got[0], expected, atol=1e-5, rtol=1e-4)
 
 
-def test_beliefs_and_looks_of_other_observers_are_refused(toy_map, random_looks):
-    looks, observer = random_looks(), LearnedMap(toy_map())
-    said, belief = observer.weigh(looks, FIXATIONS, GRID), observer.start(4, GRID, looks.scores)
-    semantic, target = Semantic(5), Target(TargetEvidence(4, 4, components=5))
-    with pytest.raises(InputError, match="belief: expected MapBelief, got DirichletBelief"):
-        observer.update(semantic.start(4, GRID, looks.scores), said)
-    with pytest.raises(InputError, match="look: expected MapLook, got SemanticLook"):
-        observer.update(belief, semantic.weigh(looks, FIXATIONS, GRID))
-    with pytest.raises(InputError, match="look"):
-        target.update(target.start(4, GRID, looks.scores), said)
+def test_policies_that_need_a_dirichlet_belief_refuse_the_map(toy_map, random_looks):
+    observer = LearnedMap(toy_map())
+    belief = observer.start(4, GRID, random_looks().scores)
     observation = FovealObservationModel.identity(["a", "b", "c", "d"], [0.2])
     with pytest.raises(InputError, match="belief: expected a belief about all classes \\(DirichletBelief\\)"):
         KLDivergence(observation, GRID)(belief, torch.zeros(4, 24, dtype=torch.bool))

@@ -98,23 +98,6 @@ def test_misses_move_cells_without_detections_towards_background():
     assert (background > 0.25).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"footprint": "soft"}, {"misses": MISSES}], ids=["hard", "soft", "misses"])
-def test_a_batch_of_looks_equals_each_look_alone(looks, options):
-    """Weighed together, selected one by one or joined again, looks give the same belief bit for bit."""
-    observer = Semantic(4, **options)
-    together = observer.weigh(looks, FIXATIONS, GRID)
-    belief = observer.start(3, GRID, looks.scores)
-    whole = observer.update(belief, together)
-    alone = [observer.weigh(looks[look : look + 1], FIXATIONS[look : look + 1], GRID) for look in range(3)]
-    joined = observer.update(belief, SemanticLook.join(alone))
-    for look in range(3):
-        for said in (alone[look], together[look : look + 1], together[torch.tensor([look])]):
-            after = observer.update(belief[look : look + 1], said)
-            for batch in (whole, joined):
-                assert torch.equal(after.beta[0], batch.beta[look])
-                assert torch.equal(after.closest[0], batch.closest[look])
-
-
 def test_models_are_submodules_of_the_observer():
     """The parameters of a fitted model are listed once, even if it is used twice; other objects are kept."""
     model = FovealObservationModel.identity(["a", "b"], [0.2], miss_rate=torch.full((3, 2), 0.5))

@@ -1,0 +1,175 @@
+"""Conversion of the objects of a record to the formats of Supervision, torchvision, COCO and GeoJSON."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from os import PathLike, fspath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from semfov.data.classes import canonical_name
+from semfov.detection.exchange import category_ids, coco_results, named_detections
+from semfov.detection.objects import Objects
+from semfov.errors import check
+from semfov.io.files import write_text
+from semfov.paths.georeference import georeference
+
+if TYPE_CHECKING:
+    import supervision
+
+_PIXELS = "pixels of the picture: x to the right, y down"
+"""What the coordinates of a GeoJSON file are whose picture has no georeference."""
+
+
+class Conversion(ABC):
+    """Conversion of objects with names of classes to the formats of other libraries, and of maps."""
+
+    classes: tuple[str, ...]
+    source: str | None
+
+    @property
+    @abstractmethod
+    def objects(self) -> Objects:
+        """The objects."""
+
+    @property
+    @abstractmethod
+    def confirmed(self) -> Tensor:
+        """Which of them were confirmed."""
+
+    @abstractmethod
+    def object_rows(self) -> list[dict[str, Any]]:
+        """The objects as a table."""
+
+    def to_supervision(self) -> supervision.Detections:
+        """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
+
+        Supervision numbers classes from 0, without background. `data` has the names of the classes as `class_name`,
+        which its annotators show, the number of the look that each box comes from as `look`, and which of the objects
+        were confirmed as `confirmed`.
+
+        Returns:
+            The objects for Supervision.
+
+        Raises:
+            InputError: Supervision is not installed.
+
+        Example::
+
+            found = agent.find_all("harbour.tif", "person").to_supervision()
+            picture = supervision.LabelAnnotator().annotate(picture, found)
+        """
+        objects = self.objects
+        data = {"look": objects.passes.numpy(), "confirmed": self.confirmed.numpy()}
+        return named_detections(objects.boxes, objects.labels, objects.scores, self.classes[1:], data)
+
+    def to_torchvision(self) -> dict[str, Tensor]:
+        """Convert the objects to the form of torchvision's detectors, which `torchmetrics` also takes.
+
+        Returns:
+            `boxes` `(M, 4)`, `labels` `(M,)` from 1 (0 is background), and `scores` `(M,)`.
+        """
+        objects = self.objects
+        return {"boxes": objects.boxes.clone(), "labels": objects.labels.clone(), "scores": objects.scores.clone()}
+
+    def to_coco(
+        self, image_id: int = 1, categories: Sequence[int] | Sequence[Mapping[str, Any]] | None = None
+    ) -> list[dict[str, Any]]:
+        """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
+
+        Args:
+            image_id: id of the image in the annotation file.
+            categories: the `categories` of the annotation file, in which classes are found by name, or the category id
+                of each class. None takes COCO's own ids, if all classes of the objects are among COCO's 80.
+
+        Returns:
+            `image_id`, `category_id`, `bbox` as `[x, y, width, height]`, and `score` of each object.
+
+        Raises:
+            InputError: the class of an object has no category.
+        """
+        objects, names = self.objects, self.classes[1:]
+        if categories is None:
+            categories = coco_categories()
+            known = {canonical_name(str(each["name"])) for each in categories}
+            strange = [name for name in names if canonical_name(name) not in known]
+            check(not strange, "categories", "those of the annotation file, for classes that COCO has not",
+                  f"None with the class {', '.join(strange[:3])}")  # fmt: skip
+        if any(isinstance(each, Mapping) for each in categories):
+            present = sorted(set(objects.labels.tolist()))
+            found = category_ids(categories, [names[label - 1] for label in present])
+            ids = dict(zip(present, found, strict=True))
+        else:
+            check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
+            ids = dict(enumerate(category_ids(categories), 1))
+        return coco_results(image_id, objects.boxes, objects.labels, objects.scores, ids)
+
+    def to_geojson(
+        self, path: str | PathLike[str] | None = None, *, source: str | PathLike[str] | None = None
+    ) -> dict[str, Any]:
+        """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
+
+        For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84). Other pictures have no place on
+        earth: their coordinates are pixels with y down, as the member `coordinates` of the collection says.
+
+        Args:
+            path: the file to write; None writes none.
+            source: the GeoTIFF; None takes the file that the picture of the record comes from, if it is known.
+
+        Returns:
+            The `FeatureCollection`, as JSON values.
+
+        Raises:
+            InputError: the picture has a georeference, and rasterio is not installed.
+            DataError: a file cannot be read or written.
+
+        Example::
+
+            record = agent.find_all("harbour.tif", "boat")
+            record.to_geojson("boats.geojson")
+        """
+        file = self.source if source is None else fspath(source)
+        place = None if file is None else georeference(file)
+        rows = self.object_rows()
+        corners = [
+            [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
+            for row in rows
+        ]
+        if place is not None and rows:
+            flat = place(np.array(corners).reshape(-1, 2))
+            corners = [[(x, y) for x, y in ring] for ring in flat.reshape(-1, 4, 2).tolist()]
+        names = "object", "class", "score", "confirmed", "look"
+        collection: dict[str, Any] = {
+            "type": "FeatureCollection",
+            "coordinates": _PIXELS if place is None else "longitude and latitude, WGS 84",
+            "features": [
+                {
+                    "type": "Feature",
+                    "properties": {name: row[name] for name in names},
+                    "geometry": {"type": "Polygon", "coordinates": [[list(point) for point in (*ring, ring[0])]]},
+                }
+                for row, ring in zip(rows, corners, strict=True)
+            ],
+        }
+        if path is not None:
+            write_text(fspath(path), json.dumps(collection, allow_nan=False))
+        return collection
+
+
+def coco_categories() -> list[dict[str, Any]]:
+    """The categories of COCO's annotation files, as torchvision has them.
+
+    Returns:
+        `id` and `name` of the 80 categories; ids go up to 90.
+
+    >>> len(coco_categories()), coco_categories()[11]
+    (80, {'id': 13, 'name': 'stop sign'})
+    """
+    from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
+
+    names = FasterRCNN_ResNet50_FPN_Weights.DEFAULT.meta["categories"]
+    return [{"id": number, "name": name} for number, name in enumerate(names) if number and name != "N/A"]

@@ -1,0 +1,72 @@
+"""The place of a picture on earth, from a GeoTIFF."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular
+
+_KEYS = 34735
+"""TIFF tag of the directory of GeoKeys, which every GeoTIFF has (OGC GeoTIFF 1.1, section 7.1.2)."""
+
+
+def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
+    """The map from pixels of a GeoTIFF to longitude and latitude.
+
+    Args:
+        source: file of the picture.
+
+    Returns:
+        A function from points `(N, 2)`, `(x, y)` in pixels with edges of pixels at integers, to longitude and latitude
+        `(N, 2)` in degrees (WGS 84); None for a picture without georeference.
+
+    Raises:
+        InputError: the picture has a georeference, and rasterio is not installed.
+        DataError: the file is missing or cannot be read.
+    """
+    if Path(source).suffix.lower() not in (".tif", ".tiff") or not _is_referenced(source):
+        return None
+    try:
+        import rasterio
+        from rasterio.warp import transform
+    except ImportError:
+        raise InputError(
+            f"source: expected rasterio for the georeference of {source}, which is not installed; "
+            'pip install "semfov[geo]"'
+        ) from None
+    try:
+        with rasterio.open(source) as picture:
+            system, affine = picture.crs, picture.transform
+    except rasterio.errors.RasterioError as error:
+        raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
+    if system is None:
+        return None
+
+    def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        column, row = points.T
+        x = affine.a * column + affine.b * row + affine.c
+        y = affine.d * column + affine.e * row + affine.f
+        return np.stack(transform(system, "EPSG:4326", x, y)[:2], -1)
+
+    return place
+
+
+def _is_referenced(source: str) -> bool:
+    """Whether a TIFF has a georeference."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    check_regular(source)
+    try:
+        with Path(source).open("rb") as file:
+            head = file.read(8)
+            # The head of a BigTIFF is twice as long.
+            tags = ImageFileDirectory_v2(head + file.read(8) if head[2:3] == b"+" or head[3:4] == b"+" else head)
+            file.seek(tags.next)
+            tags.load(file)
+            return _KEYS in tags
+    except (OSError, SyntaxError, struct.error) as error:
+        raise DataError(f"{source}: expected a readable TIFF, got: {error}") from None

@@ -1,0 +1,108 @@
+"""Slices of a picture, and their order by the raw scores of the overview: a choice of windows that learns nothing."""
+
+from collections.abc import Sequence
+
+import torch
+
+from semfov.zoom.episode import Order
+from semfov.zoom.glances import Glance, Window, around
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.policy import Choice
+
+OVERLAP = 0.2
+"""Share of a slice by which neighbours overlap."""
+
+
+def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
+    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them.
+
+    Args:
+        lattice: lattice of the picture.
+        side: side of a slice in pixels of the picture.
+        overlap: share of a slice by which neighbours overlap.
+
+    Returns:
+        The slices.
+
+    >>> [window.within for window in slices(Lattice.over((900, 400), (416, 416)), 500, 0.2)]
+    [(0.0, 0.0, 500.0, 400.0), (400.0, 0.0, 900.0, 400.0)]
+    """
+    width, height = lattice.size
+    step = max(1, int(side * (1 - overlap)))
+
+    def starts(length: int) -> list[int]:
+        last = max(length - side, 0)
+        return sorted({*range(0, last, step), last})
+
+    boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in starts(height) for x in starts(width)]
+    return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+
+
+def usual_slices(lattice: Lattice) -> list[Window]:
+    """Slices as people cut them: half as long again as the canvas shows at the largest magnification.
+
+    In a picture that is not four times as long as the canvas they have the largest magnification itself. A picture that
+    the overview shows at it has none.
+
+    Args:
+        lattice: lattice of the picture.
+
+    Returns:
+        The slices, row by row.
+
+    >>> [len(usual_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1200, 900), (640, 480))]
+    [28, 6, 0]
+    """
+    if lattice.levels == 1:
+        return []
+    wider = 1.5 if lattice.levels > 2 else 1.0
+    return slices(lattice, round(wider * min(lattice.canvas) / lattice.magnifications[-1]), OVERLAP)
+
+
+def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:
+    """The windows in descending order of the overview's raw scores in them.
+
+    Args:
+        windows: windows to look at.
+        targets: classes 1..K; none: any class.
+        most: rank a window by its highest score; false: by the sum of its scores.
+
+    Returns:
+        The order.
+    """
+    ranking: list[Choice] = []
+
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+        if len(looks) == 1:
+            values = torch.tensor([raw(looks[0], window, targets, most=most) for window in windows])
+            places = values.argsort(descending=True, stable=True).tolist()
+            ranking.extend((windows[place], float(values[place])) for place in places)
+        return ranking[len(looks) - 1 : len(looks)]
+
+    return order
+
+
+def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
+    """Value of a window by the raw scores of a coarser look: their sum, or the highest, over the cells of the window.
+
+    Args:
+        glance: the coarser look.
+        window: the window.
+        targets: classes 1..K; none: any class.
+        most: whether the highest score counts, and not the sum.
+
+    Returns:
+        The value; 0 where the look shows nothing of the window.
+    """
+    look = glance.gist
+    assert look is not None
+    x1, y1, x2, y2 = window.cells
+    left, top = look.first
+    box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
+    columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
+    rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
+    part = look.scores[rows, columns]
+    scores = (part[..., [target - 1 for target in targets]] if len(targets) else part).amax(-1)
+    if not scores.numel():
+        return 0.0
+    return float(scores.max() if most else scores.sum())

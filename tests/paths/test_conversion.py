@@ -1,0 +1,155 @@
+"""Objects of records in the formats of Supervision, torchvision, COCO and GeoJSON, read back by these packages."""
+
+import builtins
+import contextlib
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import supervision
+import torch
+from PIL import Image
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+from torchvision.utils import draw_bounding_boxes
+
+from semfov import Detections, Grid, InputError
+from semfov.errors import DataError
+from tests import small
+
+CLASSES = ("background", "person", "tvmonitor", "cup")
+
+
+@pytest.fixture
+def record():
+    """One look of three objects of three classes, and one below the threshold."""
+    boxes = torch.tensor([[[0.0, 0, 8, 9], [10, 10, 30, 40], [40, 5, 60.5, 20], [50, 40, 60, 50]]])
+    scores = torch.zeros(1, 4, 4)
+    for row, (label, score) in enumerate([(3, 0.9), (1, 0.8), (2, 0.4), (1, 0.2)]):
+        scores[0, row, label], scores[0, row, 0] = score, 1 - score
+    look = Detections(boxes, scores, torch.ones(1, 4, dtype=torch.bool))
+    return small.scanpath(Grid(4, 3, (80, 60)), torch.tensor([0]), CLASSES, detections=(look,))
+
+
+def test_supervision_counts_classes_from_0_and_has_their_names(record):
+    found = record.to_supervision()
+    assert isinstance(found, supervision.Detections)
+    np.testing.assert_array_equal(found.xyxy, record.objects.boxes.numpy())
+    assert found.class_id.tolist() == [2, 0, 1]
+    assert found["class_name"].tolist() == ["cup", "person", "tvmonitor"]
+    np.testing.assert_allclose(found.confidence, [0.9, 0.8, 0.4])
+    assert (found["look"].tolist(), found["confirmed"].tolist()) == ([0] * 3, [False] * 3)
+    # Its annotators write the names.
+    blank = np.zeros((60, 80, 3), np.uint8)
+    assert supervision.LabelAnnotator().annotate(supervision.BoxAnnotator().annotate(blank.copy(), found), found).any()
+    assert len(found.with_nms()) == 3
+    assert len(replace(record, least=0.95).to_supervision()) == 0
+
+
+def test_torchvision_draws_them(record):
+    found = record.to_torchvision()
+    assert found["labels"].tolist() == [3, 1, 2]
+    drawn = draw_bounding_boxes(torch.zeros(3, 60, 80, dtype=torch.uint8), found["boxes"], colors="white")
+    assert drawn[:, 10, 10:30].eq(255).all()
+
+
+@pytest.mark.parametrize("categories", [None, "file"])
+def test_pycocotools_reads_the_results_with_the_ids_of_the_file(record, categories):
+    """COCO's own ids (person 1, cup 47, tv 72), or those of a file that spells and orders the classes its own way."""
+    given = [{"id": 7, "name": "Cup"}, {"id": 5, "name": "tv"}, {"id": 4, "name": "person"}, {"id": 1, "name": "gull"}]
+    named = given if categories else None
+    ids = {"cup": 7, "person": 4, "tvmonitor": 5} if categories else {"cup": 47, "person": 1, "tvmonitor": 72}
+    results = record.to_coco(9, named)
+    assert [each["category_id"] for each in results] == [ids[row["class"]] for row in record.object_rows()]
+    truth = COCO()
+    truth.dataset = {
+        "info": {},
+        "images": [{"id": 9, "width": 80, "height": 60}],
+        "categories": [{"id": number, "name": name} for name, number in ids.items()],
+        "annotations": [
+            {"id": n, "image_id": 9, "iscrowd": 0, "category_id": ids[row["class"]],
+             "bbox": [row["x1"], row["y1"], row["x2"] - row["x1"], row["y2"] - row["y1"]],
+             "area": (row["x2"] - row["x1"]) * (row["y2"] - row["y1"])}
+            for n, row in enumerate(record.object_rows(), 1)
+        ],
+    }  # fmt: skip
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth.createIndex()
+        judge = COCOeval(truth, truth.loadRes(results), "bbox")
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+    assert judge.stats[0] == pytest.approx(1)
+
+
+def test_classes_without_a_category_are_refused(record):
+    with pytest.raises(InputError, match="categories: expected a category for each class, got none for cup"):
+        record.to_coco(1, [{"id": 1, "name": "person"}, {"id": 2, "name": "tv"}])
+    assert len(replace(record, target=1).to_coco(1, [{"id": 1, "name": "person"}])) == 1
+    own = replace(record, classes=("background", "gull", "tv", "cup"))
+    with pytest.raises(InputError, match=r"categories: expected those of the annotation file.*gull"):
+        own.to_coco()
+    assert [each["category_id"] for each in own.to_coco(1, [11, 12, 13])] == [13, 11, 12]
+
+
+def test_geojson_in_pixels_says_so(record, tmp_path):
+    Image.new("RGB", (80, 60)).save(tmp_path / "plain.tif")
+    for source in (None, "photo.jpg", str(tmp_path / "plain.tif")):
+        collection = replace(record, source=source).to_geojson(tmp_path / "a.geojson")
+        assert json.loads((tmp_path / "a.geojson").read_text()) == collection
+        assert "y down" in collection["coordinates"]
+    first, *_ = features = collection["features"]
+    assert len(features) == 3
+    ring = first["geometry"]["coordinates"][0]
+    assert ring == [[0, 9], [8, 9], [8, 0], [0, 0], [0, 9]]
+    assert first["properties"]["class"] == "cup"
+    with pytest.raises(DataError, match="No such file"):
+        record.to_geojson(source=tmp_path / "none.tif")
+
+
+def geotiff(path, crs, transform):
+    """A picture of 80 × 60 px with a georeference."""
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    from rasterio.transform import Affine
+
+    options = {"width": 80, "height": 60, "count": 3, "dtype": "uint8", "crs": crs, "transform": Affine(*transform)}
+    with rasterio.open(path, "w", driver="GTiff", **options) as file:
+        file.write(np.zeros((3, 60, 80), np.uint8))
+    return path
+
+
+def test_geojson_of_a_geotiff_has_its_coordinates(record, tmp_path):
+    """Web Mercator has a closed form: longitude and latitude from metres by the exponential function."""
+    file = geotiff(tmp_path / "a.tif", "EPSG:3857", (2.0, 0.0, 1_000_000.0, 0.0, -3.0, 6_000_000.0))
+    collection = replace(record, source=str(file)).to_geojson()
+    assert "WGS 84" in collection["coordinates"]
+    ring = np.array(collection["features"][1]["geometry"]["coordinates"][0])
+    x, y = np.array([[10, 40], [30, 40], [30, 10], [10, 10], [10, 40]]).T
+    radius = 6378137.0
+    longitude = np.degrees((1_000_000 + 2.0 * x) / radius)
+    latitude = np.degrees(2 * np.arctan(np.exp((6_000_000 - 3.0 * y) / radius)) - np.pi / 2)
+    np.testing.assert_allclose(ring, np.stack([longitude, latitude], -1), atol=1e-8)
+    # Counterclockwise, as RFC 7946 asks.
+    east, north = (ring[1:] - ring[:-1]).T
+    assert (east[:-1] * north[1:] - east[1:] * north[:-1] > 0).all()
+
+
+def test_a_georeference_needs_rasterio(record, tmp_path, monkeypatch):
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    tags = ImageFileDirectory_v2()
+    tags[34735] = (1, 1, 0, 0)
+    tags.tagtype[34735] = 3
+    Image.new("RGB", (80, 60)).save(tmp_path / "a.tif", tiffinfo=tags)
+    importing = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name.startswith("rasterio"):
+            raise ImportError(name)
+        return importing(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"pip install \"semfov\[geo\]\""):
+        record.to_geojson(source=tmp_path / "a.tif")

@@ -1,0 +1,90 @@
+"""Large pictures without learned evidence: slices in the order of what the overview shows."""
+
+import numpy as np
+import pytest
+import torch
+
+from semfov.agents import ZoomAgent
+from semfov.agents.limits import EpisodeLimits
+from semfov.errors import InputError
+from semfov.zoom import WindowEye
+from semfov.zoom.glances import LiveGlances
+from semfov.zoom.slices import ranked, raw, usual_slices
+from tests.small import Coloured
+
+
+@pytest.fixture
+def agent():
+    return ZoomAgent(WindowEye(Coloured()))
+
+
+def picture(*squares):
+    """Squares `(x, y, side, colour)` on grey, 1200 × 900 px."""
+    pixels = np.full((900, 1200, 3), 100, np.uint8)
+    for x, y, side, colour in squares:
+        pixels[y : y + side, x : x + side] = {"red": (230, 25, 25), "green": (25, 230, 25)}[colour]
+    return pixels
+
+
+def test_slices_cover_the_picture(agent):
+    lattice = agent.eye.open(picture()).lattice
+    covered = np.zeros((900, 1200), bool)
+    for window in usual_slices(lattice):
+        x1, y1, x2, y2 = (int(edge) for edge in window.within)
+        covered[y1:y2, x1:x2] = True
+    assert covered.all()
+
+
+def test_windows_come_in_the_order_of_the_summed_scores(agent):
+    """By a loop over the cells of the overview's hints."""
+    glances = LiveGlances(agent.eye, agent.eye.open(picture((900, 600, 90, "green"), (100, 100, 60, "red"))))
+    windows = usual_slices(glances.lattice)
+    (overview,) = glances.see([path.window for path in agent.find_all(picture(), passes=1).glances])
+    hints = overview.gist
+    for targets in ([], [1], [2], [1, 2]):
+        sums = []
+        for window in windows:
+            x1, y1, x2, y2 = (edge / hints.scale for edge in window.cells)
+            total = 0.0
+            for row in range(hints.scores.shape[0]):
+                for column in range(hints.scores.shape[1]):
+                    if int(x1) <= column < np.ceil(x2) and int(y1) <= row < np.ceil(y2):
+                        scores = hints.scores[row, column]
+                        total += float(max(scores[[t - 1 for t in targets]] if targets else scores))
+            sums.append(total)
+        assert [raw(overview, window, targets) for window in windows] == pytest.approx(sums, abs=1e-5)
+        order, looks = ranked(windows, targets), [overview]
+        chosen = []
+        while choice := order(looks, set()):
+            chosen.append(choice[0][1])
+            looks.append(overview)
+        assert chosen == pytest.approx(sorted(sums, reverse=True), abs=1e-5)
+
+
+def test_searches_find_or_stay_undecided(agent):
+    scene = picture((900, 600, 90, "green"))
+    found = agent.search(scene, "green")
+    assert found.decision.outcome == "found"
+    assert found.ending == "detection"
+    x1, y1, x2, y2 = found.decision.box.tolist()
+    assert x1 < 945 < x2
+    assert y1 < 645 < y2
+    missing = agent.search(scene, "red")
+    assert (missing.decision.outcome, missing.ending) == ("undecided", "windows")
+    assert missing.passes == 1 + len(usual_slices(missing.lattice))
+
+
+def test_limits_and_several_classes(agent):
+    scene = picture((900, 600, 90, "green"), (100, 100, 60, "red"))
+    both = agent.find_all(scene, ["red", "green"])
+    assert sorted(both.objects.labels.tolist()) == [1, 2]
+    assert both.targets == (1, 2)
+    assert set(agent.find_all(scene, "red").objects.labels.tolist()) == {1}
+    assert agent.find_all(scene, "red", passes=3).ending == "passes"
+    seen = []
+    stopped = agent.find_all(scene, on_look=lambda record: seen.append(record.passes) or len(seen) < 2)
+    assert (stopped.ending, seen, stopped.passes) == ("stopped", [1, 2], 2)
+    assert agent.search(picture(), "red", seconds=0).ending == "seconds"
+    with pytest.raises(InputError, match="seconds"):
+        EpisodeLimits(seconds=-1)
+    assert torch.equal(both.candidates.boxes, agent.find_all(scene, [1, 2]).candidates.boxes)
