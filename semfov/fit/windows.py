@@ -4,7 +4,7 @@ import json
 import logging
 import random
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -219,10 +219,14 @@ def fit_zoom(config: FitZoomConfig) -> None:
 
 
 def look_at_all(
-    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig,
+    eye: WindowEye,
+    mosaics: dict[str, Mosaics],
+    store: GlanceStore,
+    kinds: Sequence[str] = ("near", "far", "crowded", "judged", "judged crowded"),
 ) -> dict[str, list[ZoomExample]]:
-    """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
-    looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
+    """Look at all mosaics of some kinds; returns the looks by kind of mosaic."""
+    looked = {kind: mosaics[kind] for kind in kinds}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_fit_process, settings=(config,), title="looking",
@@ -249,7 +253,7 @@ def fit_looks(
 def survey_again(
     config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
 ) -> dict[str, float]:
-    """Fit a new survey; returns its measures on held-out mosaics."""
+    """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
     survey = Survey(model.classes, foresight=model.survey.foresight)
@@ -257,7 +261,7 @@ def survey_again(
     fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
     model.survey = survey.eval().requires_grad_(False)
     model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
-    crowded = judge_survey(survey, kinds["judged crowded"])
+    crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
     return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
 
 

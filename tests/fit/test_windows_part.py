@@ -11,7 +11,7 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.detector import manifest_of
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.folder import FolderFit
-from semfov.fit.parts.windows import PASSES, in_raw_order, recalls
+from semfov.fit.parts.windows import RECALL_PASSES, in_raw_order, photograph_recalls
 from semfov.fit.windows import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
@@ -20,7 +20,6 @@ from semfov.runs.looking import looking_of
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.glances import around
 from tests.colours import COLOURS, write_network, write_photographs
 from tests.small import Tiles
 
@@ -112,13 +111,14 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
     shares = {}
     for index, glances in enumerate(opened):
         tiles = mosaics.tiles(index)
-        looks = [turn.glance for turn in in_raw_order(glances, [around(glances.lattice, tile.slot) for tile in tiles])]
+        looks = [turn.glance for turn in in_raw_order(glances)]
         found = torch.stack([found_in(looks[:n], mosaics.annotation(index)) for n in range(1, len(looks) + 1)], -1)
-        # All photographs were looked at after 5 passes, so recall stays the same.
-        found = torch.cat([found, found[:, -1:].expand(-1, PASSES[-1] - 5)], -1).double()
+        # When all slices were looked at, recall stays the same.
+        assert len(looks) < RECALL_PASSES[-1]
+        found = torch.cat([found, found[:, -1:].expand(-1, RECALL_PASSES[-1] - len(looks))], -1).double()
         counts = [len(scenes.annotation(tile.index).boxes) for tile in tiles]
         for tile, part in zip(tiles, found.split(counts), strict=True):
             shares.setdefault(tile.index, []).append(part.mean(0))
     expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
     assert expected.amax() > 0
-    torch.testing.assert_close(torch.from_numpy(recalls(mosaics, opened, in_raw_order)), expected)
+    torch.testing.assert_close(torch.from_numpy(photograph_recalls(mosaics, opened, in_raw_order)), expected)

@@ -30,25 +30,25 @@ from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_orders import ranked
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance, Glances, Window, around
+from semfov.zoom.glances import Glance, Glances
 from semfov.zoom.search import find_everything
+from semfov.zoom.slices import ranked, usual_slices
 
 ENOUGH = 16
 """Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
-PASSES = (4, 8, 16)
+RECALL_PASSES = (4, 8, 16)
 """Passes of the detector after which recall is reported."""
 _OF_INPUT = 1.15
 """Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
-Way = Callable[[Glances, Sequence[Window]], Iterator[Turn[Any]]]
-"""A way of looking for all objects of a mosaic, given the looks at it and the windows of its photographs."""
+Way = Callable[[Glances], Iterator[Turn[Any]]]
+"""A way of looking for all objects of a picture."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class WindowsFit(PartFit):
         if isinstance(config, LeftOut):
             return {}
         return {
-            "looking": 60 * _LOOK * (config.mosaics + config.crowded + 2 * config.judged + 4 * config.far),
+            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
             "learning what closer looks show": 0.01 * config.steps,
             "learning the expected number of objects": 0.04 * config.steps,
             "learning the survey": 0.1 * config.survey_steps,
@@ -119,25 +119,25 @@ class WindowsFit(PartFit):
         judged = mosaics["judged"]
         opened = open_all(eye, judged, store)
         curves = {
-            "fitted": recalls(judged, opened, lambda glances, _: find_everything(glances, model)),
-            "raw": recalls(judged, opened, in_raw_order),
+            "fitted": photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
+            "raw": photograph_recalls(judged, opened, in_raw_order),
         }
         gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
-        at = PASSES[-1] - 1
+        at = RECALL_PASSES[-1] - 1
         why = (
-            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {PASSES[-1]} passes, "
+            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {RECALL_PASSES[-1]} passes, "
             f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
             f"passes {in_words(gain, 'points gained', 100)}"
         )
-        rows = [["looks", *(f"after {n} passes" for n in PASSES), "mean"]]
+        rows = [["looks", *(f"after {n} passes" for n in RECALL_PASSES), "mean"]]
         rows += [
-            [name, *(mean_percent(curve[:, n - 1]) for n in PASSES), mean_percent(curve.mean(1))]
+            [name, *(mean_percent(curve[:, n - 1]) for n in RECALL_PASSES), mean_percent(curve.mean(1))]
             for name, curve in curves.items()
         ]
         text = section(
             f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
-            f"objects of each photograph, and the mean over 1 to {PASSES[-1]} passes. `raw` looks at the photographs "
-            "one by one, in the order of the sums of the overview's raw scores.",
+            f"objects of each photograph, and the mean over 1 to {RECALL_PASSES[-1]} passes. `raw` looks at slices, in the "
+            "order of the sums of the overview's raw scores, as the agent does without this part.",
             rows,
         )
         return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
@@ -157,7 +157,7 @@ def fit_mosaics(
     Returns:
         The model and a report in Markdown.
     """
-    examples = look_at_all(config, eye, mosaics, store)
+    examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
     model = fit_looks(config, eye, mosaics, examples)
     survey_again(config, model, examples)
     judged = mosaics["judged"]
@@ -173,13 +173,13 @@ def fit_mosaics(
     return model, "\n".join(lines)
 
 
-def in_raw_order(glances: Glances, photographs: Sequence[Window]) -> Iterator[Turn[Any]]:
-    """Look at the photographs of a mosaic in descending order of the sums of the overview's raw scores."""
-    return look_by_look(glances, ranked(photographs, None, most=False), None)
+def in_raw_order(glances: Glances) -> Iterator[Turn[Any]]:
+    """Look at slices in the order of the overview's scores, as an agent without evidence does."""
+    return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
 
 
 @torch.inference_mode()
-def recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: Way) -> FloatArray:
+def photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: Way) -> FloatArray:
     """Measure the recall in each photograph of some mosaics after each pass.
 
     Args:
@@ -190,17 +190,16 @@ def recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: Way) -> Floa
     Returns:
         `(P, 16)`, the share of its objects that were found, for each photograph with objects in any mosaic.
     """
-    found, there = np.zeros((len(mosaics.scenes), PASSES[-1])), np.zeros(len(mosaics.scenes))
+    found, there = np.zeros((len(mosaics.scenes), RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
         photograph = np.repeat(
             [tile.index for tile in tiles], [len(mosaics.scenes.annotation(tile.index).boxes) for tile in tiles]
         )
         np.add.at(there, photograph, 1)
-        photographs = [around(glances.lattice, tile.slot) for tile in tiles]
         seen: list[Glance] = []
-        turns = way(glances, photographs)
-        for number in range(PASSES[-1]):
+        turns = way(glances)
+        for number in range(RECALL_PASSES[-1]):
             turn = next(turns, None)
             if turn is not None:
                 seen.append(turn.glance)
