@@ -61,7 +61,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
     steps: Count | None = None
     map_steps: Count | None = None
     windows: bool = True
-    window_steps: Count = 800
+    window_steps: Count = 400
     thin: Whole = 20
     out: Path = Path("mymodels")
 
@@ -160,7 +160,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             tile: width in pixels of the slot of a photograph.
 
         Returns:
-            The settings. Each photograph to learn from is in about eight mosaics, as long as these are not too many.
+            The settings. Each photograph to learn from is in about four mosaics, unless there are very many.
         """
         holdout = self.holdout or 5
         held_out = -(-photographs // holdout)
@@ -169,15 +169,17 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             data=self.data,
             detector=self.detector,
             holdout=holdout,
-            mosaics=max(1, kept // 3),
-            far=max(1, kept // 40),
-            crowded=max(1, kept // 6),
-            judged=max(8, min(held_out // 2, 30)),
+            mosaics=max(1, kept // 5),
+            far=max(1, kept // 60),
+            crowded=max(1, kept // 10),
+            judged=max(8, min(held_out // 3, 30)),
             judged_far=1,
-            searched=max(8, kept // 10),
+            searched=max(8, kept // 12),
+            sought=3,
+            passes=16,
             tile=tile,
             steps=self.window_steps,
-            survey_steps=2 * self.window_steps,
+            survey_steps=self.window_steps,
             seed=self.seed,
             out=self.out,
             cache=self.cache,

@@ -25,7 +25,7 @@ from semfov.fit.windows import (
     make_store,
     survey_again,
 )
-from semfov.fit.windows_choice import choose_foresight, choose_patience, open_all
+from semfov.fit.windows_choice import choose_foresight, open_all
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
@@ -94,13 +94,13 @@ class WindowsFit(PartFit):
             return {}
         return {
             "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
-            "learning what closer looks show": 0.01 * config.steps,
-            "learning the expected number of objects": 0.04 * config.steps,
-            "learning the survey": 0.1 * config.survey_steps,
-            "searching": config.searched,
-            "searching held-out mosaics": config.judged,
-            "looking closely": config.searched,
-            "looking closely at held-out mosaics": config.judged,
+            "learning what closer looks show": 0.1 * config.steps,
+            "learning the expected number of objects": 0.2 * config.steps,
+            "learning the survey": 0.4 * config.survey_steps,
+            "searching": 4 * config.searched,
+            "searching held-out mosaics": 4 * config.judged,
+            "looking closely": 4 * config.searched,
+            "looking closely at held-out mosaics": 4 * config.judged,
         }
 
     def fit(self) -> PartResult:
@@ -136,8 +136,8 @@ class WindowsFit(PartFit):
         ]
         text = section(
             f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
-            f"objects of each photograph, and the mean over 1 to {RECALL_PASSES[-1]} passes. `raw` looks at slices, in the "
-            "order of the sums of the overview's raw scores, as the agent does without this part.",
+            f"objects of each photograph, and the mean over 1 to {RECALL_PASSES[-1]} passes. `raw` looks at slices in "
+            "the order of the sums of the overview's raw scores, as the agent does without this part.",
             rows,
         )
         return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
@@ -161,12 +161,8 @@ def fit_mosaics(
     model = fit_looks(config, eye, mosaics, examples)
     survey_again(config, model, examples)
     judged = mosaics["judged"]
-    choose_patience(model, eye, judged, store)
     choose_foresight(model, eye, {"judged": judged}, store)
-    chosen = (
-        f"Settings chosen on the same mosaics: patience {model.patience:g}, foresight {model.survey.foresight:g} for "
-        "finding all objects."
-    )
+    chosen = f"Foresight chosen on the same mosaics for finding all objects: {model.survey.foresight:g}."
     lines = [judge_windows(model, examples["judged"])[0], chosen, ""]
     lines += fit_decision(config, model, eye, mosaics, store)
     lines += fit_closer_looks(config, model, eye, mosaics, store)
