@@ -105,7 +105,8 @@ def main() -> None:
     for number, seconds in enumerate(path.seconds):
         pan, tilt, _ = path.pose(number).tolist()
         print(f"{seconds:5.2f} s: camera at pan {pan:.0f}°, tilt {tilt:.0f}°")
-    print(path.summary())
+    pan, tilt = path.direction(-1)
+    print(f"{path.summary()} The last gaze was at pan {pan:.1f}°, tilt {tilt:.1f}°.")
     print(f"the camera's clock says {camera.clock:.2f} s, and {camera.turns} turns")
     save_figure(path.plot(), arguments.out)
 

@@ -301,7 +301,8 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
-                tensor; a `semfov.data.large.LargePicture`; or a scene, such as `semfov.Panorama` or `semfov.Flat`.
+                tensor; a `semfov.data.large.LargePicture`; or a scene: a `semfov.Panorama`, a
+                `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
             target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
                 with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
                 the most probable of them.
@@ -355,8 +356,8 @@ class ActivePerception(nn.Module):
             )
         index = _one_class(target, self.classes)
         if kind == "head":
-            given = _given(start=start, confirm=confirm, **limits, duration=duration)
-            _only_for(kind, "fovea", "confirm", give_up=give_up, closer=closer)
+            given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
+            _only_for(kind, "fovea", "confirm", closer=closer)
             return self.head.search(_scene(picture, color), index, seed=seed, **given)
         _only_for(kind, "fovea", "passes", start=start)
         given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)

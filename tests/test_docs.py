@@ -10,7 +10,7 @@ import semfov
 from docs.api import entries, pages
 
 DOCS = Path(__file__).parents[1] / "docs"
-GUIDES = sorted(DOCS.glob("guides/*.md"))
+GUIDES = [*sorted(DOCS.glob("guides/*.md")), DOCS / "pan-tilt.md"]
 PAGES = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 
 

@@ -286,6 +286,7 @@ class HeadAgent(nn.Module):
                 seconds=tuple(step.seconds for step in steps),
                 detections=tuple(step.detections for step in steps),
                 maps=torch.stack(maps),
+                values=tuple(step.gain for step in steps),
                 found=decision is not None and decision.outcome == "found",
                 decision=decision,
                 ending=ending,

@@ -252,6 +252,11 @@ class Flat(World):
         """The points themselves."""
         return points
 
+    def angles_of(self, points: Tensor) -> Tensor:
+        """Degrees to the right of and above the middle of the picture."""
+        middle = points.new_tensor(self.picture) / 2 - 0.5
+        return (points - middle) * points.new_tensor([1.0, -1.0]) / self.degree
+
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Distance between the middles of two windows."""
         return torch.linalg.vector_norm(one[..., :2] - other[..., :2], dim=-1)

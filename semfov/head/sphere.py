@@ -95,6 +95,11 @@ class Sphere(World):
         """Pixels of the panorama at directions."""
         return panorama_points(points, self.picture)
 
+    def angles_of(self, points: Tensor) -> Tensor:
+        """Pan from -180 to 180 degrees, and tilt."""
+        x, y, z = points.unbind(-1)
+        return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
+
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Angle between the optical axes of two cameras."""
         middle = torch.tensor([[0.0, 0.0]])

@@ -119,6 +119,17 @@ class World(ABC):
         """
 
     @abstractmethod
+    def angles_of(self, points: Tensor) -> Tensor:
+        """Directions of points of the scene, as a head would turn to them.
+
+        Args:
+            points: `(N, D)`, points of the scene.
+
+        Returns:
+            `(N, 2)`, pan to the right and tilt up, in degrees.
+        """
+
+    @abstractmethod
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Angles by which the head turns between poses.
 

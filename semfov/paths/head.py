@@ -49,6 +49,8 @@ _FORMAT = Format.of(
     {
         "actions": Field(("n",), dtype=torch.int64, low=0),
         "maps": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3),
+        # Files of earlier versions have no values.
+        "values": Field(("n",), mixed=True, finite=False, optional=True),
     },
     {
         "world": Object(_WORLD, None, ("kind", "picture", "size", "cell")),
@@ -76,6 +78,7 @@ class HeadPath(GazeRecord):
         detections: detections of each look, a batch of one, with boxes in pixels of its view.
         maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
             exploration.
+        values: expected gain per second for which each look was chosen, infinite for the first; empty if not known.
         found: whether the last look found the target; the `cell` of the decision is then one of the scene, and its
             `box` is in pixels of the last view.
 
@@ -90,6 +93,7 @@ class HeadPath(GazeRecord):
     actions: tuple[int, ...]
     seconds: tuple[float, ...]
     maps: Tensor
+    values: tuple[float, ...] = ()
 
     _format = _FORMAT
 
@@ -155,6 +159,18 @@ class HeadPath(GazeRecord):
         """
         return self.views.gaze[self.actions[look]]
 
+    def direction(self, look: int) -> tuple[float, float]:
+        """Direction in which the eye looked, as a head would turn to it.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+
+        Returns:
+            Pan to the right and tilt up, in degrees.
+        """
+        pan, tilt = self.views.world.angles_of(self.gaze(look)[None])[0].tolist()
+        return pan, tilt
+
     def places(self, look: int, score: float = 0.1) -> tuple[Places, Tensor, Tensor]:
         """Objects detected in a look, in coordinates of the scene.
 
@@ -179,17 +195,18 @@ class HeadPath(GazeRecord):
         Returns:
             The line.
         """
-        what = "exploration" if self.target is None else self.target_name
-        found = "" if self.target is None else (" found" if self.found else " not found")
         looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
-        objects = f", {self.objects_in_words()}" if self.target is None else ""
-        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}{objects}"
+        what = self.objects_in_words()
+        if self.decision is not None:
+            what = f"{self.target_name}: {self.decision.outcome} ({self.decision.probability:.2f})"
+        return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look.
 
-        `x` and `y` are the fixated point in pixels of the scene's picture, and `field` the field of view in degrees.
+        `x` and `y` are the fixated point in pixels of the scene's picture. `pan` and `tilt` are the direction of the
+        head, and `field` is its field of view, in degrees.
         `probability` is the probability of the target, or of any object in an exploration, in the fixated cell of the
         scene, and `highest` the largest one of all cells. `detections` is the number of detections, `seen` the class of
         the most confident one, and `score` its confidence. `seconds` is the time at the end of the look.
@@ -206,7 +223,7 @@ class HeadPath(GazeRecord):
                     "action": action,
                     "x": x,
                     "y": y,
-                    "field": float(self.pose(number)[2]),
+                    **dict(zip(("pan", "tilt", "field"), self.pose(number).tolist(), strict=True)),
                     "cell": cell,
                     "probability": float(self.maps[number, cell]),
                     "highest": float(self.maps[number].max()),
@@ -225,6 +242,9 @@ class HeadPath(GazeRecord):
     def _duration(self, number: int) -> float | None:
         return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
 
+    def _value(self, number: int) -> float | None:
+        return self.values[number] if self.values else None
+
     def _decision_in_picture(self) -> Decision | None:
         decision = self.decision
         if decision is None or decision.box is None:
@@ -239,6 +259,8 @@ class HeadPath(GazeRecord):
         views = self.views
         record = {"fields": list(views.fields), "fovea": views.fovea, "seconds": list(self.seconds)}
         tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
+        if self.values:
+            tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         return tensors, {"world": _settings(views.world), **record}
 
     @classmethod
@@ -252,7 +274,9 @@ class HeadPath(GazeRecord):
         check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
         cell = None if decision is None else decision.cell
         check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)
-        return {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": tuple(record["seconds"])}
+        values = tuple(tensors["values"].tolist()) if "values" in tensors else ()
+        seconds = tuple(record["seconds"])
+        return {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": seconds, "values": values}
 
 
 def _settings(world: World) -> dict[str, Any]:

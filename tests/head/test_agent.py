@@ -52,7 +52,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     found = agent.search(world, "blue", passes=5, confirm=0.0)
     assert found.found
     assert len(found) == 1
-    assert repr(found).startswith("HeadPath: blue found in ")
+    assert repr(found).startswith("HeadPath: blue: found (")
     explored = agent.explore(world, passes=3)
     assert explored.target is None
     assert len(explored) == 3

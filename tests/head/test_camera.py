@@ -63,8 +63,7 @@ class Own(PanTiltCamera):
 def middle_of(path, look=-1):
     """Pan and tilt of the middle of the first object of a look."""
     regions, *_ = path.places(look, 0.5)
-    x, y, z = regions.samples(3)[0, 4].tolist()
-    return math.degrees(math.atan2(x, z)), -math.degrees(math.asin(y))
+    return tuple(path.views.world.angles_of(regions.samples(3)[:1, 4])[0].tolist())
 
 
 def test_a_camera_needs_a_size_and_a_way_to_look(exact, panorama):

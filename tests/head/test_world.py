@@ -90,6 +90,18 @@ def test_angles_of_eye_and_head():
     assert float(flat.turn(torch.tensor([0.0, 0, 60]), torch.tensor([7.5, 10, 60]))) == pytest.approx(12.5)
 
 
+def test_a_head_that_turns_to_the_angles_of_a_point_has_it_in_the_middle_of_its_view(world):
+    points = world.centres[torch.randint(len(world.centres), (30,), generator=torch.Generator().manual_seed(1))]
+    middle = torch.tensor(world.size) / 2 - 0.5
+    for point, (pan, tilt) in zip(points, world.angles_of(points).tolist(), strict=True):
+        pose = torch.tensor([pan, tilt, 20.0])
+        if isinstance(world, Flat) and not (abs(pan) < 70 and abs(tilt) < 52):
+            continue  # the window would not fit
+        seen, inside = world.to_view(point[None], pose)
+        assert inside.all()
+        torch.testing.assert_close(seen[0], middle, atol=0.6 if isinstance(world, Flat) else 1e-2, rtol=0)
+
+
 def test_actions_are_cells_of_a_strip(world):
     views = Views(world)
     assert len(views.grid) == len(views.poses) * 100

@@ -96,6 +96,7 @@ def head_path(world=None):
         seconds=(0.2, 0.5, 1.25),
         detections=looks(3),
         maps=torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2)),
+        values=(float("inf"), 0.5, 0.25),
         ending="passes",
     )
 
@@ -127,7 +128,7 @@ WORDS = {
         "A closer look confirmed the target.",
     ),
     "zoom_path": ("cup: found (0.90) in 3 passes", "A closer look confirmed the target."),
-    "head_path": ("cat not found in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
+    "head_path": ("3 × cat from score 0.3 in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
     "moment": ("cup: undecided, p 0.25", None),
 }
 
@@ -291,7 +292,7 @@ def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path)
         write_file(other, tensors, {**values, name: changed})
         with pytest.raises(DataError, match=f"expected a complete {kind}"):
             type(record).load(other)
-    for name in tensors.keys() - {"box"}:
+    for name in tensors.keys() - {name for name, field in record._format.schema.tensors.items() if field.optional}:
         write_file(other, {key: value for key, value in tensors.items() if key != name}, values)
         with pytest.raises(DataError, match=name):
             type(record).load(other)
