@@ -21,20 +21,6 @@ ABOUT = {
 """Entries at the head of an episode, by their keys in its data."""
 
 
-NUMBER = (
-    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
-    "looks would then show."
-)
-"""What values mean where objects are counted (`semfov.zoom.policy.best_find`)."""
-
-_PROBABILITY = (
-    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
-    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
-    "is the probability, before it, that the target is at the place."
-)
-"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
-
-
 def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> str:
     """The picture with its windows and objects, all looks, and a table of the objects.
 
@@ -52,14 +38,13 @@ def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> st
     head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
     looks = "".join(_look(data, number, pool, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
-    value = "" if all(look["value"] is None for look in data["looks"]) else _PROBABILITY if data["decided"] else NUMBER
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
         f"Click on the number or the border of a window to choose its look. Green objects were confirmed by the "
         f"decision or a closer look.</p>"
         f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data, pool)}</figure>'
-        f'{looks}</div><p class="hint">{value} A look brought the objects whose final box comes from it.</p>'
+        f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
     )
 

@@ -33,6 +33,20 @@ SHOWN = 15
 """Largest number of detections of a look that are drawn and listed."""
 
 
+NUMBER = (
+    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
+    "looks would then show."
+)
+"""What values of windows mean where objects are counted (`semfov.zoom.policy.best_find`)."""
+
+_PROBABILITY = (
+    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
+    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
+    "is the probability, before it, that the target is at the place."
+)
+"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
+
+
 def zoom_data(
     path: Record,
     picture: LargePicture | ImageLike | None,
@@ -95,7 +109,7 @@ def zoom_data(
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
-        "decided": path.decision is not None,
+        "values": values_in_words(path),
         "image": pool.add(_pixels(source, (0, 0, wide, high), path.size, min(width, wide)), width, quality),
         "looks": [_look(path, look, view, objects, pool, quality) for look, view in zip(path, views, strict=True)],
         "objects": objects[:DRAWN],
@@ -175,6 +189,17 @@ def _(path: HeadPath) -> str:
     wide, high = path.views.world.size
     fields = ", ".join(f"{field:g}" for field in path.views.fields)
     return f"views of {wide} × {high} px with fields of view of {fields} degrees"
+
+
+@singledispatch
+def values_in_words(path: Record) -> str:
+    """Explain the values of the looks, where they have a meaning that the page does not tell elsewhere."""
+    return ""
+
+
+@values_in_words.register
+def _(path: ZoomPath) -> str:
+    return f"{NUMBER if path.decision is None else _PROBABILITY} "
 
 
 def windows_in_words(lattice: Lattice) -> str:
