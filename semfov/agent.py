@@ -392,7 +392,8 @@ class ActivePerception(nn.Module):
             seconds: longest time in seconds on this machine.
             duration: in a scene, longest time in seconds that the movements of eye and head take.
             on_look: called after each look with the record so far; returning False ends it.
-            worth: least number of new objects that a look must be expected to show; None takes 0.01. Only for windows.
+            worth: least gain for which a look is worth it: of windows the expected number of new objects, where None
+                takes 0.01; of a head the expected number of additional correct cells, where None takes all looks.
             batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
 
@@ -408,15 +409,16 @@ class ActivePerception(nn.Module):
         targets = class_numbers(target, self.classes[1:], "target")
         _only_for(kind, "fovea", "passes", shifts=shifts)
         _only_for(kind, "head", "seconds", duration=duration)
-        _only_for(kind, "windows", "passes", worth=worth)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
+            _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
             one = targets[0] if len(targets) == 1 else None
             return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
-            return self.head.find_all(_scene(picture, color), targets, **_given(**limits, duration=duration))
+            given = _given(worth=worth, duration=duration, **limits)
+            return self.head.find_all(_scene(picture, color), targets, **given)
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))
 
@@ -450,7 +452,8 @@ class ActivePerception(nn.Module):
             on_look: called after each look with the record so far; returning False ends the exploration.
             worth: least expected gain of a look. Of a fovea with a learned map it is the increase in the number of
                 correctly classified cells (`semfov.acquisition.ExpectedGain`; None takes 0.1). Of windows it is the
-                number of new objects (None takes 0.01). 0 makes all looks.
+                number of new objects (None takes 0.01), and of a head that of additional correct cells. 0 makes all
+                looks.
             start: first cell of a fovea or first action of a head, as for `search`.
             seed: seed of the generator that draws the start and breaks ties.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
