@@ -17,6 +17,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
+from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.episode import Turn, look_by_look
@@ -155,8 +156,9 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                return search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
-            return search_windows(
+                score = 0.5 if confirm is None else confirm
+                return _with_picture(search_slices(glances, self.classes, index, limits, score), glances)
+            path = search_windows(
                 glances,
                 self.evidence,
                 self.classes,
@@ -166,6 +168,7 @@ class ZoomAgent(nn.Module):
                 give_up=give_up,
                 closer=closer,
             )
+            return _with_picture(path, glances)
 
     def find_all(
         self,
@@ -215,7 +218,8 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.seen), path.record)
                 if ending is not None:
                     break
-        return path.record(ending or ("windows" if self.evidence is None else "worth"))
+        record = path.record(ending or ("windows" if self.evidence is None else "worth"))
+        return _with_picture(record, glances)
 
     def explore(
         self,
@@ -249,6 +253,13 @@ class ZoomAgent(nn.Module):
 
     def _open(self, picture: _Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
+
+
+def _with_picture(path: ZoomPath, glances: LiveGlances) -> ZoomPath:
+    """The record with its reduced picture, which figures and pages show, and its file."""
+    picture = glances.view.picture
+    source = None if picture.path is None else str(picture.path)
+    return replace(path, photograph=reduced_copy(picture), source=source)
 
 
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:

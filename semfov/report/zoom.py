@@ -98,12 +98,12 @@ def zoom_data(
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
     objects = _objects(path)
-    views = views_of(path, source)
+    views = look_views(path, source)
     return {
         "name": name,
         "pixels": f"{wide} × {high} px",
         "detector": None if settings is None else settings["detector"]["name"],
-        "sensor": sensor_of(path),
+        "sensor": sensor_words(path),
         "passes": str(path.passes),
         "decision": outcome_in_words(path),
         "summary": path.describe(),
@@ -117,7 +117,7 @@ def zoom_data(
     }
 
 
-class View(NamedTuple):
+class LookView(NamedTuple):
     """What a look showed.
 
     Attributes:
@@ -134,7 +134,7 @@ class View(NamedTuple):
 
 
 @singledispatch
-def views_of(path: Record, source: LargePicture) -> Iterator[View]:
+def look_views(path: Record, source: LargePicture) -> Iterator[LookView]:
     """The views of a record, from its picture.
 
     Args:
@@ -150,41 +150,41 @@ def views_of(path: Record, source: LargePicture) -> Iterator[View]:
         yield _view(look, frame, source, path.size, across)
 
 
-@views_of.register
-def _(path: ZoomPath, source: LargePicture) -> Iterator[View]:
+@look_views.register
+def _(path: ZoomPath, source: LargePicture) -> Iterator[LookView]:
     for look, glance in zip(path, path.glances, strict=True):
         frame = _whole_pixels(look.region, path.size)
         across = max(1, round((frame[2] - frame[0]) * glance.window.fixation[2]))
         yield _view(look, frame, source, path.size, across)
 
 
-@views_of.register
-def _(path: HeadPath, source: LargePicture) -> Iterator[View]:
+@look_views.register
+def _(path: HeadPath, source: LargePicture) -> Iterator[LookView]:
     whole = _pixels(source, (0, 0, *path.size), path.size, 2 * LONGEST)
     size = path.views.world.size
     for number, pixels in enumerate(head_views(path, whole)):
-        yield View(pixels, size, path.detections[number].boxes[0], size[0])
+        yield LookView(pixels, size, path.detections[number].boxes[0], size[0])
 
 
-def _view(look: RecordedLook, frame: _Frame, source: LargePicture, size: tuple[int, int], across: int) -> View:
+def _view(look: RecordedLook, frame: _Frame, source: LargePicture, size: tuple[int, int], across: int) -> LookView:
     """The view of a window of the picture."""
     x1, y1, x2, y2 = frame
     boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
-    return View(_pixels(source, frame, size, across), (x2 - x1, y2 - y1), boxes, across)
+    return LookView(_pixels(source, frame, size, across), (x2 - x1, y2 - y1), boxes, across)
 
 
 @singledispatch
-def sensor_of(path: Record) -> str | None:
+def sensor_words(path: Record) -> str | None:
     """Describe in words through what a record looked."""
     return None
 
 
-@sensor_of.register
+@sensor_words.register
 def _(path: ZoomPath) -> str:
     return windows_in_words(path.lattice)
 
 
-@sensor_of.register
+@sensor_words.register
 def _(path: HeadPath) -> str:
     wide, high = path.views.world.size
     fields = ", ".join(f"{field:g}" for field in path.views.fields)
@@ -235,7 +235,7 @@ def _objects(path: Record) -> list[Data]:
     ]
 
 
-def _look(path: Record, look: RecordedLook, view: View, objects: list[Data], pool: Pool, quality: int) -> Data:
+def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], pool: Pool, quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     (x, y), number, (x1, y1, x2, y2) = look.fixation, look.number, look.region
     width, height = path.size
@@ -268,7 +268,7 @@ def _look(path: Record, look: RecordedLook, view: View, objects: list[Data], poo
     }
 
 
-def _detections(path: Record, look: RecordedLook, view: View) -> list[Data]:
+def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     """Detections of a look, those of the target first, with boxes and labels in the unit of the view."""
     seen, rows = look.detections, []
     parts = (view.boxes.tolist(), seen.boxes[0].tolist(), seen.labels[0].tolist(), seen.confidence[0].tolist())
