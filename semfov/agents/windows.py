@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from os import PathLike, fspath
 from typing import Any, Self
 
 import torch
@@ -156,19 +157,19 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                score = 0.5 if confirm is None else confirm
-                return _with_picture(search_slices(glances, self.classes, index, limits, score), glances)
-            path = search_windows(
-                glances,
-                self.evidence,
-                self.classes,
-                index,
-                limits,
-                confirm=confirm,
-                give_up=give_up,
-                closer=closer,
-            )
-            return _with_picture(path, glances)
+                path = search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
+            else:
+                path = search_windows(
+                    glances,
+                    self.evidence,
+                    self.classes,
+                    index,
+                    limits,
+                    confirm=confirm,
+                    give_up=give_up,
+                    closer=closer,
+                )
+        return _with_picture(path, glances, picture)
 
     def find_all(
         self,
@@ -219,7 +220,7 @@ class ZoomAgent(nn.Module):
                 if ending is not None:
                     break
         record = path.record(ending or ("windows" if self.evidence is None else "worth"))
-        return _with_picture(record, glances)
+        return _with_picture(record, glances, picture)
 
     def explore(
         self,
@@ -255,13 +256,6 @@ class ZoomAgent(nn.Module):
         return LiveGlances(self.eye, self.eye.open(picture))
 
 
-def _with_picture(path: ZoomPath, glances: LiveGlances) -> ZoomPath:
-    """The record with its reduced picture, which figures and pages show, and its file."""
-    picture = glances.view.picture
-    source = None if picture.path is None else str(picture.path)
-    return replace(path, photograph=reduced_copy(picture), source=source)
-
-
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     """Tell whether a picture is large enough for windows to pay.
 
@@ -277,6 +271,12 @@ def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     (True, False)
     """
     return Lattice.over(size, canvas).levels >= 3
+
+
+def _with_picture(path: ZoomPath, glances: LiveGlances, picture: _Picture) -> ZoomPath:
+    """The record with a reduced copy of its picture, and with its file."""
+    file = fspath(picture) if isinstance(picture, str | PathLike) else None
+    return replace(path, photograph=reduced_copy(glances.view.picture), source=file)
 
 
 def search_windows(

@@ -471,6 +471,18 @@ class GazeRecord(Record):
             found=None if self.target is None else self.found,
         )
 
+    def compare(self, people: Sequence[Fixations]) -> Mapping[str, tuple[float, float]]:
+        """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
+
+        Args:
+            people: their fixations.
+
+        Returns:
+            Each measure of this record and of the people among themselves; it prints as a table.
+        """
+        found: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
+        return found
+
     @abstractmethod
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         """Fixated points `(n, 2)` in pixels of the picture, and its `(width, height)`."""
