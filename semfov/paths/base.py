@@ -379,6 +379,9 @@ class GazeRecord(Record):
     ending: Ending | None = None
     seconds: tuple[Any, ...] = ()
 
+    how: ClassVar[Literal["fovea", "windows", "head"]]
+    """Kind of look: of a fovea, at windows, or of a head that turns."""
+
     _format: ClassVar[Format]
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
