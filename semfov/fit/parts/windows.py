@@ -17,6 +17,7 @@ from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.windows import (
     FitZoomConfig,
     fit_closer_looks,
+    fit_counts,
     fit_decision,
     fit_looks,
     judge_windows,
@@ -101,6 +102,8 @@ class WindowsFit(PartFit):
             "searching held-out mosaics": 4 * config.judged,
             "looking closely": 4 * config.searched,
             "looking closely at held-out mosaics": 4 * config.judged,
+            "exploring": config.searched,
+            "exploring held-out mosaics": config.judged,
         }
 
     def fit(self) -> PartResult:
@@ -146,7 +149,7 @@ class WindowsFit(PartFit):
 def fit_mosaics(
     config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, str]:
-    """Look at the mosaics, and fit the evidence, its settings, its decisions and its closer looks.
+    """Look at the mosaics, and fit the evidence, its foresight, its decisions, closer looks and expected numbers.
 
     Args:
         config: the settings.
@@ -166,6 +169,7 @@ def fit_mosaics(
     lines = [judge_windows(model, examples["judged"])[0], chosen, ""]
     lines += fit_decision(config, model, eye, mosaics, store)
     lines += fit_closer_looks(config, model, eye, mosaics, store)
+    lines += fit_counts(config, model, eye, mosaics, store)
     return model, "\n".join(lines)
 
 
