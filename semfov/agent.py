@@ -21,6 +21,7 @@ from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
+from semfov.detection.load import DetectorLike
 from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
@@ -182,11 +183,11 @@ class ActivePerception(nn.Module):
         return cls._of(published_arguments(name, sensor, search, calibrated, **options))
 
     @classmethod
-    def raw(cls, name: str = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
+    def raw(cls, name: DetectorLike = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
         """An agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
 
         Args:
-            name: name or path of the detector, as for `semfov.load_detector`.
+            name: name, path or model of the detector, as for `semfov.load_detector`.
             sensor: name of the sensor (`semfov.sensor.SENSORS`).
             options: options of `semfov.load_detector`.
 
@@ -414,8 +415,7 @@ class ActivePerception(nn.Module):
             _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            one = targets[0] if len(targets) == 1 else None
-            return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             given = _given(worth=worth, duration=duration, **limits)
             return self.head.find_all(_scene(picture, color), targets, **given)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from os import PathLike, fspath
 from typing import Any, Self
 
 import torch
@@ -17,6 +18,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
+from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.episode import Turn, look_by_look
@@ -155,17 +157,19 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                return search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
-            return search_windows(
-                glances,
-                self.evidence,
-                self.classes,
-                index,
-                limits,
-                confirm=confirm,
-                give_up=give_up,
-                closer=closer,
-            )
+                path = search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
+            else:
+                path = search_windows(
+                    glances,
+                    self.evidence,
+                    self.classes,
+                    index,
+                    limits,
+                    confirm=confirm,
+                    give_up=give_up,
+                    closer=closer,
+                )
+        return _with_picture(path, glances, picture)
 
     def find_all(
         self,
@@ -207,7 +211,7 @@ class ZoomAgent(nn.Module):
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
             turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else ())
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence)
         ending: Ending | None = None
         with torch.inference_mode():
             for turn in turns:
@@ -215,7 +219,8 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.seen), path.record)
                 if ending is not None:
                     break
-        return path.record(ending or ("windows" if self.evidence is None else "worth"))
+        record = path.record(ending or ("windows" if self.evidence is None else "worth"))
+        return _with_picture(record, glances, picture)
 
     def explore(
         self,
@@ -268,6 +273,12 @@ def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     return Lattice.over(size, canvas).levels >= 3
 
 
+def _with_picture(path: ZoomPath, glances: LiveGlances, picture: _Picture) -> ZoomPath:
+    """The record with a reduced copy of its picture, and with its file."""
+    file = fspath(picture) if isinstance(picture, str | PathLike) else None
+    return replace(path, photograph=reduced_copy(glances.view.picture), source=file)
+
+
 def search_windows(
     glances: Glances,
     evidence: GlimpseEvidence,
@@ -305,7 +316,7 @@ def search_windows(
         The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
-    path = _Windows(glances, classes, target)
+    path = _Windows(glances, classes, target, (), evidence)
     seen, values = path.seen, path.values
 
     def close_up(box: Tensor) -> Detections:
@@ -395,9 +406,15 @@ class _Windows:
     """
 
     def __init__(
-        self, glances: Glances, classes: tuple[str, ...], target: int | None, targets: tuple[int, ...] = ()
+        self,
+        glances: Glances,
+        classes: tuple[str, ...],
+        target: int | None,
+        targets: tuple[int, ...] = (),
+        evidence: GlimpseEvidence | None = None,
     ) -> None:
         self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
+        self.certainty = None if evidence is None else evidence.certainty
         self.seen: list[Glance] = []
         self.values: list[float] = []
 
@@ -416,5 +433,6 @@ class _Windows:
             glances=tuple(self.seen),
             values=tuple(self.values),
             candidates=merge(self.seen, self.target),
+            certainty=self.certainty,
             ending=ending,
         )

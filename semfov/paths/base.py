@@ -378,6 +378,9 @@ class GazeRecord(Record):
     ending: Ending | None = None
     seconds: tuple[Any, ...] = ()
 
+    how: ClassVar[Literal["fovea", "windows", "head"]]
+    """Kind of look: of a fovea, at windows, or of a head that turns."""
+
     _format: ClassVar[Format]
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
@@ -468,6 +471,18 @@ class GazeRecord(Record):
             target=self.target_name,
             found=None if self.target is None else self.found,
         )
+
+    def compare(self, people: Sequence[Fixations]) -> Mapping[str, tuple[float, float]]:
+        """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
+
+        Args:
+            people: their fixations.
+
+        Returns:
+            Each measure of this record and of the people among themselves; it prints as a table.
+        """
+        found: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
+        return found
 
     @abstractmethod
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:

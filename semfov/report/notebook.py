@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from html import escape
 
-from semfov.paths import HeadPath, Moment, Record, Scanpath, ZoomPath
+from semfov.metrics.scanpath.beside import compare_scanpath
+from semfov.paths import GazeRecord, HeadPath, Moment, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
 from semfov.report.drawing import path_html
 from semfov.report.episode import Pool, episode_data
@@ -87,3 +88,4 @@ draws("plot", Moment, plot_moment)
 draws("animate", Record, animate_looks)
 draws("animate", Scanpath, animate)
 draws("animate", HeadPath, animate_head)
+draws("compare", GazeRecord, compare_scanpath)

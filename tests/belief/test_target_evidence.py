@@ -10,7 +10,6 @@ from semfov import Detections, Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target
-from semfov.belief.target_evidence import Thresholds
 from semfov.errors import InputError
 from tests import small
 
@@ -233,14 +232,6 @@ def test_bad_input(looks, model):
         Target(model).weigh(looks, FIXATIONS, GRID)
     with pytest.raises(InputError, match="fixation"):
         model(looks, FIXATIONS[:2], GRID, 1)
-
-
-def test_thresholds_are_changed_one_by_one():
-    before = Thresholds(0.8, 0.1, 0.3)
-    assert before.changed() == before
-    assert before.changed(confirm=0.0) == Thresholds(0.0, 0.1, 0.3)
-    assert before.changed(give_up=0.2) == Thresholds(0.8, 0.2, 0.3)
-    assert before.changed(place=0.4) == Thresholds(0.8, 0.1, 0.4)
 
 
 def test_the_default_classes_are_those_of_coco():

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Scanpath
-from semfov.belief import Belief, Verification
+from semfov.belief import Belief
 from semfov.belief.observers import Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
 from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
 from tests.decision.test_rule import Nothing, Scripted, Square, cells
+from tests.decision.test_verifier import AT, FromScore
 
 
 class Fine(Square):
@@ -23,24 +24,6 @@ class Fine(Square):
         if found.boxes.numel() and float(found.boxes[0, 0, 2] - found.boxes[0, 0, 0]) < 30:
             return Candidates(found.boxes, found.classes.flip(-1))
         return found
-
-
-class FromScore(Verification):
-    """The probability of the place is the score of the target in the closer look."""
-
-    def forward(self, features):
-        return torch.stack([features[..., 6], features[..., 6]], -1)
-
-
-AT = Thresholds(confirm=0.7, give_up=0.1, place=0.3)
-
-
-@pytest.fixture
-def image():
-    """A red square of 20 pixels in the last cell."""
-    picture = torch.full((3, 120, 160), 0.4)
-    picture[:, 90:110, 130:150] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
-    return picture
 
 
 def agent(observer, detector=None, thresholds=AT):

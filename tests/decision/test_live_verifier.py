@@ -9,7 +9,6 @@ import torch
 from scipy.ndimage import find_objects, label
 
 from semfov import ActivePerception, Detections, Eye, Foveation
-from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
@@ -18,7 +17,7 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
 from tests.decision.test_rule import Scripted
-from tests.decision.test_verifier import AT, GRID, Closer, Told, box_of, look, step
+from tests.decision.test_verifier import AT, GRID, Closer, FromScore, Told, box_of, look, step
 
 SURE, GREY = 0.9, torch.full((3, 120, 160), 0.4)
 
@@ -37,13 +36,6 @@ class Spots(Detector):
         boxes = [[float(x.start), float(y.start), float(x.stop), float(y.stop)] for y, x in places]
         scores = [min(float(red[place].max()), 0.95) for place in places]
         return Candidates(canvas.new_tensor([boxes]), canvas.new_tensor([[[s, 0.95 - s] for s in scores]]))
-
-
-class FromScore(Verification):
-    """The probability of the place, and of presence, is the score of the target in the closer look."""
-
-    def forward(self, features):
-        return torch.stack([features[..., 6], features[..., 6]], -1)
 
 
 class Lasting(Scripted):

@@ -23,10 +23,10 @@ from semfov.decision import (
     strength,
     strongest,
 )
-from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze.policies import NonPredictive, Random
+from tests.small import Coloured
 
 SIZE = (160, 120)
 AT = Thresholds(0.8, 0.1)
@@ -218,18 +218,11 @@ def test_strongest_detection_without_overlapping_detections_is_none():
     assert strongest([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) == (0.0, None)
 
 
-class Square(Detector):
-    """Detects the bounding box of red pixels (class 1) with a high score, and never class 2."""
+class Square(Coloured):
+    """Detects the bounding box of red pixels (class 1) with a high score."""
 
     def __init__(self) -> None:
-        super().__init__("square", ("red", "green"), SIZE)
-
-    def propose(self, canvas):
-        ys, xs = (canvas[0, 0] - canvas[0, 1] > 0.1).nonzero(as_tuple=True)
-        if not len(xs):
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
-        return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.05]]]))
+        super().__init__(size=SIZE, score=0.9)
 
 
 @dataclass(frozen=True)
@@ -275,14 +268,6 @@ class Scripted(Observer):
 def cells(**at):
     """Probabilities of 12 cells: 0.2 unless given."""
     return [at.get(f"c{cell}", at.get("rest", 0.2)) for cell in range(12)]
-
-
-@pytest.fixture
-def image():
-    """A red square in the last cell."""
-    picture = torch.full((3, 120, 160), 0.4)
-    picture[:, 90:110, 130:150] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
-    return picture
 
 
 def agent(observer):

@@ -54,6 +54,13 @@ class Told(Verification):
         return torch.stack([features[..., 6], features[..., 6] / 2], -1)
 
 
+class FromScore(Verification):
+    """Gives the score of the target in the closer look as the probability of the place, and of presence."""
+
+    def forward(self, features):
+        return torch.stack([features[..., 6], features[..., 6]], -1)
+
+
 class Closer:
     """Closer looks with given scores by cell; remembers which cells were examined."""
 

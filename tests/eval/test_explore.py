@@ -2,21 +2,18 @@
 
 import csv
 import json
-import re
 from dataclasses import replace
 
 import pytest
 import torch
 
-from eval.explore import explore, main
+from eval.explore import explore
 from eval.explore.config import ExploreConfig
 from eval.explore.references import FUSED, PAINTED
 from eval.explore.run import ExploreRun
 from semfov import observers
-from semfov.gaze.policies import POLICIES
 from semfov.gaze.saliency import VOCUS2
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SaliencyConfig
-from semfov.runs.presets import presets
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 
 pytestmark = pytest.mark.weights
@@ -163,16 +160,3 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     assert key() == run.saliency_stores["vocus2"].key
     # The whole photograph looks the same to every sensor.
     assert key(view="picture", sensor=other) == key(view="picture")
-
-
-def test_help_names_every_preset(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--help"])
-    assert stopped.value.code == 0
-    explained = "".join(re.search(r".*(--policies \[ITEM.*?\(type:)", capsys.readouterr().out, re.DOTALL)[1].split())
-    for name, preset in presets("exploration").items():
-        if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
-            continue  # a policy registered by another test
-        assert f"`{name.removesuffix('-raw').removesuffix('-calibrated')}`" in explained, name
-    for ending in ("-raw", "-calibrated"):
-        assert f"`{ending}`" in explained

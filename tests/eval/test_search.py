@@ -2,21 +2,18 @@
 
 import csv
 import json
-import re
-from dataclasses import asdict
 
 import pytest
 import torch
 import yaml
 
-from eval.search import main, search
+from eval.search import search
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.detection import Detections
-from semfov.gaze.policies import POLICIES
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.looks import look_from
-from semfov.runs.presets import label, presets
+from semfov.runs.presets import label
 from semfov.runs.store import cell_store
 
 pytestmark = pytest.mark.weights
@@ -98,48 +95,3 @@ def test_stored_looks_equal_new_looks_and_damaged_files_are_refused(finished):
     other = cell_store(path.parent.parent, {"another": "eye"}, 4, 3)
     other.folder = run.store.folder
     assert other.load(digest) == {}
-
-
-def test_help_and_print_config(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--help"])
-    assert stopped.value.code == 0
-    text = capsys.readouterr().out
-    for word in ("--sensor.sigma", "width of the fovea", "--config"):
-        assert word in text
-    explained = "".join(re.search(r".*(--policies \[ITEM.*?\(type:)", text, re.DOTALL)[1].split())
-    for name, preset in presets("search").items():
-        if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
-            continue  # a policy registered by another test
-        alone = re.sub("-(raw|calibrated|learned)$", "", name)
-        assert f"`{alone}`" in explained, name
-    assert "`-raw`or`-calibrated`" in explained
-    assert "Thelastfouralsotake`-learned`" in explained
-    learned = [name for name in presets("search") if name.endswith("-learned")]
-    assert learned == [
-        "foveal-hit-learned",
-        "place-information-learned",
-        "entropy-limit-learned",
-        "ideal-observer-learned",
-        "maximum-a-posteriori-learned",
-    ]
-    with pytest.raises(SystemExit):
-        main(["--sensor.sigma", "50", "--print_config"])
-    printed = yaml.safe_load(capsys.readouterr().out)
-    assert printed["sensor"]["sigma"] == 50
-
-
-def test_the_example_of_a_policy_in_the_help_is_valid(capsys):
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    text = " ".join(capsys.readouterr().out.replace("-\n", "-").split())
-    mapping = re.search(r"mapping of settings such as `(\{.*?\})`", text)[1]
-    with pytest.raises(SystemExit):
-        main(["--policies", f"[{mapping}]", "--print_config"])
-    (policy,) = yaml.safe_load(capsys.readouterr().out)["policies"]
-    assert label(PolicyConfig(**policy), "search") == "non-predictive-calibrated, tempering 0.25"
-    with pytest.raises(SystemExit):
-        main(["--policies.help"])
-    settings = capsys.readouterr().out
-    for name in asdict(PolicyConfig("random")):
-        assert name in settings

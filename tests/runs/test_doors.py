@@ -124,14 +124,3 @@ def test_invalid_command_lines_are_refused_before_any_work(arguments, message, c
     assert error.startswith(f"error: {message}")
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir()), "nothing is written"
-
-
-def test_help_shows_ranges(capsys):
-    from eval.search import main
-
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    assert "(type: int from 1 to 10,000, default: 10)" in text
-    assert "(type: float from 0 to 1, default: 0.02)" in text
-    assert "Annotated" not in text

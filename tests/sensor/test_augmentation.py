@@ -146,12 +146,6 @@ def test_works_in_a_data_loader():
     assert next(iter(loader))[0].shape == (2, 3, 16, 20)
 
 
-def test_repr_shows_the_settings():
-    text = repr(RandomFoveation((3.0, 30.0), levels=4))
-    assert text.startswith("RandomFoveation(sigma=(3.0, 30.0), p=0.5, ")
-    assert "levels=4, growth=2.0, convention=kornia" in text
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

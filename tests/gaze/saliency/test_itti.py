@@ -193,7 +193,3 @@ def test_bad_input() -> None:
         dyadic_pyramid(torch.zeros(1, 3, 8, 8), -1)
     with pytest.raises(InputError, match="intensity"):
         orientation_energy(torch.zeros(1, 3, 8, 8))
-
-
-def test_repr_shows_the_settings() -> None:
-    assert repr(IttiKoch()) == "IttiKoch(normalise=True)"

@@ -147,7 +147,7 @@ def test_saliency_is_linear_in_contrast(photograph: np.ndarray) -> None:
 def test_gradients(fusion: str, normalise: bool, color_space: str) -> None:
     image = torch.rand(1, 3, 6, 7, dtype=torch.float64, requires_grad=True)
     model = VOCUS2(1.0, 2.0, fusion=fusion, normalise=normalise, color_space=color_space)
-    assert torch.autograd.gradcheck(model, image)
+    assert torch.autograd.gradcheck(model, image, fast_mode=True)
 
 
 def test_the_image_may_be_a_view() -> None:
@@ -188,8 +188,3 @@ def test_bad_image() -> None:
         VOCUS2()(torch.zeros(3, 8, 8))
     with pytest.raises(InputError, match="channels"):
         twin_pyramids(torch.zeros(1, 3, 0, 8))
-
-
-def test_repr_shows_the_settings() -> None:
-    expected = "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean', color_space='opponent')"
-    assert repr(VOCUS2(3, 13)) == expected
