@@ -334,8 +334,9 @@ class ActivePerception(nn.Module):
                 the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
                 0.5 for a belief without thresholds.
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes the
-                usual number. 0 decides without them, as does an agent without a model of verification.
+            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes 2 in
+                a photograph, and as many as there are passes for in a large picture. 0 decides without them, as does
+                an agent without a model of verification.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
@@ -427,8 +428,7 @@ class ActivePerception(nn.Module):
             _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            one = targets[0] if len(targets) == 1 else None
-            return self.fovea.find_all(image, one, bounds, shifts=usual if shifts is None else shifts)
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             given = _given(worth=worth, duration=duration, **limits)
             return self.head.find_all(_scene(picture, color), targets, **given)

@@ -416,3 +416,13 @@ def test_parts_that_were_fitted_for_another_sensor_are_refused():
     model.metadata.update(sensor=settings["sensor"])
     with pytest.raises(InputError, match=r"growth is 2\.0, the model was fitted with 1\.0"):
         ActivePerception(squares_eye(), (Semantic(3, model), NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
+
+
+def test_all_objects_are_found_by_the_fovea(agent, image):
+    record = agent.find_all(image, ["red", "green"], how="fovea", passes=6)
+    assert (record.how, record.passes, record.target, record.decision) == ("fovea", 6, None, None)
+    assert set(record.objects.labels.tolist()) == {1, 2}
+    assert record.objects.labels.bincount().tolist()[1:] == list(record.expected.values())
+    alone = agent.find_all(image, "green", how="fovea", passes=6).objects
+    assert set(alone.labels.tolist()) == {2}
+    assert any(box == pytest.approx([130, 100, 140, 110], abs=6) for box in alone.boxes.tolist())
