@@ -63,7 +63,7 @@ def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
 
 
 class ModelFolder:
-    """The result of `train.fit_detector`: models for one detector and one sensor, and which of them the agent uses.
+    """The result of `semfov fit`: models for one detector and one sensor, and which of them the agent uses.
 
     The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
     The verification is compared with the same agent without closer looks.

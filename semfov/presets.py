@@ -13,7 +13,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
-from semfov.detection.load import load_detector
+from semfov.detection.load import DetectorLike, load_detector
 from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
@@ -76,7 +76,7 @@ def published_arguments(
     return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}
 
 
-def raw_arguments(name: str, sensor: str, **options: Any) -> dict[str, Any]:
+def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:
     """Arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)

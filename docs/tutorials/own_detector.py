@@ -117,7 +117,7 @@ print(scanpath)
 viz.plot_episode(scanpath)
 
 # %% [markdown]
-# For practical use, fit on thousands of photographs: `python -m train.fit_detector` fits everything that the
+# For practical use, fit on thousands of photographs: `semfov fit` fits everything that the
 # recommended agent needs ([your detector in three commands](../detectors.md#your-detector-in-three-commands)).
 #
 # Next: [your policy](own_policy.py).

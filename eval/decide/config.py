@@ -34,7 +34,7 @@ class DecideConfig(ScenesConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
-        models: folder written by `train.fit_detector`, which defines detector, sensor, grid, learned evidence and
+        models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
             verification.
     """
 

@@ -4,7 +4,7 @@ Without arguments it searches the embedded scenes, which need no data set. With 
 
     python -m eval.search --data.root val2017 --data.annotations instances_val2017.json --out runs/val
     python -m eval.search --config configs/paper_search.yaml --data.root ... --data.annotations ...
-    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # a folder of train.fit_detector
+    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # a folder of semfov fit
 
 To continue a stopped run, give the same command again.
 """

@@ -31,7 +31,7 @@ class SearchConfig(RunConfig):
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
         scanpaths: number of episodes to draw as figures.
-        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
+        models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
     """
 
     policies: tuple[str | PolicyConfig, ...] = (

@@ -169,20 +169,22 @@ class FoveaAgent:
         scanpath, ended, _ = episode.run(start, shifts, seed)
         return replace(scanpath, ending="worth") if ended else scanpath
 
-    def find_all(self, image: Tensor, target: int | None, limits: EpisodeLimits, *, shifts: int = 20) -> Scanpath:
-        """Look for all objects of a class, or of all classes; see `ActivePerception.find_all`.
+    def find_all(self, image: Tensor, targets: tuple[int, ...], limits: EpisodeLimits, *, shifts: int = 20) -> Scanpath:
+        """Look for all objects of some classes, or of all classes; see `ActivePerception.find_all`.
 
         Args:
             image: `(1, 3, H, W)`.
-            target: class 1..K; None for all classes.
+            targets: classes 1..K; none stand for all classes.
             limits: limits of the episode.
             shifts: largest number of gaze shifts.
 
         Returns:
             The scanpath, without a decision.
         """
-        strategy = self.exploring if target is None else self.searching
-        return _Episode(self, image, self.grid(image), strategy, target, limits, None, None).run(None, shifts, 0)[0]
+        one = targets[0] if len(targets) == 1 else None
+        strategy = self.exploring if one is None else self.searching
+        episode = _Episode(self, image, self.grid(image), strategy, one, limits, None, None)
+        return replace(episode.run(None, shifts, 0)[0], target=None, targets=targets)
 
     def grid(self, image: Tensor) -> Grid:
         """The grid of the belief over an image `(1, 3, H, W)`."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from os import PathLike, fspath
 from typing import Any, Self
 
 import torch
@@ -12,11 +13,12 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
-from semfov.decision import MOST_CLOSER, OUTCOMES, Decision, Verifier, check_thresholds, settle
+from semfov.decision import OUTCOMES, Decision, Verifier, check_thresholds, settle
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
+from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.episode import Turn, look_by_look
@@ -31,6 +33,9 @@ from semfov.zoom.slices import ranked, usual_slices
 
 USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
+
+CLOSER = 100
+"""Default for the largest number of closer looks: as many as there are passes for."""
 
 NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
@@ -120,7 +125,7 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST_CLOSER,
+        closer: int = CLOSER,
     ) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one (`search_windows`).
 
@@ -155,17 +160,19 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                return search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
-            return search_windows(
-                glances,
-                self.evidence,
-                self.classes,
-                index,
-                limits,
-                confirm=confirm,
-                give_up=give_up,
-                closer=closer,
-            )
+                path = search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
+            else:
+                path = search_windows(
+                    glances,
+                    self.evidence,
+                    self.classes,
+                    index,
+                    limits,
+                    confirm=confirm,
+                    give_up=give_up,
+                    closer=closer,
+                )
+        return _with_picture(path, glances, picture)
 
     def find_all(
         self,
@@ -207,7 +214,7 @@ class ZoomAgent(nn.Module):
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
             turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else ())
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence)
         ending: Ending | None = None
         with torch.inference_mode():
             for turn in turns:
@@ -215,7 +222,8 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.seen), path.record)
                 if ending is not None:
                     break
-        return path.record(ending or ("windows" if self.evidence is None else "worth"))
+        record = path.record(ending or ("windows" if self.evidence is None else "worth"))
+        return _with_picture(record, glances, picture)
 
     def explore(
         self,
@@ -268,6 +276,12 @@ def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     return Lattice.over(size, canvas).levels >= 3
 
 
+def _with_picture(path: ZoomPath, glances: LiveGlances, picture: _Picture) -> ZoomPath:
+    """The record with a reduced copy of its picture, and with its file."""
+    file = fspath(picture) if isinstance(picture, str | PathLike) else None
+    return replace(path, photograph=reduced_copy(glances.view.picture), source=file)
+
+
 def search_windows(
     glances: Glances,
     evidence: GlimpseEvidence,
@@ -277,13 +291,14 @@ def search_windows(
     *,
     confirm: float | None = None,
     give_up: float | None = None,
-    closer: int = MOST_CLOSER,
+    closer: int = CLOSER,
 ) -> ZoomPath:
     """Search a picture for one object of a class and decide whether it is there.
 
     Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
-    such a place (`semfov.decision.Verifier`). Without closer looks it is `found` when the picture holds it with
-    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+    such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without closer looks it is
+    `found` when the picture holds it with a probability of at least `confirm` and a detection shows it
+    (`semfov.decision.settle`).
 
     When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
     if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
@@ -305,7 +320,7 @@ def search_windows(
         The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
-    path = _Windows(glances, classes, target)
+    path = _Windows(glances, classes, target, (), evidence)
     seen, values = path.seen, path.values
 
     def close_up(box: Tensor) -> Detections:
@@ -326,6 +341,7 @@ def search_windows(
         facts = facts or SearchFacts(turn.belief)
         facts.add(glance)
         path.add(turn)
+        ending = limits.reached(len(seen), path.record)
         presence = None
         if facts.detected or ahead < thresholds.give_up:  # otherwise no probability ends the search
             presence = facts.presence(ahead)
@@ -333,12 +349,13 @@ def search_windows(
                 state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([ahead])
                 ended = int(settle(*state, thresholds))
             else:
-                room = limits.room(len(seen))
                 look = WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
-                verifier.see(look, last=ahead == 0 or room <= 1)
-                values += [place.probability for place in verifier.look_closely(room)]
+                verifier.see(look, last=ahead == 0 or limits.room(len(seen)) <= 1)
+                while ending is None and verifier.candidate is not None:
+                    values.append(verifier.candidate.probability)
+                    verifier.look()
+                    ending = limits.reached(len(seen), path.record)
                 ended = verifier.outcome()
-        ending = limits.reached(len(seen), path.record)
         if ended or ending is not None:
             break
     assert facts is not None
@@ -395,9 +412,15 @@ class _Windows:
     """
 
     def __init__(
-        self, glances: Glances, classes: tuple[str, ...], target: int | None, targets: tuple[int, ...] = ()
+        self,
+        glances: Glances,
+        classes: tuple[str, ...],
+        target: int | None,
+        targets: tuple[int, ...] = (),
+        evidence: GlimpseEvidence | None = None,
     ) -> None:
         self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
+        self.certainty = None if evidence is None else evidence.certainty
         self.seen: list[Glance] = []
         self.values: list[float] = []
 
@@ -416,5 +439,6 @@ class _Windows:
             glances=tuple(self.seen),
             values=tuple(self.values),
             candidates=merge(self.seen, self.target),
+            certainty=self.certainty,
             ending=ending,
         )

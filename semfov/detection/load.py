@@ -1,4 +1,4 @@
-"""Loading of detectors by name or file: `load_detector`."""
+"""Loading of detectors by name, file or model: `load_detector`."""
 
 from collections.abc import Sequence
 from os import PathLike, fspath
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from semfov.detection.architectures import ARCHITECTURES
 from semfov.detection.coco_classes import COCO_CLASSES
@@ -13,37 +14,52 @@ from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.detection.darknet_weights import read_weights
 from semfov.detection.detector import Detector
+from semfov.detection.modules import comes_from
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import YoloV3
-from semfov.errors import DataError, InputError, lookup
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import check_regular
 
 _WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; use load_detector('x.cfg', weights='{}')"
+_PICKLE = (
+    "detector: expected a file that can be read without running code from it, got {0}; export the model to ONNX, for "
+    "Ultralytics with: yolo export model={0} format=onnx; for other modules with: torch.onnx.export(model, image, "
+    "'{1}.onnx'). A state dict of a torchvision model is read by load_detector('torchvision:MODEL', weights='{0}', "
+    "classes=[...])"
+)
+
+DetectorLike = str | PathLike[str] | nn.Module
+"""What `load_detector` takes: the name or file of a detector, a `Detector`, or a model of another library."""
 
 
-def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
-    """Load a detector by its name or its file, ready for inference.
+def load_detector(model: DetectorLike, **options: Any) -> Detector:
+    """Load a detector by its name or its file, or make one of a model in memory.
 
     - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: published Darknet networks; options of `load_yolo`.
     - A path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
     - A path that ends in `.onnx`: your own ONNX model; options of `semfov.detection.onnx.load_onnx`.
     - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`: published ONNX models; options of `semfov.detection.onnx.load_onnx`.
     - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.load_torchvision`.
+    - `"hf:<owner>/<name>"`: models of Hugging Face's hub; options of `semfov.detection.transformers.load_hub`.
+    - A model of torchvision, transformers or Ultralytics: options of `wrap_torchvision`, `wrap_transformers` and
+      `wrap_ultralytics` in the modules of these names in `semfov.detection`.
+    - A `Detector`: returned as it is.
 
     The weights of a named detector are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
+    Names are the same in upper and lower case.
 
     Args:
-        name_or_path: name of the detector, or path of its `.cfg` or `.onnx` file.
+        model: name of the detector, path of its `.cfg` or `.onnx` file, or a model.
         **options: options of the loader of this kind of detector.
 
     Returns:
         The detector.
 
     Raises:
-        InputError: the name or an option is unknown.
+        InputError: the name, the model or an option is unknown.
         DataError: the weights are damaged, or cannot be downloaded.
 
     Example::
@@ -51,7 +67,12 @@ def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector
         detector = load_detector("yolox-nano", threshold=0.05)
         detections = detector(images)  # (B, 3, H, W), RGB in [0, 1]
     """
-    name = fspath(name_or_path)
+    if isinstance(model, Detector):
+        check(not options, "options", "none for a detector that is made already", ", ".join(options))
+        return model
+    if not isinstance(model, str | PathLike):
+        return load_module(model, **options)
+    name = known_name(model)
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
         from semfov.detection.onnx import load_onnx
 
@@ -60,11 +81,44 @@ def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector
         from semfov.detection.torchvision import load_torchvision
 
         return load_torchvision(name, **options)
-    if name.endswith(".weights"):
-        raise InputError(_WEIGHTS_ALONE.format(name))
-    if not name.endswith(".cfg"):
-        lookup(name, WEIGHTS, "detector")
+    if name.startswith("hf:"):
+        from semfov.detection.transformers import load_hub
+
+        return load_hub(name, **options)
     return load_yolo(name, **options)
+
+
+def load_module(module: nn.Module, **options: Any) -> Detector:
+    """Make a detector of a torch module of another library; its library is recognised by the module of its class.
+
+    The module itself is used, not a copy, and set to `eval` mode.
+
+    Args:
+        module: a detection model of torchvision, an object detection model of transformers, or a model of Ultralytics.
+        options: options of `wrap_torchvision`, `wrap_transformers` or `wrap_ultralytics`.
+
+    Returns:
+        The detector, in `eval` mode.
+
+    Raises:
+        InputError: the library is unknown, or an option does not fit the module.
+    """
+    if comes_from(module, "torchvision.models.detection"):
+        from semfov.detection.torchvision import wrap_torchvision
+
+        return wrap_torchvision(module, **options)
+    if comes_from(module, "transformers.models"):
+        from semfov.detection.transformers import wrap_transformers
+
+        return wrap_transformers(module, **options)
+    if comes_from(module, "ultralytics"):
+        from semfov.detection.ultralytics import wrap_ultralytics
+
+        return wrap_ultralytics(module, **options)
+    raise InputError(
+        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(module).__module__}."
+        f"{type(module).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
+    )
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
@@ -80,21 +134,45 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
         InputError: no detector has this name.
         DataError: the file does not exist.
 
-    >>> check_detector("yolox-nano")[:2]
+    >>> check_detector("YOLOX-Nano")[:2]
     ('person', 'bicycle')
     """
-    name = fspath(name_or_path)
+    name = known_name(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         if not Path(name).exists():
             raise DataError(f"detector: no such file: {name}; check the path")
         check_regular(name)
-        return None
-    if name.startswith("torchvision:"):
-        return None
-    if name.endswith(".weights"):
-        raise InputError(_WEIGHTS_ALONE.format(name))
-    lookup(name, WEIGHTS, "detector")
-    return COCO_CLASSES
+    return COCO_CLASSES if name in WEIGHTS else None
+
+
+def known_name(name_or_path: str | PathLike[str]) -> str:
+    """Return a name as it is written in tables, and the path of a file as it is.
+
+    Args:
+        name_or_path: name of the detector in any case, or path of its file.
+
+    Returns:
+        The name or the path.
+
+    Raises:
+        InputError: no detector has this name, or its file is not one that can be read.
+
+    >>> known_name("YOLOv3-tiny"), known_name("Mine.onnx")
+    ('yolov3-tiny', 'Mine.onnx')
+    """
+    given = fspath(name_or_path)
+    if given.endswith((".onnx", ".cfg")):
+        return given
+    if given.endswith(".weights"):
+        raise InputError(_WEIGHTS_ALONE.format(given))
+    if given.endswith((".pt", ".pth")):
+        raise InputError(_PICKLE.format(given, Path(given).stem))
+    lower = given.lower()
+    if lower.startswith("torchvision:"):
+        return lower
+    if lower.startswith("hf:"):
+        return f"hf:{given[3:]}"
+    return lower if lower in WEIGHTS else lookup(given, WEIGHTS, "detector")
 
 
 def load_yolo(

@@ -15,7 +15,7 @@ from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.onnx_file import check_canvas, check_elements
 from semfov.detection.onnx_recognition import HEADS, Signature, recognise
-from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.onnx_settings import read_settings
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import Preprocessing
@@ -144,7 +144,8 @@ class OnnxDetector(Detector):
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
-        return super().settings() | own
+        providers = self.session.providers
+        return super().settings() | own | ({} if providers is None else {"providers": list(providers)})
 
 
 def load_onnx(
@@ -164,6 +165,7 @@ def load_onnx(
     per_class: bool = False,
     threads: int | None = None,
     device: torch.device | str = "cpu",
+    providers: Sequence[Provider] | None = None,
 ) -> OnnxDetector:
     """Load a detector from an ONNX file, or a published one by its name (`ONNX_MODELS`).
 
@@ -189,6 +191,8 @@ def load_onnx(
         per_class: suppress only boxes of the same class (`Selection`).
         threads: number of threads of onnxruntime; None for `torch.get_num_threads()`.
         device: device of onnxruntime.
+        providers: execution providers of onnxruntime in order, each by its name or as `(name, options)`, instead of
+            those of `device`.
 
     Returns:
         The detector.
@@ -199,7 +203,7 @@ def load_onnx(
     """
     name = fspath(name_or_path)
     path = _locate(name, weights)
-    session = OnnxSession(path, threads=threads, device=device)
+    session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(path, session.metadata)
     options = {
         "head": head,

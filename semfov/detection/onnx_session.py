@@ -1,6 +1,6 @@
 """An ONNX model in onnxruntime, called with torch tensors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,10 @@ EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+Provider = str | tuple[str, Mapping[str, Any]]
+"""An execution provider of onnxruntime: its name, alone or with its options."""
+
+
 class OnnxSession:
     """An inference session of one ONNX file.
 
@@ -30,6 +34,8 @@ class OnnxSession:
         path: the model.
         threads: number of threads of an operation; None for `torch.get_num_threads()`.
         device: `"cpu"`, or `"cuda"` where onnxruntime has the CUDA provider.
+        providers: execution providers of onnxruntime in order, each by its name or as `(name, options)`, instead of
+            those of `device`.
         spinning: let idle threads spin; for measurements only.
         checked: whether the file is checked before it is opened (`semfov.detection.onnx_file`).
 
@@ -51,6 +57,7 @@ class OnnxSession:
         *,
         threads: int | None = None,
         device: torch.device | str = "cpu",
+        providers: Sequence[Provider] | None = None,
         spinning: bool = False,
         checked: bool = True,
     ) -> None:
@@ -60,6 +67,7 @@ class OnnxSession:
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
         self.device = torch.device(device)
+        self.providers = None if providers is None else tuple(providers)
         options = ort.SessionOptions()
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
@@ -68,9 +76,9 @@ class OnnxSession:
         if checked:
             check_file(self.path)
         try:
-            providers = _providers(self.device)
+            chosen = _providers(self.device) if self.providers is None else _known_providers(self.providers)
             # onnxruntime's fallback would print messages and try the same again.
-            self._session = ort.InferenceSession(fspath(path), options, providers=providers, disable_fallback=1)
+            self._session = ort.InferenceSession(fspath(path), options, providers=chosen, disable_fallback=1)
         except InputError:
             raise
         except Exception as error:  # onnxruntime's own exceptions share no base class
@@ -144,11 +152,24 @@ class OnnxSession:
         return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (self.path, self.threads, self.device, self.spinning)
+        return _reopen, (self.path, self.threads, self.device, self.providers, self.spinning)
 
 
-def _reopen(path: Path, threads: int, device: torch.device, spinning: bool) -> OnnxSession:
-    return OnnxSession(path, threads=threads, device=device, spinning=spinning, checked=False)
+def _reopen(
+    path: Path, threads: int, device: torch.device, providers: Sequence[Provider] | None, spinning: bool
+) -> OnnxSession:
+    return OnnxSession(path, threads=threads, device=device, providers=providers, spinning=spinning, checked=False)
+
+
+def _known_providers(wanted: Sequence[Provider]) -> list[Any]:
+    """The execution providers, all of which onnxruntime has."""
+    import onnxruntime as ort
+
+    have = ort.get_available_providers()
+    names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
+    missing = [name for name in names if name not in have]
+    check(bool(names) and not missing, "providers", f"some of {', '.join(have)}", ", ".join(missing) or "none")
+    return list(wanted)
 
 
 def _providers(device: torch.device) -> list[Any]:

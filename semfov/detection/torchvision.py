@@ -15,10 +15,11 @@ from torch.nn import functional as F
 
 from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.detector import Detector, check_images
+from semfov.detection.modules import module_digest
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
-from semfov.detection.torchvision_heads import Raw, head_of
+from semfov.detection.torchvision_heads import Raw, head_of, output_count
 from semfov.errors import DataError, InputError, check, check_shape, lookup
 from semfov.io.files import sha256
 
@@ -151,6 +152,58 @@ class TorchvisionDetector(Detector):
         transform: Any = self.model.transform
         sizes = {"min_size": list(transform.min_size), "max_size": transform.max_size}
         return super().settings() | ({} if self.stretch else sizes)
+
+
+def wrap_torchvision(
+    model: nn.Module,
+    *,
+    classes: Sequence[str] | None = None,
+    name: str = "torchvision",
+    first: int = 1,
+    background: BackgroundPolicy | None = None,
+    threshold: float = 0.02,
+    iou: float = 0.5,
+    limit: int = 100,
+    per_class: bool = False,
+    device: torch.device | str | None = None,
+) -> TorchvisionDetector:
+    """Make a detector of a torchvision detection model.
+
+    Args:
+        model: the model.
+        classes: names of the outputs after the first; None for a model with the 91 outputs of torchvision's own weights
+            on COCO.
+        name: name of the model in tables and in fitted models.
+        first: number of outputs before the first class, 1 or 0 (`TorchvisionDetector`).
+        background: background policy of the scores (`semfov.detection.score_vectors`).
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        device: device of the model; None leaves it where it is.
+
+    Returns:
+        The detector, in `eval` mode.
+
+    Raises:
+        InputError: it is another model, or `classes` is missing.
+    """
+    if classes is None:
+        from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
+
+        names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+        count = output_count(model)
+        check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
+        classes = names[first:]
+    return TorchvisionDetector(
+        model if device is None else model.to(device),
+        classes,
+        name=name,
+        first=first,
+        background=background,
+        selection=Selection(threshold, iou, limit, per_class),
+        digest=module_digest(model),
+    ).eval()
 
 
 def load_torchvision(

@@ -110,3 +110,18 @@ def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | N
         if isinstance(model, kind):
             return function, softmax
     return None
+
+
+def output_count(model: nn.Module) -> int | None:
+    """The number of a model's outputs, background included; None where its head is not one of torchvision's."""
+    for path in (
+        "roi_heads.box_predictor.cls_score.out_features",
+        "head.classification_head.num_classes",
+        "head.classification_head.num_columns",
+    ):
+        found: Any = model
+        for part in path.split("."):
+            found = getattr(found, part, None)
+        if isinstance(found, int):
+            return found
+    return None

@@ -42,7 +42,7 @@ def fit_detector(
 ) -> ActivePerception:
     """Fit all models that the recommended agent needs to a detector, and return the agent.
 
-    This is `python -m train.fit_detector` as a function. The detector looks at every photograph from every cell. Then
+    This is `semfov fit` as a function. The detector looks at every photograph from every cell. Then
     an observation model, the exponent of its likelihoods, target evidence, the verification of targets by closer looks
     and a map of all classes are fitted. Each of them is compared with raw scores on held-out photographs, and the
     verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent

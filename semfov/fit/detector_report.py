@@ -160,7 +160,7 @@ def next_commands(config: FitDetectorConfig, run: Looking) -> str:
     quoted = f'"{target}"' if " " in target else target
     return "\n".join(
         [
-            f"  python -m eval.demo PHOTO.jpg --target {quoted} --models {out}",
+            f"  semfov search PHOTO.jpg --target {quoted} --models {out}",
             f"  python -m eval.search --models {out} --data.root PHOTOS --data.annotations instances.json",
         ]
     )

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
@@ -16,6 +16,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.errors import check
 from semfov.fit.outputs import training_of, write_outputs
 from semfov.fit.settings import FitConfig
+from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_choice import choose_foresight, choose_patience, open_all
 from semfov.fit.windows_decision import fit_judge, judge_searches, search_mosaics
 from semfov.fit.windows_evidence import (
@@ -44,7 +45,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.survey import Survey
 
-RefitPart = Literal["decision", "survey", "verification"]
+RefitPart = Literal["decision", "survey", "verification", "certainty"]
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,9 @@ class FitZoomConfig(FitConfig, WorkConfig):
         place: least probability that the target is at a place, for a closer look there when no other look follows.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
         refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
-            probabilities after closer looks at places that seem to hold the target, and `survey`, the number of objects
-            of any class that closer looks find. The verification has to follow new decisions; without it they are made
-            without closer looks.
+            probabilities after closer looks at places that seem to hold the target, `survey`, the number of objects
+            of any class that closer looks find, and `certainty`, the probability that an object is there. The
+            verification has to follow new decisions; without it they are made without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
@@ -98,7 +99,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
     lost: Share = 0.02
     place: Share = 0.2
     evidence: Path | None = None
-    refit: tuple[RefitPart, ...] = ("decision", "verification")
+    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300
@@ -110,6 +111,9 @@ DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms",
 
 VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
 """Settings that the verification depends on."""
+
+COUNTING = ("searched", "judged", "passes", "tile", "seed")
+"""Settings that the certainty depends on."""
 
 SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
@@ -187,7 +191,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     parts: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[RefitPart] = set(config.refit) if config.evidence else {"decision", "survey", "verification"}
+    refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
     examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
     if config.evidence is None:
         model = fit_looks(config, eye, mosaics, examples)
@@ -215,6 +219,11 @@ def fit_zoom(config: FitZoomConfig) -> None:
         parts += ["Closer looks:", "", fit_closer(model, mosaics, opened, config)]
         if model.verification is not None:
             model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+    if "certainty" in refit:
+        prepare_worker()
+        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+        parts += certainty_again(model, mosaics, opened, passes=config.passes)
+        model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)

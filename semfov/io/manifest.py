@@ -149,7 +149,7 @@ class Manifest:
         return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **known)
 
 
-_AGAIN = "run python -m train.fit_detector again, or copy the folder again"
+_AGAIN = "run semfov fit again, or copy the folder again"
 
 
 def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
@@ -183,9 +183,7 @@ def _read(path: Path) -> dict[str, Any]:
             raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}; {_AGAIN}")
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise DataError(
-            f"{path}: no such file; expected a folder of models that python -m train.fit_detector wrote"
-        ) from None
+        raise DataError(f"{path}: no such file; expected a folder of models that semfov fit wrote") from None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not a readable JSON file ({' '.join(str(error).split())}); {_AGAIN}") from None
     if not isinstance(record, dict):

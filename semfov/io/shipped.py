@@ -15,9 +15,9 @@ def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
         The command line.
 
     >>> fit_command("mine.onnx")
-    'python -m train.fit_detector mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'
+    'semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'
     """
-    return f"python -m train.fit_detector {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
+    return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
 
 
 def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:

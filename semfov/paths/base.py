@@ -158,17 +158,18 @@ class Record(Conversion):
     def refuted(self) -> list[CloseUp]:
         """The closer looks that did not confirm that the target is there."""
         boxes = [place.box for place in self._confirmations()]
-        return [look for look in self._closer() if not any(look.box.equal(box) for box in boxes)]
+        return [look for look in self.closer_looks if not any(look.box.equal(box) for box in boxes)]
 
     def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self._decision_in_picture(), self.target, self._closer(), self._last())
+        return places_confirmed(self._decision_in_picture(), self.target, self.closer_looks, self._last())
 
     def _last(self) -> int:
         """Number of the last look."""
         return 0
 
-    def _closer(self) -> Sequence[CloseUp]:
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
         """The closer looks."""
         return ()
 
@@ -378,6 +379,9 @@ class GazeRecord(Record):
     ending: Ending | None = None
     seconds: tuple[Any, ...] = ()
 
+    how: ClassVar[Literal["fovea", "windows", "head"]]
+    """Kind of look: of a fovea, at windows, or of a head that turns."""
+
     _format: ClassVar[Format]
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
@@ -429,7 +433,8 @@ class GazeRecord(Record):
         """Number of the last look."""
         return len(self) - 1
 
-    def _closer(self) -> Sequence[CloseUp]:
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
         """The closer looks."""
         return self.closer
 
@@ -468,6 +473,18 @@ class GazeRecord(Record):
             target=self.target_name,
             found=None if self.target is None else self.found,
         )
+
+    def compare(self, people: Sequence[Fixations]) -> Mapping[str, tuple[float, float]]:
+        """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
+
+        Args:
+            people: their fixations.
+
+        Returns:
+            Each measure of this record and of the people among themselves; it prints as a table.
+        """
+        found: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
+        return found
 
     @abstractmethod
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:

@@ -1,7 +1,7 @@
-"""A registry of functions that draw records.
+"""A registry of functions that draw records, or compare them.
 
-Imports run one way, and the rooms that draw records come after this one. They register their functions here, and
-records call them by name.
+Imports run one way, and the rooms that draw and compare records come after this one. They register their functions
+here, and records call them by name.
 """
 
 from __future__ import annotations

@@ -95,6 +95,7 @@ class HeadPath(GazeRecord):
     maps: Tensor
     values: tuple[float, ...] = ()
 
+    how = "head"
     _format = _FORMAT
 
     @property

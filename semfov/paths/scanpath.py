@@ -102,6 +102,7 @@ class Scanpath(GazeRecord):
     seconds: tuple[Mapping[str, float], ...] = ()
     stimulus: Stimulus | None = None
 
+    how = "fovea"
     _format = _FORMAT
 
     def __len__(self) -> int:

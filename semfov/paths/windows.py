@@ -16,6 +16,7 @@ from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
+from semfov.zoom.certainty import Certainty
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 
@@ -46,6 +47,8 @@ _FORMAT = Format.of(
     {
         "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
         "windows": Array(Object(_WINDOW, None, tuple(_WINDOW)), "n"),
+        # Files of earlier versions have no certainty.
+        "certainty": Maybe(pair(Number())),
     },
     endings=("decision", "detection", "worth", "passes", "windows", "seconds", "stopped"),
     closer=("number", "target", "place", "presence"),
@@ -66,6 +69,7 @@ class ZoomPath(GazeRecord):
         glances: looks in their order, the overview first. In a path from a file they have no gist.
         values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
             probability that the target is at the place.
+        certainty: probability that an object is there, by its score; None if it is not known.
         candidates: objects merged from all looks (`semfov.zoom.merge`), of all scores from 0.05 on.
         detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
@@ -84,9 +88,11 @@ class ZoomPath(GazeRecord):
     glances: tuple[Glance, ...]
     values: tuple[float, ...]
     candidates: Objects = field()
+    certainty: Certainty | None = None
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
+    how = "windows"
     _format = _FORMAT
     _sentences = WINDOWS
 
@@ -96,6 +102,20 @@ class ZoomPath(GazeRecord):
         some = bool(self._sought()) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
+
+    @property
+    def expected(self) -> dict[str, float]:
+        """Expected number of objects by the name of their class: the sum of the probabilities of all candidates.
+
+        Objects that no look has shown are not counted. Without a certainty it is the number of `objects`.
+        """
+        if self.certainty is None:
+            return super().expected
+        sums = torch.zeros(len(self.classes), dtype=torch.float64)
+        chances = self.certainty.probability(self.candidates.scores.double())
+        sums.index_add_(0, self.candidates.labels, chances)
+        labels = self._sought() or sums.nonzero()[:, 0].tolist()
+        return {self.classes[label]: float(sums[label]) for label in labels}
 
     @property
     def passes(self) -> int:
@@ -113,6 +133,22 @@ class ZoomPath(GazeRecord):
             outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
             return f"{self.target_name}: {outcome} in {passes}"
         return f"{self.objects_in_words()} in {passes}"
+
+    def objects_in_words(self) -> str:
+        """Count the objects, by class where classes were searched for, and say how many are expected.
+
+        Returns:
+            A phrase such as `about 3 × person (4 from score 0.3)`.
+        """
+        if self.certainty is None or not self._sought():
+            return super().objects_in_words()
+        seen, expected = self.objects.labels, self.expected
+        names = [
+            f"about {expected[self.classes[label]]:.0f} × {self.classes[label]} "
+            f"({int((seen == label).sum())} from score {self.least:g})"
+            for label in self._sought()
+        ]
+        return ", ".join(names)
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
@@ -182,7 +218,9 @@ class ZoomPath(GazeRecord):
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
         windows = [{name: getattr(glance.window, name) for name in _WINDOW} for glance in self.glances]
-        return tensors, {"lattice": {name: getattr(self.lattice, name) for name in _LATTICE}, "windows": windows}
+        certainty = None if self.certainty is None else list(self.certainty)
+        lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
+        return tensors, {"lattice": lattice, "windows": windows, "certainty": certainty}
 
     @classmethod
     def _fields(
@@ -211,4 +249,5 @@ class ZoomPath(GazeRecord):
             ),
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,
+            "certainty": record.get("certainty") and Certainty(*record["certainty"]),
         }

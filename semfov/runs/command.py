@@ -1,5 +1,7 @@
 """Command lines from dataclasses: help, YAML files, dotted overrides, exit codes."""
 
+from __future__ import annotations
+
 import os
 import re
 import signal
@@ -9,40 +11,66 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
-
-from jsonargparse import ArgumentParser, set_parsing_settings
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, get_origin
 
 from semfov.errors import SemfovError
 from semfov.io.files import discard_unfinished
+from semfov.runs.arguments import in_one_line, setting_types, usual_form
 from semfov.runs.settings import check_settings
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
 
 _Config = TypeVar("_Config")
 
-_GOES_ON = "give the same command again to continue"
+GOES_ON = "; give the same command again to continue"
+"""What is said about an interrupted command that keeps what it has finished."""
+
+_PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
+             "skimage": "scikit-image", "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
+"""Names under which packages are installed, where they are not those of their modules."""
 _SAID: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def make_parser(
-    config: type[Any], description: str | None, positional: tuple[str, str] | None = None
+    config: type[Any],
+    description: str | None,
+    positional: tuple[str, str] | None = None,
+    program: str | None = None,
 ) -> ArgumentParser:
     """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted.
 
     Args:
         config: dataclass of the settings.
         description: description for `--help`.
-        positional: name and help of a path field that becomes an optional positional argument.
+        program: name of the program in the usage; None for that of the process.
+        positional: name and help of a field that becomes an optional positional argument: a path, or a tuple of words.
 
     Returns:
         The parser.
     """
+    from jsonargparse import ArgumentParser, set_parsing_settings
+
+    class Parser(ArgumentParser):
+        """Say in one line what is wrong with the arguments."""
+
+        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+            if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells
+                super().error(message, ex)
+            known = [option for option in self._option_string_actions if option.startswith("--")]
+            print(f"error: {in_one_line(message, config, known)}", file=sys.stderr)
+            self.exit(2)
+
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
-    parser = ArgumentParser(
-        prog=None, description=description, default_env=False, formatter_class=_formatter(), exit_on_error=True
+    parser = Parser(
+        prog=program, description=description, default_env=False, formatter_class=_formatter(), exit_on_error=True
     )
     parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
     if positional is not None:
-        parser.add_argument(positional[0], nargs="?", type=Path, help=positional[1])
+        hint = setting_types(config)[positional[0]]
+        several = get_origin(hint) is tuple
+        kind = str if several or hint is str else Path
+        parser.add_argument(positional[0], help=positional[1], nargs="*" if several else "?", type=kind)
     parser.add_class_arguments(config, as_group=True, skip=set() if positional is None else {positional[0]})
     return parser
 
@@ -62,35 +90,51 @@ def _formatter() -> Any:
 
 
 def run_command(
-    main: Callable[[_Config], None],
+    main: Callable[[_Config], int | None],
     config: type[_Config],
     description: str | None,
     arguments: Sequence[str] | None = None,
     *,
     positional: tuple[str, str] | None = None,
+    program: str | None = None,
+    goes_on: str = GOES_ON,
 ) -> int:
     """Parse `arguments` into a `config` and call `main` with it.
 
     Args:
-        main: the function to run.
+        main: the function to run; it may return an exit code.
         config: dataclass of its settings.
         description: description for `--help`.
         arguments: command-line arguments (None: those of the process).
-        positional: name and help of a path field that becomes an optional positional argument.
+        positional: name and help of a field that becomes an optional positional argument (`make_parser`).
+        program: name of the program in the usage; None for that of the process.
+        goes_on: what is said after an interruption.
 
     Returns:
-        The exit code: 0, or 1 after a `SemfovError` (printed in one line), 130 after Ctrl-C, 143 after SIGTERM, or 141
-        if the reader of the output has closed its pipe. Usage errors exit with 2.
+        The exit code: 0 or that of `main`; 1 after a `SemfovError` or for a package that is missing (printed in one
+        line), 130 after Ctrl-C, 143 after SIGTERM, or 141 if the reader of the output has closed its pipe. Usage errors
+        exit with 2.
+
+    Raises:
+        ModuleNotFoundError: a module of this project is missing.
     """
     try:
-        with _signals():
-            parser = make_parser(config, description, positional)
-            parsed = parser.parse_args(arguments)
+        with _signals(goes_on):
+            parser = make_parser(config, description, positional, program)
+            given = sys.argv[1:] if arguments is None else arguments
+            parsed = parser.parse_args(usual_form(given, config, parser._option_string_actions))
             parsed.pop("config", None)
             check_settings(config, parsed)
             settings = parser.instantiate(parsed)
-            main(config(**settings.as_dict()))
+            code = main(config(**settings.as_dict()))
             sys.stdout.flush()
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if not missing or missing in ("semfov", "eval", "train", "benchmarks"):
+            raise
+        install = f"pip install {_PACKAGES.get(missing, missing)}"
+        print(f"error: this command needs {missing}, which is not installed: {install}", file=sys.stderr)
+        return 1
     except SemfovError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -102,12 +146,12 @@ def run_command(
         # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
         # it and would end by the signal although it was caught here. A string that runs to its end resets this.
         exec("")
-        print(f"{_SAID[signal.SIGINT]}; {_GOES_ON}", file=sys.stderr)
+        print(f"{_SAID[signal.SIGINT]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated:
-        print(f"{_SAID[signal.SIGTERM]}; {_GOES_ON}", file=sys.stderr)
+        print(f"{_SAID[signal.SIGTERM]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGTERM
-    return 0
+    return code or 0
 
 
 class _Terminated(BaseException):
@@ -115,7 +159,7 @@ class _Terminated(BaseException):
 
 
 @contextmanager
-def _signals() -> Iterator[None]:
+def _signals(goes_on: str) -> Iterator[None]:
     """Let the first SIGINT or SIGTERM end the command in good order, and the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -126,7 +170,7 @@ def _signals() -> Iterator[None]:
         signal.signal(signal.SIGTERM, _leave)
         if _importing(frame):
             # An exception from here would pass through the start of a native module, and some abort the process.
-            os.write(sys.stderr.fileno(), f"{_SAID[number]}; {_GOES_ON}\n".encode())
+            os.write(sys.stderr.fileno(), f"{_SAID[number]}{goes_on}\n".encode())
             _leave(number, frame)
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
 

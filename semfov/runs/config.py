@@ -360,7 +360,7 @@ class RunConfig(PoliciesConfig, ScenesConfig):
         saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
-        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
+        models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
 
     Attributes:
         task: the task of the policies.

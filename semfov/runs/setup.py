@@ -156,7 +156,7 @@ def growth_of(eye: Eye) -> float:
     if not isinstance(sensor, Foveation):
         raise InputError(
             f"sensor: expected a Foveation, since models are shipped for no other sensor, got {type(sensor).__name__}; "
-            "fit models for it (python -m train.fit_detector), or choose policies that need none"
+            "fit models for it (semfov fit), or choose policies that need none"
         )
     return float(sensor.growth)
 

@@ -14,8 +14,9 @@ from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
-from semfov.io.schema import Field, Maybe, Number, Object, Schema, perceptron
+from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
 from semfov.sensor.lines import constant
+from semfov.zoom.certainty import Certainty
 from semfov.zoom.gist import Gist
 from semfov.zoom.networks import (
     CROWD,
@@ -71,6 +72,7 @@ class GlimpseEvidence(Pretrained):
         foresight: share of what still closer looks would find in a window that counts towards its value.
         thresholds: thresholds at which searches decide; None where none were chosen.
         verification: probabilities after closer looks; None decides searches without them.
+        certainty: probability that an object is there, by its score; None where it was not fitted.
         metadata: JSON values kept with the model.
 
     Raises:
@@ -110,7 +112,9 @@ class GlimpseEvidence(Pretrained):
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": SURVEY,
+            # Files of earlier versions have neither of these.
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
+            "certainty": Maybe(Pair((Number(low=-_LARGEST, high=_LARGEST), Number(low=-_LARGEST, high=_LARGEST)))),
         },
     )
 
@@ -123,6 +127,7 @@ class GlimpseEvidence(Pretrained):
         foresight: float = 0.35,
         thresholds: Thresholds | None = None,
         verification: Verification | None = None,
+        certainty: Certainty | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -149,6 +154,7 @@ class GlimpseEvidence(Pretrained):
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
         self.survey = Survey(classes, foresight=foresight)
         self.verification = verification
+        self.certainty = certainty
 
     def presence(
         self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
@@ -283,13 +289,13 @@ class GlimpseEvidence(Pretrained):
             "thresholds": _listed(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
             "verification": None if verified is None else {"thresholds": _listed(verified.thresholds)},
+            "certainty": None if self.certainty is None else list(self.certainty),
         }
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model from its file."""
-        # Files of earlier versions have no verification.
-        verified = record.get("verification")
+        verified, certainty = record.get("verification"), record.get("certainty")
         model = cls(
             record["classes"],
             record["width"],
@@ -297,6 +303,7 @@ class GlimpseEvidence(Pretrained):
             foresight=record["foresight"],
             thresholds=_thresholds(record["thresholds"]),
             verification=None if verified is None else Verification(thresholds=_thresholds(verified["thresholds"])),
+            certainty=None if certainty is None else Certainty(*certainty),
             metadata=record["metadata"],
         )
         model.survey.foresight = record["survey"]["foresight"]

@@ -3,9 +3,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import nn
 
+from semfov import ActivePerception
 from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.load import load_detector
+from semfov.detection.load import check_detector, known_name, load_detector
 from semfov.detection.onnx_twin import RUNTIMES
 from semfov.detection.placement import resize
 from semfov.errors import DataError, InputError
@@ -135,3 +137,82 @@ def test_both_runtimes_give_the_same_detections(tiny, tiny_weights):
     assert torch.equal(actual.labels, expected.labels)
     torch.testing.assert_close(actual.scores, expected.scores, atol=1e-4, rtol=0)
     torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.01, rtol=0)
+
+
+def test_a_detector_is_returned_as_it_is(small_cfg, write_weights):
+    detector = load_detector(small_cfg, weights=write_weights(), classes=["cat", "dog"])
+    assert load_detector(detector) is detector
+    assert ActivePerception.raw(detector).eye.detector is detector
+    with pytest.raises(InputError, match="options: expected none for a detector that is made already, got threshold"):
+        load_detector(detector, threshold=0.1)
+
+
+def test_names_are_the_same_in_upper_and_lower_case():
+    assert known_name("YOLOv3-Tiny") == "yolov3-tiny"
+    assert known_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
+    assert known_name("HF:Owner/Name") == "hf:Owner/Name"
+    assert known_name("Folder/Net.cfg") == "Folder/Net.cfg"
+
+
+@pytest.mark.parametrize("load", [load_detector, check_detector])
+@pytest.mark.parametrize("name", ["mine.pt", "folder/mine.pth"])
+def test_pickles_are_refused_with_the_command_that_exports_them(load, name):
+    with pytest.raises(InputError, match=rf"yolo export model={name} format=onnx;.*weights='{name}'"):
+        load(name)
+
+
+class Cells(nn.Module):
+    """The columns of YOLOv8 for two classes: a box in the middle of each cell of 32 pixels, with its colour as scores.
+
+    In evaluation such a network returns its maps too.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names = {0: "red", 1: "green"}
+        self.scale = nn.Parameter(torch.ones(1))
+
+    def forward(self, image):
+        scores = nn.functional.avg_pool2d(image * self.scale, 32)[:, :2]
+        rows, columns = scores.shape[-2:]
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        centre = torch.stack([x, y])[None].expand(len(image), -1, -1, -1) * 32 + 16
+        boxes = torch.cat([centre, torch.full_like(centre, 20)], 1)
+        return torch.cat([boxes, scores], 1).flatten(2), [scores]
+
+
+class Wrapper(nn.Module):
+    """The object around a network that `ultralytics.YOLO` makes."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.model = network
+
+
+@pytest.fixture
+def cells(monkeypatch):
+    monkeypatch.setattr(Cells, "__module__", "ultralytics.nn.tasks")
+    monkeypatch.setattr(Wrapper, "__module__", "ultralytics.engine.model")
+    return Cells()
+
+
+def test_networks_of_ultralytics(cells):
+    image = torch.zeros(1, 3, 64, 64)
+    image[:, 0, :32, 32:] = 0.9
+    image[:, 1, 32:, :32] = 0.7
+    image.requires_grad_()
+    detector = load_detector(Wrapper(cells), input_size=64, threshold=0.1)
+    assert (detector.classes, len(detector.digest)) == (("red", "green"), 64)
+    found = detector(image)
+    torch.testing.assert_close(found.boxes[0], torch.tensor([[38.0, 6.0, 58.0, 26.0], [6.0, 38.0, 26.0, 58.0]]))
+    torch.testing.assert_close(found.scores[0], torch.tensor([[0.1, 0.9, 0.0], [0.3, 0.0, 0.7]]))
+    found.scores[..., 1:].amax(-1).sum().backward()
+    assert image.grad is not None
+    assert load_detector(cells).digest == detector.digest
+    with pytest.raises(InputError, match=r"all class scores of each box, \(B, 7, N\), got \(1, 6, 400\)"):
+        load_detector(cells, classes=["red", "green", "blue"])(torch.rand(1, 3, 64, 64))
+
+
+def test_unknown_modules_are_refused():
+    with pytest.raises(InputError, match=r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear"):
+        load_detector(nn.Linear(1, 1))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, InputError
 
@@ -102,3 +103,16 @@ def test_unsuitable_files_and_inputs_are_refused(make_onnx, tmp_path):
 def test_a_missing_device_is_refused(make_onnx):
     with pytest.raises(InputError, match="CPUExecutionProvider"):
         OnnxSession(make_onnx({"a": values(1, 5, 4)}), device="cuda")
+
+
+def test_execution_providers_are_chosen_by_name(make_onnx):
+    path = make_onnx({"output": values(1, 84, 85)})
+    wanted = [("CPUExecutionProvider", {"arena_extend_strategy": "kSameAsRequested"})]
+    chosen, plain = load_onnx(path, providers=wanted), load_onnx(path)
+    assert chosen.settings() == plain.settings() | {"providers": wanted}
+    assert pickle.loads(pickle.dumps(chosen.session)).providers == tuple(wanted)
+    canvas = images(1)
+    assert torch.equal(chosen.propose(canvas).classes, plain.propose(canvas).classes)
+    for missing in ([], ["CPUExecutionProvider", "NoSuchProvider"]):
+        with pytest.raises(InputError, match=r"providers: expected some of .*CPUExecutionProvider, got (none|NoSuch)"):
+            load_onnx(path, providers=missing)

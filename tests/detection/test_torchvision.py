@@ -9,7 +9,9 @@ from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.load import load_detector
+from semfov.detection.selection import Selection
 from semfov.detection.torchvision import TorchvisionDetector, load_torchvision
+from semfov.detection.torchvision_heads import output_count
 from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
 
@@ -308,6 +310,24 @@ def test_missing_and_unsuitable_files_are_refused(tmp_path, monkeypatch):
         torch.save(content, tmp_path / "other.pth")
         with pytest.raises(DataError, match=r"other\.pth"):
             load_torchvision(LITE, weights=tmp_path / "other.pth", classes=NAMES)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_model_in_memory_is_a_detector(kind):
+    model = randomise_heads(MODELS[kind]())
+    detector = load_detector(model, classes=NAMES, limit=7)
+    image = torch.rand(1, 3, 60, 80)
+    other = TorchvisionDetector(model, NAMES, selection=Selection(limit=7))
+    assert torch.equal(detector(image).scores, other(image).scores)
+    assert output_count(model) == 4
+    assert len(detector.digest) == 64
+    with pytest.raises(InputError, match="classes: expected the names of the model's outputs after the first"):
+        load_detector(model)
+
+
+def test_a_model_with_the_outputs_of_coco_needs_no_names():
+    model = RetinaNet(Backbone(32), 91, anchor_generator=anchors((16,), (32,)), **SMALL)
+    assert load_detector(model).classes == COCO_CLASSES
 
 
 def test_models_of_sigmoids_may_have_no_background_output():

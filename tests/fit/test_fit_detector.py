@@ -1,6 +1,7 @@
-"""`python -m train.fit_detector` for a detector of coloured squares, from photographs to a search."""
+"""`semfov fit` for a detector of coloured squares, from photographs to a search."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +17,13 @@ import semfov
 from eval.comparison.model_folder import with_models
 from eval.decide import main as decide
 from eval.decide.config import DecisionConfig
-from eval.demo import main as demo
 from eval.explore.config import ExploreConfig
 from eval.search import main as search
 from eval.search.config import SearchConfig
 from semfov import ActivePerception, DataError, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import thin_classes
@@ -40,7 +41,6 @@ from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_network, write_photographs
-from train.fit_detector import main
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def home(tmp_path_factory):
     (folder / "photographs").mkdir()
     write_photographs(folder / "photographs")
     torch.set_num_threads(1)
-    assert main(arguments(folder)) == 0
+    assert command(arguments(folder)) == 0
     return folder
 
 
@@ -62,7 +62,7 @@ def data(folder):
 
 def arguments(folder, *more):
     paths = ["--out", str(folder / "models"), "--cache", str(folder / "cache")]
-    return [str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
+    return ["fit", str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
 
 
 @pytest.mark.slow
@@ -135,7 +135,7 @@ def test_the_published_agent_takes_the_folder(home, search):
 def test_the_published_agent_needs_an_observation_model(home, tmp_path):
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
-    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: python -m train\.fit_detector"):
+    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: semfov fit"):
         ActivePerception.published(folder)
 
 
@@ -178,10 +178,10 @@ def forbid(monkeypatch, *parts):
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
     before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
     forbid(monkeypatch, *FITS)
-    assert main(arguments(home)) == 0
+    assert command(arguments(home)) == 0
     assert {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")} == before
     printed = capsys.readouterr()
-    assert "python -m eval.demo PHOTO.jpg --target" in printed.out
+    assert "semfov search PHOTO.jpg --target" in printed.out
     assert f"--models {home / 'models'}" in printed.out
 
 
@@ -196,17 +196,17 @@ def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, 
     (tmp_path / "models/manifest.json").unlink()
     forbid(monkeypatch, *(FITS.keys() - {part}))
     torch.set_num_threads(1)
-    assert main(arguments(home, "--out", str(tmp_path / "models"))) == 0
+    assert command(arguments(home, "--out", str(tmp_path / "models"))) == 0
     again, once = (folder / f"models/{part}.safetensors" for folder in (tmp_path, home))
     assert again.read_bytes() == once.read_bytes()
 
 
 @pytest.mark.parametrize("agent", ["recommended", "published"])
-def test_the_demonstration_takes_the_folder(home, tmp_path, capsys, agent):
+def test_the_command_takes_the_folder(home, tmp_path, capsys, agent):
     photo = str(home / "photographs/0.png")
-    given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--out", str(tmp_path)]
-    assert demo([*given, "--agent", agent]) == 0
-    assert "0.png: “red”" in capsys.readouterr().out
+    given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--agent", agent]
+    assert command(["search", *given]) == 0
+    assert re.search(r"0\.png, .*red", capsys.readouterr().out)
 
 
 def copy_models(home, tmp_path):
@@ -218,7 +218,7 @@ def copy_models(home, tmp_path):
 def test_another_network_is_refused(home, tmp_path):
     folder = copy_models(home, tmp_path)
     write_network(tmp_path / "colours.onnx", bias=-3.0)
-    with pytest.raises(DataError, match=r"detector: .*expected the network .*python -m train\.fit_detector"):
+    with pytest.raises(DataError, match=r"detector: .*expected the network .*semfov fit"):
         ActivePerception.from_pretrained(folder)
     with pytest.raises(DataError, match="expected the network"):
         ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
@@ -245,7 +245,7 @@ def test_a_changed_file_is_refused(home, tmp_path, name):
     with pytest.raises(DataError, match=f"{name}: damaged or changed"):
         ModelFolder(folder)
     (folder / name).unlink()
-    with pytest.raises(DataError, match=r"no such file.*train\.fit_detector"):
+    with pytest.raises(DataError, match=r"no such file.*semfov fit"):
         ModelFolder(folder)
 
 
@@ -331,9 +331,7 @@ def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
     assert agent.verification is None
     assert isinstance(agent.searching.observer, Target)
     assert with_models(DecisionConfig(models=folder)).verification is None
-    assert (
-        demo([str(home / "photographs/0.png"), "--target", "red", "--models", str(folder), "--out", str(tmp_path)]) == 0
-    )
+    assert command(["search", str(home / "photographs/0.png"), "--target", "red", "--models", str(folder)]) == 0
 
 
 def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_path):
@@ -370,7 +368,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         raise DataError("data: too few")
 
     monkeypatch.setattr("semfov.fit.parts.verification.fit_in_folds", fail)
-    assert main(arguments(home, "--out", str(folder))) == 0
+    assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
     part = Manifest.read(folder).parts["verification"]
@@ -413,21 +411,19 @@ def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_pat
 
 
 def test_a_folder_without_models_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"manifest\.json: no such file; .*train\.fit_detector"):
+    with pytest.raises(DataError, match=r"manifest\.json: no such file; .*semfov fit"):
         ActivePerception.from_pretrained(tmp_path)
 
 
 def test_an_unknown_model_name_is_refused():
-    with pytest.raises(
-        InputError, match=r"got 'mymodels'; make a folder by `python -m train\.fit_detector .*mymodels`"
-    ):
+    with pytest.raises(InputError, match=r"got 'mymodels'; make a folder by `semfov fit .*mymodels`"):
         ActivePerception.from_pretrained("mymodels")
 
 
 def test_a_network_without_models_names_the_command_that_fits_them(home):
     network = str(home / "colours.onnx")
     for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
-        with pytest.raises(InputError, match=r"python -m train\.fit_detector \S+colours\.onnx --data\.root"):
+        with pytest.raises(InputError, match=r"semfov fit \S+colours\.onnx --data\.root"):
             make(network)
 
 
@@ -444,7 +440,7 @@ def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_pat
         category["name"] = f"other {category['id']}"
     (tmp_path / "instances.json").write_text(json.dumps(record))
     given = arguments(home, "--data.annotations", str(tmp_path / "instances.json"), "--out", str(tmp_path / "out"))
-    assert main(given) == 1
+    assert command(given) == 1
     error = capsys.readouterr().err
     assert "expected some of the detector's 3 classes (red, green, blue" in error
     assert "'other 1'" in error

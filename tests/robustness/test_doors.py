@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-import eval.demo as program
 from semfov import (
     ActivePerception,
     MapEvidence,
@@ -330,58 +329,6 @@ def test_learned_models_accept_only_grids_of_similar_size(kind):
     for grid in ((21, 10), (10, 4), (40, 40), (1, 1)):
         with pytest.raises(SemfovError, match=r"^grid: the .* was fitted on 10 × 10 cells.*use grid=\(10, 10\)"):
             model.check_compatible(settings, grid)
-
-
-COMMANDS = {
-    "--target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
-    "--target mug": "target: unknown class 'mug'; did you mean 'cup'?",
-    "--target 1.5": "target: unknown class",
-    "--target cup --explore": "target: expected none with --explore, got cup",
-    "--target zebra": "target: expected a class in the embedded scenes",
-    "nosuch.jpg --target cup": "photo: no such file or folder: nosuch.jpg; check the path",
-    "nosuch.mp4 --explore": "nosuch.mp4; check the path",
-    "FOLDER/empty --target cup": "photo: expected photographs (.jpg",
-    "FOLDER/notes.txt --target cup": "not an image in a format that Pillow reads",
-    "FOLDER/cut.png --explore": "truncated, damaged",
-    "FOLDER/photo.png --camera 0 --target cup": "photo: expected none with --camera",
-    "--camera -1 --target cup": "camera: expected a whole number from 0",
-    "--target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
-    "--target cup --confirm 50": "confirm: expected a number from 0 to 1, got 50",
-    "--target cup --give_up -1": "give_up: expected a number from 0 to 1, got -1",
-    "--target cup --start -1": "start: expected a whole number from 0",
-    "--target cup --seed -1": "seed: expected a whole number from 0",
-    "--target cup --rate -1": "rate: expected a number from 0",
-    "--target cup --frames 0": "frames: expected a whole number from 1",
-    "--target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
-    "--target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
-    "--target cup --detector my.weights": "detector: expected a cfg and its weights",
-}
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_wrong_values_on_the_command_line_give_an_error_of_one_line(command, folder, monkeypatch, capsys):
-    """The error comes before a detector is loaded."""
-    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
-    assert program.main(command.replace("FOLDER", str(folder)).split()) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert COMMANDS[command] in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize("command", ["--nosuch", "--shifts many --target cup", "--sensor wide", "--agent best", "a b"])
-def test_wrong_options_on_the_command_line_end_with_exit_code_2(command, monkeypatch, capsys):
-    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
-    with pytest.raises(SystemExit) as stopped:
-        program.main(command.split())
-    assert stopped.value.code == 2
-    assert command.split()[0].strip("-") in capsys.readouterr().err.replace("Unrecognized arguments: b", "a b")
-
-
-def test_classes_are_listed_without_loading_the_agent(monkeypatch, capsys):
-    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
-    assert program.main([]) == 0
-    assert "wine glass" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["array", "tensor", "floats", "Pillow image"])

@@ -168,8 +168,8 @@ def test_a_single_process_does_not_wait_and_ranks_share_tasks(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.weights
 def test_a_closed_output_pipe_prints_no_traceback():
-    """As in `python -m eval.demo | head -0`."""
-    call = [sys.executable, "-m", "eval.demo"]
+    """As in `semfov detectors | head -0`."""
+    call = [sys.executable, "-m", "semfov", "detectors"]
     with running(call, cwd=ROOT, stdout=subprocess.PIPE) as process:
         process.stdout.close()
         process.stdout = None

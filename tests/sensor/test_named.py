@@ -9,6 +9,7 @@ import torch
 
 from eval.search import main as search
 from semfov import ActivePerception, FovealObservationModel, Scanpath
+from semfov.cli.main import main as command
 from semfov.errors import InputError
 from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
@@ -16,7 +17,6 @@ from semfov.runs.config import SensorConfig
 from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
 from semfov.sensor.named import SensorName
 from tests.colours import write_network, write_photographs
-from train.fit_detector import main as fit_detector
 from train.fit_fom import main as fit_fom
 
 
@@ -120,7 +120,7 @@ def test_policies_that_need_a_model_say_that_none_is_shipped(home, policy, capsy
     assert search(searching(home, "refused", [policy])) == 1
     error = capsys.readouterr().err
     assert re.match(r"error: sensor: expected a Foveation, since models are shipped for no other sensor, got L", error)
-    assert "train.fit_detector" in error
+    assert "semfov fit" in error
 
 
 def test_an_observation_model_is_fitted_and_used(home):
@@ -136,7 +136,7 @@ def test_an_observation_model_is_fitted_and_used(home):
 def test_a_folder_of_models_keeps_its_sensor(home, tmp_path):
     small = ["--columns", "3", "--rows", "2", "--holdout", "2", "--steps", "4", "--map_steps", "5", "--fixations", "3"]
     arguments = given(home, "models", *small, "--judged", "2", "--sensor.settings.fovea", "80")
-    assert fit_detector([str(home / "colours.onnx"), *arguments]) == 0
+    assert command(["fit", str(home / "colours.onnx"), *arguments]) == 0
     folder = ModelFolder(home / "models")
     assert folder.manifest.sensor == {"name": "log-polar", "fovea": 80, "spacing": 1, "pooling": 1, "reference": 640}
     agent = ActivePerception.from_pretrained(home / "models")

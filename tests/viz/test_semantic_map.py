@@ -8,8 +8,8 @@ import pytest
 import scipy.ndimage
 import torch
 
-from eval import demo
 from semfov import Grid
+from semfov.cli.text import regions_lines
 from semfov.viz import entropy, plot_semantic_map
 from semfov.viz.semantic import borders, named_regions, regions
 from tests import small
@@ -149,20 +149,14 @@ def test_entropy_is_that_of_normalised_probabilities():
     assert float(got.max()) <= 2
 
 
-def test_the_demo_lists_classes_and_their_cells():
-    """One line for each class: its number of cells, its highest probability and the cell of that."""
-    lines = demo.path_table("picture", marginal_map()).splitlines()
-    start = lines.index("what is where:")
-    assert lines[start + 1 : start + 3] == [
-        "  cat: 4 cells, p up to 0.95 at (3, 1)",
-        "  dog: 2 cells, p up to 0.55 at (5, 3)",
+def test_an_exploration_is_told_as_classes_and_their_cells():
+    """One line for each class: its number of cells, its highest probability and the middle of its cell."""
+    assert regions_lines(marginal_map()) == [
+        "  map: cat in 4 cells, p up to 0.95 around (34, 14)",
+        "  map: dog in 2 cells, p up to 0.55 around (54, 34)",
     ]
-
-
-def test_the_demo_reports_an_empty_map():
     empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
-    told = demo.path_table("picture", scanpath_of(empty, 6))
-    assert told.rstrip().endswith("what is where:\n  nothing that is more probable than background")
+    assert regions_lines(scanpath_of(empty, 6)) == []
     one = empty.clone()
     one[-1, 5, 2] = 0.97
-    assert "  cup: 1 cell, p up to 0.97 at (5, 0)" in demo.path_table("picture", scanpath_of(one, 6)).splitlines()
+    assert len(regions_lines(scanpath_of(one, 6))) == 1

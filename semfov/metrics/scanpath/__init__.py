@@ -5,7 +5,7 @@ Definitions differ between groups, and each function names the group whose defin
 sequences need `pip install semfov[human]`.
 """
 
-from semfov.metrics.scanpath.beside import BesidePeople, compare_scanpath
+from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_judd, auc_shuffled
 from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
@@ -28,6 +28,7 @@ from semfov.metrics.scanpath.simplify import merge_close
 __all__ = [
     "BesidePeople",
     "MultiMatch",
+    "ScanpathComparison",
     "auc",
     "auc_judd",
     "auc_shuffled",

@@ -29,17 +29,30 @@ class BesidePeople(NamedTuple):
         scanpath: of the scanpath against each person, on average.
         people: of each person against each other person, on average; NaN for a single person.
 
-    Example::
-
-        for name, measure in compare_scanpath(agent.search("kitchen.jpg", "cup"), people).items():
-            print(f"{name}: {measure.scanpath:.2f}, people {measure.people:.2f}")
+    >>> BesidePeople(0.5, 0.75).people
+    0.75
     """
 
     scanpath: float
     people: float
 
 
-def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixations]) -> dict[str, BesidePeople]:
+class ScanpathComparison(dict[str, BesidePeople]):
+    """Measures of a scanpath beside those of people, by name; printed as a table.
+
+    >>> print(ScanpathComparison({"AUC": BesidePeople(0.85, 0.9)}))
+    measure  scanpath  people
+    AUC          0.85    0.90
+    """
+
+    def __str__(self) -> str:
+        """The measures as a table."""
+        wide = max(map(len, ["measure", *self]))
+        lines = [f"{name:{wide}}  {each.scanpath:8.2f}  {each.people:6.2f}" for name, each in self.items()]
+        return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
+
+
+def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixations]) -> ScanpathComparison:
     """Compare a scanpath with those of people in the same picture, and the people with each other.
 
     - `MultiMatch shape`, `direction`, `length`, `position` (`multimatch`): 1 for equal scanpaths; NaN below three
@@ -73,7 +86,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixation
     records = [each.resized(size) for each in (ours, *people)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]
-    found = {}
+    found = ScanpathComparison()
     for name, measure in _measures(size).items():
         among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
         found[name] = BesidePeople(measure(mine, theirs), _mean(among))

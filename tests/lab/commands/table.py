@@ -159,7 +159,6 @@ COMMANDS = {
         same={"no store": ("--store", "false")},
         refused=((("--people", "nobody.csv"), "nobody.csv"),),
     ),
-    "eval.demo": Command(workers=False),
     "eval.human search": Command(refused=((("--people", "nobody.json"), "nobody.json"),)),
     "train.fit_fom": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "4", "--holdout", "2", "--shard", "1", "--method", "newton"),
@@ -217,7 +216,7 @@ COMMANDS = {
         workers=False,
     ),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
-    "train.fit_detector": Command(
+    "semfov.cli.main fit": Command(
         settings=("HERE/colours.onnx", *PHOTOGRAPHS, "--data.limit", "8", "--columns", "3", "--rows", "2",
                   "--holdout", "4", "--steps", "4", "--map_steps", "2", "--fixations", "2",
                   "--sensor.sigma", "60", "--sensor.growth", "1"),

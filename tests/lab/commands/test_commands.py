@@ -151,7 +151,7 @@ def test_unknown_settings_are_refused(name, capsys):
     assert "seeed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [name for name in COMMANDS if not name.startswith("semfov.")])
 def test_help_describes_the_command_and_printed_settings_can_be_given_back(name, capsys, tmp_path):
     module, *job = name.split()
     with pytest.raises(SystemExit) as stopped:

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
+from semfov import Grid
 from semfov.data.fixations import Fixations
 from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, compare_scanpath, edit_distance, multimatch, sequence_score
+from tests import small
 
 SIZE = (800, 600)
 
@@ -58,3 +61,13 @@ def test_other_pictures_and_fixations_in_another_unit_are_told():
     shifted = Fixations("a.jpg", "1", mine.points * 3, SIZE)
     with pytest.warns(UserWarning, match=r"of 14 fixations \(\d+%\) lie far outside their frame"):
         compare_scanpath(shifted, others)
+
+
+def test_a_record_is_compared_by_itself_and_printed_as_a_table():
+    grid = Grid(10, 10, SIZE)
+    scanpath = small.scanpath(grid, torch.tensor([55, 11, 27, 87]), ("background", "cup"), target=1)
+    others = people(3)
+    table = scanpath.compare(others)
+    assert table == compare_scanpath(scanpath.as_fixations("a.jpg"), others)
+    assert str(table).splitlines()[0].split() == ["measure", "scanpath", "people"]
+    assert len(str(table).splitlines()) == 1 + len(table)

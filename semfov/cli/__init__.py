@@ -1,0 +1,1 @@
+"""The command `semfov`: search, find, explore, live, fit and detectors, without a checkout."""

@@ -1,0 +1,83 @@
+"""The agent and the classes that the options name, with what can be checked before anything is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from semfov.agent import ActivePerception
+from semfov.cli.options import AgentOptions
+from semfov.data.classes import class_index
+from semfov.detection.load import check_detector
+from semfov.errors import InputError, check
+from semfov.io.manifest import Manifest
+from semfov.sensor.foveation import Foveation
+from semfov.sensor.named import SENSORS
+
+
+def known_classes(options: AgentOptions) -> tuple[str, ...] | None:
+    """Names of the detector's classes, or None where they are known only after it is loaded."""
+    return check_detector(options.detector) if options.models is None else Manifest.read(options.models).classes
+
+
+def make_agent(options: AgentOptions) -> ActivePerception:
+    """The agent that the options name."""
+    if options.models is not None:
+        check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
+        moved: dict[str, Any] = {} if options.detector == AgentOptions.detector else {"detector": options.detector}
+        own = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
+        return own(options.models, **moved)
+    if options.agent == "recommended":
+        sensor = SENSORS[options.sensor or "gradual"]
+        kind = sensor.make.__name__
+        check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
+        shape: dict[str, Any] = {name: sensor.settings[name] for name in ("sigma", "growth")}
+        return ActivePerception.recommended(options.detector, **shape)
+    make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
+    return make(options.detector, sensor=options.sensor or "published")
+
+
+def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:
+    """The classes that a text names, with commas between them; None for all.
+
+    Args:
+        text: the text.
+        classes: names of the detector's classes; None does not check them.
+
+    Returns:
+        The names.
+
+    Raises:
+        InputError: a class is unknown; the message has the nearest names.
+
+    >>> several_classes("Cups, fork", ("cup", "fork"))
+    ['cup', 'fork']
+    """
+    if text is None or text == "all":
+        return None
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    check(bool(names), "target", "a class, or several with commas", repr(text))
+    return names if classes is None else [classes[class_index(name, classes, "target") - 1] for name in names]
+
+
+def one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
+    """The class that a text names; None for none.
+
+    Args:
+        text: the text.
+        classes: names of the detector's classes; None does not check it.
+
+    Returns:
+        Its name.
+    """
+    if text is None or classes is None:
+        return text
+    return classes[class_index(text, classes, "target") - 1]
+
+
+def check_target(target: str | None, options: AgentOptions) -> str:
+    """Raise `InputError` without a target; the message tells how to list the classes."""
+    if not target:
+        name = options.detector if options.models is None else options.models
+        raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
+    return target

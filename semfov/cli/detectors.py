@@ -1,0 +1,52 @@
+"""Subcommand detectors: lists the detectors that can be named, or the classes of one."""
+
+from __future__ import annotations
+
+from os import fspath
+
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.verification import Verification
+from semfov.cli.options import DetectorsOptions
+from semfov.cli.text import columns, table_lines
+from semfov.detection.load import check_detector, load_detector
+from semfov.detection.weights import WEIGHTS, cache_folder
+from semfov.io.manifest import Manifest
+from semfov.io.pretrained import Pretrained
+from semfov.zoom import GlimpseEvidence
+
+PURPOSES: dict[str, type[Pretrained]] = {
+    "search": TargetEvidence,
+    "closer looks": Verification,
+    "explore": MapEvidence,
+    "large pictures": GlimpseEvidence,
+}
+"""Models that are shipped for some detectors, by what they are for."""
+
+
+def list_detectors(options: DetectorsOptions) -> int:
+    """List the detectors, or the classes of one.
+
+    Args:
+        options: the options.
+
+    Returns:
+        The exit code.
+    """
+    if options.name is not None:
+        name = fspath(options.name)
+        folder = options.name.is_dir()
+        classes = Manifest.read(options.name).classes if folder else check_detector(name)
+        classes = load_detector(name).classes if classes is None else classes
+        print(f"{name} knows {len(classes)} classes:\n{columns(classes)}")
+        return 0
+    rows = [["name", "size", "weights", "models shipped for", "licence"]]
+    for name, weights in WEIGHTS.items():
+        there = "here" if (cache_folder() / weights.file).is_file() else "downloaded when needed"
+        models = [what for what, kind in PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
+        rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
+    print("\n".join(table_lines(rows)))
+    print(f"\nWeights are kept in {cache_folder()}.")
+    print("Others: torchvision:MODEL, a .onnx file, a .cfg file with its weights, or a folder from semfov fit.")
+    print("A detector without shipped models runs with --agent raw, or after semfov fit.")
+    return 0

@@ -1,0 +1,160 @@
+"""Help of the command, one screen for each subcommand, with examples first."""
+
+OVERVIEW = """\
+semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
+
+  semfov search kitchen.jpg --target cup            is there a cup, and where?
+  semfov find harbour.tif --target person           all people in a large picture, and how many
+  semfov explore street.jpg --report street.html    what is where, as a page with every look
+  semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
+  semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
+  semfov detectors                                  detectors that can be named, and their licences
+
+Commands:
+  search      search pictures for a class, and decide whether it is there
+  find        find all objects of one class, of several or of all
+  explore     learn what is where, without a target
+  live        search or explore a video, a camera or a network stream
+  fit         fit all models to your own detector
+  detectors   list detectors, or the classes of one
+
+`semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
+Without a picture, search, find and explore take an embedded scene, so `semfov search --target cup` tries it out.
+"""
+
+_AGENT = """\
+  --detector NAME      yolov3-tiny (default), another name (semfov detectors), or a file such as mine.onnx
+  --models FOLDER      models of your own detector, which semfov fit made
+  --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
+
+_LOOKS = """\
+  --how KIND           auto (default: by the size of the picture), fovea, windows, or head (in a panorama)
+  --passes N           most passes of the detector; --shifts N: most gaze shifts of a fovea
+  --seconds S          longest time for a picture; the first limit that is reached ends it"""
+
+_OUTPUT = """\
+  --out FILE           results as .json, .csv, .geojson, or for COCO .coco.json, written while it runs
+  --out FOLDER         figures and results of each picture; --draw scanpath,views,belief,belief_bars,animation or none
+  --report PAGE.html   a page in which to step through the looks; --looks prints them
+
+A picture of several that cannot be read is reported and skipped; the exit code is then 1. --help-all: all options."""
+
+SEARCH = f"""\
+semfov search: is it there, and where?
+
+  semfov search kitchen.jpg --target cup
+  semfov search photos/ --target "wine glass" --out found.csv
+  semfov search harbour.tif --target person --passes 16 --report harbour.html
+  semfov search kitchen.jpg --target cup --models mymodels
+
+usage: semfov search [PICTURE ...] --target CLASS [options]
+
+  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+  --target CLASS       class to search for (semfov detectors NAME lists them)
+  --embeddings FILE    word vectors; the target may then be a description, such as "something to drink from"
+{_AGENT}
+{_LOOKS}
+  --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
+  --closer N           most closer looks at places that seem to hold the target (0: none)
+  --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
+{_OUTPUT}
+"""
+
+FIND = f"""\
+semfov find: all objects, and how many
+
+  semfov find harbour.tif --target person
+  semfov find flight/*.jpg --target person,car --passes 16 --out boxes.json
+  semfov find street.jpg --out street.coco.json
+  semfov find BIG.jpg --models mymodels --report page.html
+
+usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
+
+  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+  --target CLASSES     a class, or several with commas (default: all classes)
+{_AGENT}
+{_LOOKS}
+  --worth N            a look is worth a pass if it is expected to show this many new objects (default 0.01)
+  --batch N            windows that are looked at together
+{_OUTPUT}
+"""
+
+EXPLORE = f"""\
+semfov explore: what is where
+
+  semfov explore street.jpg
+  semfov explore street.jpg --shifts 10 --report street.html
+  semfov explore harbour.tif --seconds 20 --out harbour.json
+  semfov explore panorama.jpg --how head
+
+usage: semfov explore [PICTURE ...] [options]
+
+  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+{_AGENT}
+{_LOOKS}
+  --worth N            a look is worth a pass if it is expected to name this many more cells right, or in a large
+                       picture to show this many new objects (default 0.1 and 0.01)
+  --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
+{_OUTPUT}
+"""
+
+LIVE = f"""\
+semfov live: one look at each frame of a video, a camera or a network stream
+
+  semfov live --camera 0 --target cup
+  semfov live holiday.mp4 --target bicycle --out seen
+  semfov live rtsp://192.168.1.20/stream --target person
+  semfov live holiday.mp4                             explore, without a target
+
+usage: semfov live [VIDEO | URL | --camera N] [--target CLASS] [options]
+
+  VIDEO, URL           a video file, or an address such as rtsp://… that OpenCV can open
+  --camera N           number of a camera; Ctrl-C ends it
+  --target CLASS       class to search for (default: explore)
+  --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
+  --rate R             rate at which belief fades from frame to frame (0: never)
+  --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
+  --closer N           most closer looks in the time until half of the belief has faded (0: none)
+{_AGENT}
+  --start 5,5          first cell as column,row, or its number; --seed N draws it
+  --out FILE           video to write, with gaze, belief and detections drawn into each frame
+
+Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
+"""
+
+FIT = """\
+semfov fit: fit all models to your own detector
+
+  semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
+  semfov search PHOTO.jpg --target cup --models mymodels
+  semfov find BIG.jpg --models mymodels
+
+usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
+
+  MODEL                    the detector: a name or a file, as for semfov.load_detector
+  --data.root FOLDER       photographs to learn from; a few dozen with boxes are enough to begin with
+  --data.annotations FILE  their boxes in COCO's format (none: embedded scenes, enough only to try it out)
+  --data.limit N           use only so many photographs
+  --detector.classes LIST  names of the detector's classes, "[cat,dog]", where its file does not hold them
+  --out FOLDER             folder for the models (default mymodels)
+  --holdout N              hold out one in N photographs, on which each part is compared with raw scores
+  --workers N              processes that look (default: one for each core)
+
+It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
+scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
+"""
+
+LIST_DETECTORS = """\
+semfov detectors: detectors that can be named, or the classes of one
+
+  semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
+  semfov detectors yolox-nano      the classes that it knows
+  semfov detectors mine.onnx
+
+usage: semfov detectors [NAME]
+
+  NAME                 name or file of a detector, as for semfov.load_detector, or a folder of models
+
+Weights are downloaded when a detector is first used, into $SEMFOV_CACHE or the user's cache folder. A detector without
+shipped models runs with --agent raw, or after semfov fit.
+"""

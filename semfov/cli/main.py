@@ -1,0 +1,161 @@
+"""Entry point of the command `semfov`."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TextIO
+
+from semfov.cli import help as texts
+from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
+from semfov.runs.command import GOES_ON, make_parser, run_command
+from semfov.version import __version__
+
+
+@dataclass(frozen=True)
+class Subcommand:
+    """A subcommand.
+
+    Attributes:
+        text: its help, one screen.
+        options: returns the dataclass of its options.
+        run: runs it with these options, and returns the exit code.
+        positional: name and help of the positional argument.
+        goes_on: what is said after an interruption.
+    """
+
+    text: str
+    options: Callable[[], type[Any]]
+    run: Callable[[Any], int | None]
+    positional: tuple[str, str]
+    goes_on: str = ""
+
+
+def _search(options: Any) -> int:
+    from semfov.cli.search import search_pictures
+
+    return search_pictures(options)
+
+
+def _find(options: Any) -> int:
+    from semfov.cli.search import find_objects
+
+    return find_objects(options)
+
+
+def _explore(options: Any) -> int:
+    from semfov.cli.search import explore_pictures
+
+    return explore_pictures(options)
+
+
+def _live(options: Any) -> int:
+    from semfov.cli.live import look_live
+
+    return look_live(options)
+
+
+def _fit_options() -> type[Any]:
+    from semfov.fit.detector_settings import FitDetectorConfig
+
+    return FitDetectorConfig
+
+
+def _fit(options: Any) -> None:
+    from semfov.fit.detector import fit_folder
+
+    fit_folder(options)
+
+
+def _detectors(options: Any) -> int:
+    from semfov.cli.detectors import list_detectors
+
+    return list_detectors(options)
+
+
+_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
+_MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
+
+SUBCOMMANDS: dict[str, Subcommand] = {
+    "search": Subcommand(texts.SEARCH, lambda: SearchOptions, _search, _PICTURES),
+    "find": Subcommand(texts.FIND, lambda: FindOptions, _find, _PICTURES),
+    "explore": Subcommand(texts.EXPLORE, lambda: ExploreOptions, _explore, _PICTURES),
+    "live": Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
+    "fit": Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
+    "detectors": Subcommand(
+        texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")
+    ),
+}
+"""The subcommands by name. What they need is imported when they run."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Args:
+        arguments: command-line arguments; None for those of the process.
+
+    Returns:
+        The exit code: 0, or 1 after an error (printed in one line) and if a picture was left out. Usage errors exit
+        with 2.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["help"]:
+        given = [*given[1:2], "--help"]
+    name, *rest = given or ["--help"]
+    if name in ("--version", "-V"):
+        print(f"semfov {__version__}")
+        return 0
+    if name in ("--help", "-h", "--help-all"):
+        print(texts.OVERVIEW, end="")
+        return 0
+    if name not in SUBCOMMANDS:
+        print(f"error: {_unknown(name, rest)}", file=sys.stderr)
+        return 2
+    command = SUBCOMMANDS[name]
+    if "--help" in rest or "-h" in rest:
+        print(command.text, end="")
+        return 0
+    options, program = command.options(), f"semfov {name}"
+    if "--help-all" in rest or "--help_all" in rest:
+        usage = command.text.partition("\nusage:")[0]
+        make_parser(options, usage, command.positional, program).print_help()
+        return 0
+    names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
+    with _plain_warnings():
+        return run_command(command.run, options, command.text, rest, **names)
+
+
+def _unknown(name: str, rest: Sequence[str]) -> str:
+    """What to type instead of a name that is no subcommand."""
+    if Path(name).exists():
+        return f"expected a command before {name!r}; try `semfov search {name} --target CLASS`"
+    if name.startswith("-"):
+        return f"expected a command before {name}: {', '.join(SUBCOMMANDS)}"
+    near = get_close_matches(name, SUBCOMMANDS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(SUBCOMMANDS)}"
+    return f"unknown command {name!r}; {hint}"
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print each warning as one line, without the place in the code."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        print(f"warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,192 @@
+"""Options of the subcommands: dataclasses with the names that they have in Python."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from semfov.agent import How
+from semfov.agents.limits import MOST_PASSES
+from semfov.decision import MOST_CLOSER
+from semfov.errors import InputError
+from semfov.live import RATE
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole
+from semfov.sensor.named import SensorName
+
+Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
+"""Figures that can be drawn of an episode."""
+
+ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
+"""Figures that are drawn unless others are named."""
+
+MostCloserLooks = Annotated[int, Range(0, 100)]
+"""Largest number of closer looks."""
+
+
+@dataclass(frozen=True)
+class AgentOptions(Settings):
+    """The agent.
+
+    Args:
+        agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
+            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
+            no model: scores as they are).
+        detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
+        models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
+        sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
+        start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
+        seed: seed of the random start, of ties and of the embedded scene.
+    """
+
+    agent: Literal["recommended", "published", "raw"] = "recommended"
+    detector: str = "yolov3-tiny"
+    models: Path | None = None
+    sensor: SensorName | None = None
+    start: str | None = None
+    seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class PictureOptions(AgentOptions):
+    """Looks at pictures, and what is written of them.
+
+    Args:
+        pictures: photographs, large pictures, or folders of them (none: an embedded scene).
+        how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
+            in front of the viewer), or `auto` by the size of the picture.
+        passes: largest number of passes of the detector, closer looks included (none: 24 for windows, 40 for a head).
+        shifts: largest number of gaze shifts of a fovea (none: 30 for a search, 20 otherwise, without limit of passes).
+        seconds: longest time in seconds for each picture on this machine.
+        duration: longest time in seconds that eye and head move in a scene (none: 30).
+        out: file of results, `.json`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and results.
+        draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
+            where), `belief_bars` and `animation`; `none` draws nothing (not given: all but `belief_bars`, if `out` is a
+            folder). If `out` is a file, they are written into a folder of its name.
+        report: HTML page to write, in which to step through the looks.
+        looks: print every look.
+    """
+
+    pictures: tuple[str, ...] = ()
+    how: How = "auto"
+    passes: Annotated[int, Range(1, MOST_PASSES)] | None = None
+    shifts: Shifts | None = None
+    seconds: Positive | None = None
+    duration: Positive | None = None
+    out: Path | None = None
+    draw: tuple[Drawing, ...] | None = None
+    report: Path | None = None
+    looks: bool = False
+
+
+@dataclass(frozen=True)
+class SearchOptions(PictureOptions):
+    """Search pictures for a class.
+
+    Args:
+        target: class to search for.
+        embeddings: file of word vectors (text format of GloVe or word2vec); a target that is not a class of the
+            detector is then spread over the classes closest in meaning.
+        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
+            in the picture for a search without closer looks (none: the value chosen when the model was fitted; for
+            agents without a fitted belief, a detection's score of 0.5).
+        give_up: probability of the target below which a look is not worth a pass (none: the value chosen when the
+            belief was fitted).
+        closer: largest number of closer looks, in which a window around a place that seems to hold the target is
+            enlarged to the detector's input; 0: none. Each takes one of the passes.
+    """
+
+    target: str | None = None
+    embeddings: Path | None = None
+    confirm: Share | None = None
+    give_up: Share | None = None
+    closer: MostCloserLooks | None = None
+
+
+@dataclass(frozen=True)
+class FindOptions(PictureOptions):
+    """Find all objects.
+
+    Args:
+        target: class to find, or several with commas (none: all classes).
+        worth: a look is worth a pass if it is expected to show this many new objects (none: 0.01).
+        batch: number of windows that are looked at together.
+    """
+
+    target: str | None = None
+    worth: Weight | None = None
+    batch: Count = 1
+
+
+@dataclass(frozen=True)
+class ExploreOptions(PictureOptions):
+    """Explore pictures.
+
+    Args:
+        worth: least expected gain of a look: cells that are named right with a learned map (none: 0.1), or in a large
+            picture new objects (none: 0.01); 0 makes all looks.
+    """
+
+    worth: Weight | None = None
+
+
+@dataclass(frozen=True)
+class LiveOptions(AgentOptions):
+    """Look at a video, a camera or a network stream.
+
+    Args:
+        source: video file, or address of a stream.
+        camera: number of a camera.
+        target: class to search for (none: explore).
+        frames: number of frames to look at (none: all of them; a camera until Ctrl-C).
+        rate: rate at which belief fades from frame to frame; 0: never.
+        confirm: the target counts as found when its probability reaches this value (none: that of the model).
+        give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
+        closer: largest number of closer looks in the time until half of the belief has faded; 0: none.
+        out: video to write, with gaze, belief and detections drawn into each frame.
+    """
+
+    source: str | None = None
+    camera: Whole | None = None
+    target: str | None = None
+    frames: Count | None = None
+    rate: Annotated[float, Range(0, 100)] = RATE
+    confirm: Share | None = None
+    give_up: Share | None = None
+    closer: MostCloserLooks = MOST_CLOSER
+    out: Path | None = None
+
+
+@dataclass(frozen=True)
+class DetectorsOptions(Settings):
+    """Detectors that can be named.
+
+    Args:
+        name: name or file of a detector whose classes are listed, or a folder of models.
+    """
+
+    name: Path | None = None
+
+
+def start_of(text: str | None) -> int | tuple[int, int] | None:
+    """The first cell as a number, or as column and row.
+
+    Args:
+        text: `47`, or `5,5`.
+
+    Returns:
+        The cell.
+
+    Raises:
+        InputError: it is neither.
+
+    >>> start_of("5,7"), start_of("47"), start_of(None)
+    ((5, 7), 47, None)
+    """
+    if text is None:
+        return None
+    try:
+        numbers = [int(word) for word in text.strip("()[] ").split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2) or min(numbers) < 0:
+        raise InputError(f"start: expected a cell as column,row (5,5) or as its number (47), got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])

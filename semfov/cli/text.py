@@ -1,0 +1,222 @@
+"""What the command prints: outcomes, objects and looks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from semfov.decision import Decision
+from semfov.paths import GazeRecord, Scanpath, detections_in_words
+from semfov.viz.drawing import CONFIDENT
+from semfov.viz.semantic import named_regions
+
+OBJECTS_LISTED = 20
+"""Largest number of objects that are listed."""
+
+
+def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
+    """Say what was found where, with what, and in how many passes and seconds.
+
+    Args:
+        record: the record.
+        name: name of the picture.
+        seconds: time that it took.
+
+    Returns:
+        Lines of text.
+    """
+    width, height = record.size
+    passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
+    lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
+    lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
+    if record.decision is None:
+        lines += regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
+        lines += objects_lines(record)
+    return "\n".join(lines)
+
+
+def _headline(record: GazeRecord) -> str:
+    if record.decision is not None:
+        return decision_text(record, record.decision)
+    expected = record.expected
+    number = f"{sum(expected.values()):.1f}"
+    if len(expected) > 1 and record.targets:
+        number = ", ".join(f"{count:.1f} {name}" for name, count in expected.items())
+    return f"{record.objects_in_words()}; expected number {number}"
+
+
+def decision_text(record: GazeRecord, decision: Decision) -> str:
+    """Say whether the target was found, and where.
+
+    Args:
+        record: the record of a search.
+        decision: its decision.
+
+    Returns:
+        The text.
+    """
+    name, probability = record.target_name, f"probability {decision.probability:.2f}"
+    if decision.outcome != "found":
+        where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
+        return f"{name} {where}, {probability}"
+    point, box = found_place(record, decision)
+    edges = f", box {box_text(box)}" if box is not None else ""
+    where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
+    return f"found {name}{where}{edges}, {probability}"
+
+
+def found_place(
+    record: GazeRecord, decision: Decision
+) -> tuple[tuple[float, float] | None, tuple[float, float, float, float] | None]:
+    """Middle and box of what was found, in picture pixels; the middle of the cell where there is no box.
+
+    Args:
+        record: the record.
+        decision: its decision.
+
+    Returns:
+        `(x, y)` and `(x1, y1, x2, y2)`, each None where it is not known.
+    """
+    if decision.box is not None:
+        x1, y1, x2, y2 = (float(edge) for edge in decision.box)
+        return ((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1, x2, y2)
+    if isinstance(record, Scanpath) and decision.cell is not None:
+        x, y = record.grid.centres[decision.cell].tolist()
+        return (x, y), None
+    return None, None
+
+
+def objects_lines(record: GazeRecord) -> list[str]:
+    """A line for each of the most confident objects.
+
+    Args:
+        record: the record.
+
+    Returns:
+        The lines.
+    """
+    rows = record.object_rows()
+    lines = [
+        f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
+        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' if row['confirmed'] else ''}"
+        for row in rows[:OBJECTS_LISTED]
+    ]
+    more = len(rows) - OBJECTS_LISTED
+    return [*lines, f"  and {more} more (--out FILE.json writes all)"] if more > 0 else lines
+
+
+def box_text(box: Sequence[float]) -> str:
+    """Corners of a box in whole pixels.
+
+    Args:
+        box: `(x1, y1, x2, y2)`.
+
+    Returns:
+        The text.
+
+    >>> box_text((380.2, 190.0, 443.9, 276.4))
+    '380,190–444,276'
+    """
+    x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
+    return f"{x1},{y1}–{x2},{y2}"
+
+
+def regions_lines(scanpath: Scanpath) -> list[str]:
+    """A line for each class that the final map of an exploration names, with its most probable cell.
+
+    Args:
+        scanpath: the exploration.
+
+    Returns:
+        The lines.
+    """
+    parts: dict[str, list[int]] = {}
+    for label, cells, _ in named_regions(scanpath):
+        parts.setdefault(label, []).extend(cells)
+    lines = []
+    for label, cells in sorted(parts.items(), key=lambda item: -len(item[1])):
+        chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
+        x, y = scanpath.grid.centres[cells[int(chance.argmax())]].tolist()
+        many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
+        lines.append(f"  map: {label} in {many}, p up to {float(chance.max()):.2f} around ({x:.0f}, {y:.0f})")
+    return lines
+
+
+def looks_text(record: GazeRecord) -> str:
+    """The looks as a table: where, which part of the picture, what was detected, and how long it took.
+
+    Args:
+        record: the record.
+
+    Returns:
+        Lines of text.
+    """
+    width, height = record.size
+    rows = [["look", "at (x, y)", "shows", "detections", "value", "ms"]]
+    for look in record:
+        whole = tuple(look.region) == (0, 0, width, height)
+        rows.append(
+            [
+                str(look.number),
+                f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
+                "the whole picture" if whole else box_text(look.region),
+                detections_in_words(look.detections, record.classes, score=CONFIDENT),
+                "" if look.value is None else f"{look.value:.3f}",
+                "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
+            ]
+        )
+    lines = [f"  {line}" for line in table_lines(rows)]
+    for number, close_up in enumerate(record.closer, 1):
+        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
+        lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
+    return "\n".join(lines)
+
+
+def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of equal length as lines with aligned columns.
+
+    Args:
+        rows: the cells.
+
+    Returns:
+        The lines.
+
+    >>> table_lines([["name", "size"], ["a", "12"]])
+    ['name  size', 'a     12']
+    """
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def columns(names: Sequence[str], width: int = 100) -> str:
+    r"""Names in columns, in order down each column.
+
+    Args:
+        names: the names.
+        width: width of the text in letters.
+
+    Returns:
+        Lines of text.
+
+    >>> columns(["cup", "fork", "oven"], 12)
+    'cup   oven\nfork'
+    """
+    wide = max(map(len, names)) + 2
+    across = max(1, width // wide)
+    down = -(-len(names) // across)
+    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
+
+
+def plain_name(name: str) -> str:
+    """Make a name valid on every file system.
+
+    Args:
+        name: any text.
+
+    Returns:
+        The name.
+
+    >>> plain_name("my cup, frame 3")
+    'my-cup-frame-3'
+    """
+    return re.sub(r"[^\w.]+", "-", name).strip("-.") or "picture"

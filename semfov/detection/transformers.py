@@ -1,0 +1,208 @@
+"""Object detection models of transformers (DETR, RT-DETR, D-FINE), with the full score vector of every box."""
+
+import inspect
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.detection.class_names import keep_classes, named_outputs
+from semfov.detection.detector import Detector, check_images
+from semfov.detection.modules import module_digest
+from semfov.detection.onnx_heads import decode_detr, decode_rtdetr
+from semfov.detection.placement import Placement, letterbox
+from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
+from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.selection import Selection
+from semfov.errors import DataError, InputError, check, check_shape
+
+SOFTMAX = ("detr", "table-transformer", "yolos")
+"""Kinds of models whose scores are a softmax over the classes and "no object"; the others have a sigmoid each."""
+_IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformable_detr", "dab-detr")
+_EDGES = {"shortest_edge": 800, "longest_edge": 1333}
+_SQUARE = {"height": 640, "width": 640}
+
+
+class TransformersDetector(Detector):
+    """An object detection model of transformers as a `Detector`; it is differentiable.
+
+    The model takes `pixel_values` and returns `logits` and `pred_boxes`. Everything is taken before the thresholds and
+    the top-k of transformers' `post_process_object_detection`.
+
+    Args:
+        model: the model.
+        classes: name of each score, `"N/A"` for scores that do not stand for a class; None for those of its `config`.
+        name: name of the model in tables and in fitted models; None for the kind of the model.
+        processor: settings of transformers' image processor: `size` (`height` and `width`, to which images are
+            stretched, or `shortest_edge` and `longest_edge`), `do_normalize`, `image_mean` and `image_std`. None takes
+            those with which the kind of model is trained.
+        background: background policy; None for `own` where the model has "no object", else `residual`.
+        selection: settings of the selection of boxes.
+        digest: sha256 of the weights.
+
+    Raises:
+        InputError: the model is for another task, or takes a text.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        classes: Sequence[str] | None = None,
+        *,
+        name: str | None = None,
+        processor: Mapping[str, Any] | None = None,
+        background: BackgroundPolicy | None = None,
+        selection: Selection | None = None,
+        digest: str = "",
+    ) -> None:
+        config: Any = model.config
+        detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
+        takes_text = "input_ids" in inspect.signature(model.forward).parameters
+        if not detects or takes_text:
+            raise InputError(
+                f"detector: expected a model for object detection with classes of its own, such as "
+                f"RTDetrForObjectDetection, got {type(model).__name__}"
+            )
+        if classes is None:
+            classes = [config.id2label[index] for index in sorted(config.id2label)]
+        names, places = named_outputs(classes)
+        normal = config.model_type in _IMAGENET
+        given: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
+        given |= processor or {}
+        size = given.get("size") or (_EDGES if normal else _SQUARE)
+        self.edges = (size["shortest_edge"], size["longest_edge"]) if "shortest_edge" in size else None
+        self.softmax = config.model_type in SOFTMAX
+        super().__init__(
+            config.model_type if name is None else name,
+            names,
+            (size["width"], size["height"]) if self.edges is None else (self.edges[1], self.edges[1]),
+            background=("own" if self.softmax else "residual") if background is None else background,
+            selection=selection,
+            stretch=self.edges is None,
+            digest=digest,
+        )
+        self.model = model.eval()
+        self.preprocessing = Preprocessing(stretch=self.edges is None)
+        if given["do_normalize"]:
+            means = {"mean": given["image_mean"], "std": given["image_std"]}
+            self.preprocessing = self.preprocessing.merged(means)
+        self._places, self._count = places, len(classes)
+
+    def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
+        """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's image processor does, without padding."""
+        check_images(images)
+        if self.edges is None:
+            return letterbox(images, self.input_size, stretch=True)
+        height, width = images.shape[-2:]
+        scale = min(self.edges[0] / min(width, height), self.edges[1] / max(width, height))
+        columns, rows = max(1, math.floor(width * scale)), max(1, math.floor(height * scale))
+        canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False, antialias=scale < 1)
+        return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        check_shape(canvas, "canvas", None, 3, None, None)
+        if not canvas.is_floating_point():
+            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        outputs = self.model(pixel_values=self.preprocessing(canvas.to(next(self.model.parameters()).dtype)))
+        logits, boxes = outputs.logits.to(canvas.dtype), outputs.pred_boxes.to(canvas.dtype)
+        size = (canvas.shape[-1], canvas.shape[-2])
+        candidates = decode_detr(logits, boxes, size) if self.softmax else decode_rtdetr(logits, boxes, size)
+        return keep_classes(candidates, self._places, self._count)
+
+    def settings(self) -> dict[str, object]:
+        """List the settings that the detections depend on."""
+        own = {"softmax": self.softmax, "preprocessing": self.preprocessing.settings()}
+        return super().settings() | own | ({} if self.edges is None else {"edges": list(self.edges)})
+
+
+def wrap_transformers(
+    model: nn.Module,
+    *,
+    classes: Sequence[str] | None = None,
+    name: str | None = None,
+    processor: Mapping[str, Any] | None = None,
+    background: BackgroundPolicy | None = None,
+    threshold: float = 0.02,
+    iou: float = 0.5,
+    limit: int = 100,
+    per_class: bool = False,
+    device: torch.device | str | None = None,
+) -> TransformersDetector:
+    """Make a detector of an object detection model of transformers.
+
+    Args:
+        model: the model.
+        classes: name of each score; None for those of its `config`.
+        name: name of the model in tables and in fitted models.
+        processor: settings of the image processor (`TransformersDetector`), such as `processor.to_dict()`.
+        background: background policy of the scores (`semfov.detection.score_vectors`).
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        device: device of the model; None leaves it where it is.
+
+    Returns:
+        The detector, in `eval` mode.
+
+    Raises:
+        InputError: the model is for another task, or an option does not fit it.
+    """
+    selection = Selection(threshold, iou, limit, per_class)
+    detector = TransformersDetector(
+        model if device is None else model.to(device),
+        classes,
+        name=name,
+        processor=processor,
+        background=background,
+        selection=selection,
+        digest=module_digest(model),
+    )
+    return detector.eval()
+
+
+def load_hub(name: str, *, revision: str | None = None, **options: Any) -> TransformersDetector:
+    """Load an object detection model from Hugging Face's hub, with the settings of its image processor.
+
+    Only safetensors are read, and no code of the repository is run.
+
+    Args:
+        name: `hf:owner/name`, or `hf:` and a folder that transformers' `save_pretrained` wrote.
+        revision: branch, tag or commit of the repository.
+        options: options of `wrap_transformers`.
+
+    Returns:
+        The detector, in `eval` mode and without gradients of its parameters.
+
+    Raises:
+        InputError: transformers or a package that the model needs is not installed, or the model is for another task.
+        DataError: the model cannot be downloaded, is damaged, or has no safetensors.
+
+    Example::
+
+        detector = semfov.load_detector("hf:PekingU/rtdetr_v2_r18vd")
+    """
+    repository = name.removeprefix("hf:")
+    check(bool(repository), "detector", "hf:owner/name", repr(name))
+    try:
+        from transformers import AutoImageProcessor, AutoModelForObjectDetection
+    except ImportError:
+        raise InputError(
+            "detector: expected the package transformers, which is not installed; pip install transformers"
+        ) from None
+    try:
+        model = AutoModelForObjectDetection.from_pretrained(
+            repository, revision=revision, use_safetensors=True, trust_remote_code=False
+        )
+        processor = AutoImageProcessor.from_pretrained(repository, revision=revision, trust_remote_code=False)
+    except ImportError as error:
+        raise InputError(f"detector: {name} needs a package that is not installed: {error}") from error
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
+    model.requires_grad_(False)
+    return wrap_transformers(model, **{"name": name, "processor": processor.to_dict(), **options})

@@ -1,0 +1,128 @@
+"""Models of Ultralytics as detectors, with the full score vector of every box."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from semfov.detection.class_names import keep_classes, named_outputs
+from semfov.detection.detector import Detector
+from semfov.detection.modules import module_digest
+from semfov.detection.onnx_heads import decode_yolov8
+from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.selection import Selection
+from semfov.errors import InputError, check_shape
+
+
+class UltralyticsDetector(Detector):
+    """A detection model of Ultralytics as a `Detector`; it is differentiable.
+
+    Its network returns, for every cell, a box and a sigmoid for each class: `(B, 4 + K, N)`. The package itself is not
+    imported here.
+
+    Args:
+        model: an `ultralytics.YOLO` object, or the network in it.
+        classes: names of the classes; None for those of the model.
+        name: name of the model in tables and in fitted models.
+        input_size: size of the canvas in pixels, one side or `(width, height)`.
+        background: background policy of the scores.
+        selection: settings of the selection of boxes.
+        digest: sha256 of the weights.
+
+    Raises:
+        InputError: the model returns boxes without their full scores.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        classes: Sequence[str] | None = None,
+        *,
+        name: str = "ultralytics",
+        input_size: int | tuple[int, int] = 640,
+        background: BackgroundPolicy = "residual",
+        selection: Selection | None = None,
+        digest: str = "",
+    ) -> None:
+        network: Any = _network(model)
+        if classes is None:
+            found = network.names
+            classes = [found[index] for index in sorted(found)] if isinstance(found, dict) else list(found)
+        names, places = named_outputs(classes)
+        super().__init__(
+            name,
+            names,
+            (input_size, input_size) if isinstance(input_size, int) else input_size,
+            background=background,
+            selection=selection,
+            fill=114 / 255,
+            stride=32,
+            digest=digest,
+        )
+        self.model = network.eval()
+        self._places, self._count = places, len(classes)
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        check_shape(canvas, "canvas", None, 3, None, None)
+        outputs = self.model(canvas.to(next(self.model.parameters()).dtype))
+        columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
+        if not isinstance(columns, Tensor) or columns.ndim != 3 or columns.shape[1] != 4 + self._count:
+            got = tuple(columns.shape) if isinstance(columns, Tensor) else type(columns).__name__
+            raise InputError(
+                f"detector: expected a network that returns all class scores of each box, (B, {4 + self._count}, N), "
+                f"got {got}; use a detection model whose head selects no boxes (end2end off)"
+            )
+        return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)
+
+
+def wrap_ultralytics(
+    model: nn.Module,
+    *,
+    classes: Sequence[str] | None = None,
+    name: str = "ultralytics",
+    input_size: int | tuple[int, int] = 640,
+    background: BackgroundPolicy = "residual",
+    threshold: float = 0.02,
+    iou: float = 0.5,
+    limit: int = 100,
+    per_class: bool = False,
+    device: torch.device | str | None = None,
+) -> UltralyticsDetector:
+    """Make a detector of a model of Ultralytics.
+
+    Args:
+        model: an `ultralytics.YOLO` object, or the network in it.
+        classes: names of the classes; None for those of the model.
+        name: name of the model in tables and in fitted models.
+        input_size: size of the canvas in pixels, one side or `(width, height)`.
+        background: background policy of the scores (`semfov.detection.score_vectors`).
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        device: device of the model; None leaves it where it is.
+
+    Returns:
+        The detector, in `eval` mode.
+    """
+    network = _network(model)
+    return UltralyticsDetector(
+        network if device is None else network.to(device),
+        classes,
+        name=name,
+        input_size=input_size,
+        background=background,
+        selection=Selection(threshold, iou, limit, per_class),
+        digest=module_digest(network),
+    ).eval()
+
+
+def _network(model: Any) -> nn.Module:
+    """The network of an `ultralytics.YOLO` object, which has it as its `model`; a network has layers there."""
+    inner = getattr(model, "model", None)
+    network = inner if hasattr(inner, "names") else model
+    if not isinstance(network, nn.Module) or not hasattr(network, "names"):
+        raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
+    return network

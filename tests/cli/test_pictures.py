@@ -1,0 +1,247 @@
+"""Search, find and explore as a user runs them, with a detector of red squares: texts, results, figures and pages."""
+
+import csv
+import json
+import re
+
+import pytest
+import torch
+from PIL import Image
+
+from semfov.belief import Verification
+from semfov.belief.target_evidence import Thresholds
+
+
+def episodes_of(page):
+    text = page.read_text(encoding="utf-8")
+    return json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])["episodes"]
+
+
+def written_files(printed):
+    return [line.strip() for line in printed.out.partition("written:\n")[2].splitlines() if line.startswith("  ")]
+
+
+def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
+    code, printed = run("search", photo, "--target", "red", "--start", "7,5", "--looks", "--out", tmp_path / "out",
+                        "--report", tmp_path / "page.html")  # fmt: skip
+    assert code == 0
+    found = re.search(
+        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, probability [01]\.\d\d\n"
+        r"  \w.*\. \d+ passes in \d+\.\d s\.", printed.out,
+    )  # fmt: skip
+    assert found
+    assert 8 <= int(found[1]) <= 28
+    assert 8 <= int(found[2]) <= 28
+    assert "  0     (150, 110)" in printed.out  # the middle of the cell in column 7 and row 5 of 8 × 6
+    names = {"results.json", "scanpath.png", "views.png", "belief.png", "animation.gif"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    listed = written_files(printed)
+    assert {str(tmp_path / "out" / name) for name in names} | {str(tmp_path / "page.html")} == set(listed)
+    (episode,) = episodes_of(tmp_path / "page.html")
+    assert episode["name"] == "my photo.png"
+    (result,) = json.loads((tmp_path / "out/results.json").read_text())["pictures"]
+    assert (result["outcome"], result["picture"]) == ("found", str(photo))
+    assert (round(result["x"]), round(result["y"])) == (int(found[1]), int(found[2]))
+
+
+def test_nothing_is_written_unless_it_is_asked_for(run, photo, tmp_path):
+    before = set(tmp_path.rglob("*"))
+    code, printed = run("search", photo, "--target", "red", "--start", 47)
+    assert code == 0
+    assert "written:" not in printed.out
+    assert set(tmp_path.rglob("*")) == before
+    code, printed = run("search", photo, "--target", "red", "--start", 47, "--out", tmp_path / "out", "--draw", "none")
+    assert written_files(printed) == [str(tmp_path / "out/results.json")]
+
+
+@pytest.mark.parametrize("task", ["search", "explore"])
+def test_only_the_named_figures_are_drawn(run, photo, tmp_path, task):
+    more = ("--target", "red", "--start", 47) if task == "search" else ("--shifts", 1)
+    code, _ = run(task, photo, *more, "--out", tmp_path / "found.json", "--draw", "belief,belief_bars")
+    assert code == 0
+    wanted = {"belief.png", "belief_bars.png"} if task == "search" else {"map.png"}
+    assert {file.name for file in (tmp_path / "found").iterdir()} == wanted
+
+
+def test_a_description_is_matched_to_classes_by_word_vectors(run, photo, tmp_path):
+    vectors = tmp_path / "vectors.txt"
+    vectors.write_text("red 1 0.8\nwine 0.8 1\nglass 1 1\ncrimson 1 0.9\n")
+    described = ["search", photo, "--target", "something crimson", "--start", 47]
+    code, printed = run(*described, "--embeddings", vectors)
+    assert code == 0
+    assert re.search(r"may mean: (red|wine glass) 1\.00, (red|wine glass) 0\.\d\d", printed.out)
+    assert "found red" in printed.out
+    code, printed = run(*described)
+    assert code == 1
+    assert "unknown class" in printed.err
+    assert "--embeddings" in printed.err
+
+
+def test_all_objects_are_listed_and_written_as_tables(run, photo, large, tmp_path, agent, evidence):
+    """The box of the square is the same in every format, and a table has a line for each object."""
+    agent.windows = evidence
+    for kind in ("json", "csv", "geojson", "coco.json"):
+        code, printed = run("find", photo, large, "--target", "red", "--passes", 4, "--out", tmp_path / f"boxes.{kind}")
+        assert code == 0
+    assert re.search(r"my photo\.png, 160 × 120 px: 1 × red from score 0\.3; expected number \d\.\d\n", printed.out)
+    assert re.search(r"  red 0\.\d\d at \(18, 18\), box 8,8–28,28", printed.out)
+    assert "2 pictures: 2 looked at" in printed.out
+    first, second = json.loads((tmp_path / "boxes.json").read_text())["pictures"]
+    boxes = [[row[edge] for edge in ("x1", "y1", "x2", "y2")] for row in (*first["objects"], *second["objects"])]
+    assert boxes[0] == pytest.approx([8, 8, 28, 28], abs=1)
+    assert boxes[1] == pytest.approx([1000, 700, 1040, 740], abs=8)
+    assert (second["width"], second["height"]) == (1280, 960)
+    assert list(second["expected"]) == ["red"]
+    with (tmp_path / "boxes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["picture"], row["class"]) for row in rows] == [(str(photo), "red"), (str(large), "red")]
+    assert [[float(row[edge]) for edge in ("x1", "y1", "x2", "y2")] for row in rows] == boxes
+    coco = json.loads((tmp_path / "boxes.coco.json").read_text())
+    names = {each["id"]: each["name"] for each in coco["categories"]}
+    for each, (x1, y1, x2, y2), image in zip(coco["annotations"], boxes, coco["images"], strict=True):
+        assert each["bbox"] == pytest.approx([x1, y1, x2 - x1, y2 - y1])
+        assert (names[each["category_id"]], each["image_id"]) == ("red", image["id"])
+    places = json.loads((tmp_path / "boxes.geojson").read_text())["features"]
+    corners = [each["geometry"]["coordinates"][0] for each in places]
+    assert [[min(x), min(y), max(x), max(y)] for x, y in (zip(*ring, strict=True) for ring in corners)] == boxes
+    assert [each["properties"]["picture"] for each in places] == [str(photo), str(large)]
+
+
+def test_several_classes_or_all_are_found(run, photo):
+    _, printed = run("find", photo, "--target", "Red, wine glass")
+    assert "px: 1 × red, 0 × wine glass from score 0.3" in printed.out
+    _, printed = run("find", photo, "--passes", 1)
+    assert "px: 1 object from score 0.3" in printed.out
+
+
+def test_a_search_of_pictures_is_a_table_with_a_line_for_each(run, photo, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    photo.rename(folder / "a.png")
+    Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "b.png")
+    code, printed = run("search", folder, "--target", "red", "--shifts", 4, "--out", tmp_path / "found.csv")
+    assert code == 0
+    with (tmp_path / "found.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    assert (first["outcome"], second["outcome"]) == ("found", "undecided")
+    assert 8 <= float(first["x"]) <= 28
+    assert second["x"] == ""
+    assert "2 pictures: 1 found, 1 undecided" in printed.out
+
+
+def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("a.png", "c.png"):
+        Image.open(photo).save(folder / name)
+    (folder / "b.png").write_bytes((folder / "a.png").read_bytes()[:120])
+    code, printed = run("find", folder, "--out", tmp_path / "boxes.json", "--report", tmp_path / "page.html")
+    assert code == 1
+    assert re.search(r"skipped \S+b\.png: image .* cannot be decoded", printed.err)
+    assert "3 pictures: 2 looked at; 1 skipped" in printed.out
+    result = json.loads((tmp_path / "boxes.json").read_text())
+    assert [each["picture"] for each in result["pictures"]] == [str(folder / "a.png"), str(folder / "c.png")]
+    assert [each["picture"] for each in result["skipped"]] == [str(folder / "b.png")]
+    assert [each["name"] for each in episodes_of(tmp_path / "page.html")] == ["a.png", "c.png"]
+
+
+def test_an_interrupted_folder_leaves_its_results_and_ends_in_one_line(run, photo, tmp_path, agent, monkeypatch):
+    seen = []
+
+    def stop(*arguments, **options):
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(find_all(*arguments, **options))
+        return seen[0]
+
+    find_all = agent.find_all
+    monkeypatch.setattr(agent, "find_all", stop)
+    code, printed = run("find", photo, photo, "--out", tmp_path / "boxes.json")
+    assert code == 130
+    assert printed.err.splitlines()[-1] == "interrupted"
+    assert len(json.loads((tmp_path / "boxes.json").read_text())["pictures"]) == 1
+    assert written_files(printed) == [str(tmp_path / "boxes.json")]
+
+
+def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, evidence, tmp_path):
+    evidence.verification = Verification(thresholds=Thresholds(0.4, 0.0, 0.0))
+    for parameter in evidence.verification.requires_grad_(False).parameters():
+        parameter.zero_()  # all probabilities after closer looks are one half
+    agent.windows = evidence
+    search = ("search", large, "--target", "red", "--passes", 5, "--looks")
+    code, printed = run(*search, "--out", tmp_path / "out", "--report", tmp_path / "page.html")
+    assert code == 0
+    assert re.search(
+        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, probability 0\.50", printed.out
+    )
+    assert "A closer look confirmed the target." in printed.out
+    assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}
+    (episode,) = episodes_of(tmp_path / "page.html")
+    assert len(episode["looks"]) == int(episode["passes"])
+    _, printed = run(*search, "--closer", 0)
+    assert "closer look" not in printed.out
+    _, printed = run("search", large, "--target", "red", "--confirm", 1, "--give-up", 0, "--passes", 3, "--closer", 0)
+    assert "red undecided" in printed.out
+    assert "All 3 passes were used. 3 passes" in printed.out
+    _, printed = run("explore", large, "--worth", 1000)
+    assert "1 pass in" in printed.out
+
+
+def test_a_folder_may_have_small_and_large_pictures(run, photo, large, agent, evidence, tmp_path):
+    agent.windows = evidence
+    photo.rename(large.with_name(photo.name))
+    out, page = tmp_path / "out", tmp_path / "page.html"
+    code, _ = run("search", large.parent, "--target", "red", "--passes", 6, "--out", out, "--report", page)
+    assert code == 0
+    assert [(each["name"], "looks" in each) for each in episodes_of(page)] == [
+        ("field.png", True),
+        ("my photo.png", False),
+    ]
+    assert (out / "000-field.png/scanpath.png").is_file()
+    assert (out / "001-my-photo.png/animation.gif").is_file()
+
+
+@pytest.mark.parametrize("size", [(320, 160), (400, 300)], ids=["panorama", "flat"])
+def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monkeypatch, size):
+    Image.new("RGB", size, (100, 100, 100)).save(tmp_path / "scene.png")
+    scenes = []
+    monkeypatch.setattr(type(agent), "explore", lambda self, scene, **options: scenes.append((scene, options)) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run("explore", tmp_path / "scene.png", "--how", "head", "--duration", 5)
+    ((scene, options),) = scenes
+    assert type(scene).__name__ == ("Panorama" if size == (320, 160) else "Flat")
+    assert options["duration"] == 5
+
+
+def test_file_names_are_escaped_in_the_report(run, photo, tmp_path):
+    photo = photo.rename(photo.with_name("<img src=x onerror=alert(1)>'\"&$x$.png"))
+    code, _ = run("search", photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
+    assert code == 0
+    assert "<img" not in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert episodes_of(tmp_path / "page.html")[0]["name"] == photo.name
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("search", "--target", "Cups"),
+        ("find", "--target", "cup"),
+        ("explore", "--shifts", 1),
+        ("search", "--target", "cup", "--agent", "published", "--sensor", "published-narrow", "--shifts", 1),
+        ("explore", "--agent", "raw", "--sensor", "gradual", "--shifts", 1),
+    ],
+    ids=lambda options: " ".join(map(str, options[:5])),
+)
+def test_the_agents_of_the_package_look_at_an_embedded_scene(options, tmp_path, capsys):
+    from semfov.cli.main import main
+
+    out = ["--out", str(tmp_path / "out"), "--report", str(tmp_path / "page.html")]
+    with torch.random.fork_rng():
+        assert main([*map(str, options), *out]) == 0
+    printed = capsys.readouterr().out
+    assert "an embedded scene" in printed
+    assert (tmp_path / "out/scanpath.png").is_file()
+    assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -1,0 +1,141 @@
+"""What the command is told: help, version, and mistakes that are refused in one line before anything is loaded."""
+
+import re
+
+import pytest
+
+import semfov
+from semfov.cli import agent, live, search
+from semfov.cli.main import SUBCOMMANDS, main
+from semfov.errors import InputError
+from semfov.runs.command import make_parser
+
+REFUSED = {
+    "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
+    "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
+    "search": "target: expected a class, --target cup, got none; `semfov detectors yolov3-tiny` lists them",
+    "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
+    "find --start 5,5": "start: expected none for find",
+    "search nosuch.jpg --target cup": "picture: no such file or folder: nosuch.jpg; check the path",
+    "explore film.mp4": "picture: expected photographs; `semfov live` takes videos, got film.mp4",
+    "explore http://example.org/a.jpg": "picture: expected a file on this machine",
+    "explore FOLDER": "picture: expected photographs (.jpg",
+    "live": "source: expected a video, an address or --camera 0, got none",
+    "live nosuch.mp4": "nosuch.mp4; check the path",
+    "live a.mp4 --camera 0": "camera: expected a video or a camera, not both, got 0",
+    "live --camera -1": "camera: expected a whole number from 0",
+    "live --camera 0 --rate -1": "rate: expected a number from 0",
+    "live --camera 0 --frames 0": "frames: expected a whole number from 1",
+    "search --target cup --passes 0": "passes: expected a whole number from 1 to 1,000,000, got 0",
+    "search --target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
+    "search --target cup --seconds 0": "seconds: expected a number above 0",
+    "search --target cup --confirm 50": "confirm: expected a number from 0 to 1, got 50",
+    "search --target cup --give-up -1": "give_up: expected a number from 0 to 1, got -1",
+    "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
+    "search --target cup --seed -1": "seed: expected a whole number from 0",
+    "search --target cup --out a.xls": "out: expected a folder, or a file that ends in .coco.json, .json, .csv",
+    "search --target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
+    "search --target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
+    "search --target cup --detector my.weights": "detector: expected a cfg and its weights",
+    "detectors yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
+    "fit": "model: expected the name or the file of a detector, got none",
+}
+
+WRONG_USE = {
+    "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
+    "--target cup": "expected a command before --target: search, find",
+    "FOLDER --target cup": "try `semfov search FOLDER --target CLASS`",
+    "search --targt cup": "unknown option --targt; did you mean --target?",
+    "search --xyz": "unknown option --xyz; --help-all lists all options",
+    "search --target": "--target: expected a value, got none",
+    "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
+    "search --sensor wide": "sensor: expected 'published' or 'published-narrow' or",
+    "search --agent recomended": "or 'raw', got 'recomended'; did you mean 'recommended'?",
+    "search --draw portrait": "draw: expected some of 'scanpath', 'views', 'belief', 'belief_bars', 'animation'",
+    "live a.mp4 b.mp4": "unexpected argument 'b.mp4'",
+}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_loaded(monkeypatch):
+    for module in (agent, live, search):
+        monkeypatch.setattr(module, "make_agent", lambda options: pytest.fail("the agent was loaded"))
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_wrong_values_are_refused_in_one_line(command, tmp_path, capsys):
+    assert main(command.replace("FOLDER", str(tmp_path)).split()) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert REFUSED[command] in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", WRONG_USE)
+def test_wrong_use_is_refused_in_one_line_with_exit_code_2(command, tmp_path, capsys):
+    try:
+        code = main(command.replace("FOLDER", str(tmp_path)).split())
+    except SystemExit as stopped:
+        code = stopped.code
+    assert code == 2
+    error = capsys.readouterr().err
+    assert WRONG_USE[command].replace("FOLDER", str(tmp_path)) in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["help"]])
+def test_alone_it_lists_its_commands(words, capsys):
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert all(re.search(rf"^  {name} ", printed, re.M) for name in SUBCOMMANDS)
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"semfov {semfov.__version__}\n"
+
+
+@pytest.mark.parametrize("name", SUBCOMMANDS)
+def test_help_is_one_screen_with_options_that_exist(name, capsys):
+    """Its examples come first, and --help-all lists every option of the short help."""
+    assert main([name, "--help"]) == 0
+    short = capsys.readouterr().out
+    lines = short.splitlines()
+    assert len(lines) <= 30
+    assert max(map(len, lines)) <= 120
+    assert lines[2].startswith(f"  semfov {name}")
+    assert main([name, "--help-all"]) == 0
+    whole = capsys.readouterr().out
+    usage = short.partition("\nusage:")[2].partition("\n\nWeights")[0]
+    named = set(re.findall(r"--[a-z][\w.-]*", usage)) - {"--help-all"}
+    assert [option for option in named if f"--{option[2:].replace('-', '_')}" not in whole] == []
+
+
+def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
+    command = SUBCOMMANDS["search"]
+    for words in (["--give-up", "0.2"], ["--give_up=0.2"], ["--give-up=0.2"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(["search", *words, "--print-config"])
+        assert stopped.value.code == 0
+        assert "give_up: 0.2" in capsys.readouterr().out
+    parser = make_parser(command.options(), "", command.positional)
+    assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
+
+
+def test_detectors_are_listed_with_licence_and_models(capsys):
+    assert main(["detectors"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^yolov3-tiny +35 MB .*search, closer looks, explore, large pictures +public", printed, re.M)
+    assert re.search(r"^yolox-tiny +20 MB .* none +Apache", printed, re.M)
+    assert main(["detectors", "yolox-nano"]) == 0
+    printed = capsys.readouterr().out
+    assert "yolox-nano knows 80 classes:" in printed
+    assert "wine glass" in printed
+
+
+def test_an_agent_without_models_is_not_made_from_a_folder():
+    from semfov.cli.options import SearchOptions
+
+    with pytest.raises(InputError, match="agent: expected recommended or published with --models, got raw"):
+        make_agent(SearchOptions(agent="raw", models="mymodels"))
+
+
+make_agent = agent.make_agent

@@ -1,0 +1,216 @@
+"""The detectors of transformers: small random models against transformers' own post-processing."""
+
+import json
+import sys
+
+import pytest
+import torch
+from torch import nn
+from transformers import (
+    DetrConfig,
+    DetrForObjectDetection,
+    DetrImageProcessor,
+    DFineConfig,
+    DFineForObjectDetection,
+    OwlViTConfig,
+    OwlViTForObjectDetection,
+    ResNetConfig,
+    RTDetrConfig,
+    RTDetrForObjectDetection,
+    RTDetrImageProcessor,
+    RTDetrResNetConfig,
+    RTDetrV2Config,
+    RTDetrV2ForObjectDetection,
+)
+from transformers.models.hgnet_v2 import HGNetV2Config
+
+from semfov import load_detector
+from semfov.errors import DataError, InputError
+
+NAMES = {0: "N/A", 1: "cat", 2: "dog", 3: "cup"}
+SMALL = {"d_model": 16, "encoder_attention_heads": 2, "decoder_attention_heads": 2, "decoder_ffn_dim": 32}
+HYBRID = {
+    **SMALL,
+    "num_labels": 4,
+    "id2label": NAMES,
+    "encoder_hidden_dim": 16,
+    "encoder_ffn_dim": 32,
+    "encoder_in_channels": [16, 24, 32],
+    "feat_strides": [8, 16, 32],
+    "decoder_in_channels": [16, 16, 16],
+    "decoder_layers": 2,
+    "num_queries": 20,
+    "num_denoising": 0,
+}
+
+
+def resnet():
+    return RTDetrResNetConfig(
+        embedding_size=8,
+        hidden_sizes=[8, 16, 24, 32],
+        depths=[1, 1, 1, 1],
+        layer_type="basic",
+        out_features=["stage2", "stage3", "stage4"],
+    )
+
+
+def hgnet():
+    return HGNetV2Config(
+        hidden_sizes=[8, 16, 24, 32],
+        stem_channels=[3, 8, 8],
+        stage_in_channels=[8, 8, 16, 24],
+        stage_mid_channels=[8, 8, 8, 8],
+        stage_out_channels=[8, 16, 24, 32],
+        stage_num_blocks=[1, 1, 1, 1],
+        stage_downsample=[False, True, True, True],
+        stage_light_block=[False, False, True, True],
+        stage_kernel_size=[3, 3, 5, 5],
+        stage_numb_of_layers=[1, 1, 1, 1],
+        out_features=["stage2", "stage3", "stage4"],
+    )
+
+
+def detr():
+    backbone = ResNetConfig(
+        embedding_size=8, hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], layer_type="basic", out_features=["stage4"]
+    )
+    sizes = {"encoder_layers": 1, "decoder_layers": 1, "encoder_ffn_dim": 32, "num_queries": 12}
+    config = DetrConfig(
+        **SMALL, **sizes, use_timm_backbone=False, backbone_config=backbone, backbone=None, id2label=NAMES
+    )
+    return DetrForObjectDetection(config)
+
+
+MODELS = {
+    "detr": detr,
+    "rt_detr": lambda: RTDetrForObjectDetection(RTDetrConfig(backbone_config=resnet(), **HYBRID)),
+    "rt_detr_v2": lambda: RTDetrV2ForObjectDetection(RTDetrV2Config(backbone_config=resnet(), **HYBRID)),
+    "d_fine": lambda: DFineForObjectDetection(DFineConfig(backbone_config=hgnet(), **HYBRID)),
+}
+
+
+def small(kind):
+    """A random model whose boxes and scores depend on the picture, and are not all alike."""
+    torch.manual_seed(0)
+    model = MODELS[kind]().eval()
+    for layer in model.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight)
+        elif isinstance(layer, nn.BatchNorm2d):
+            nn.init.ones_(layer.weight)
+    for name, parameter in model.named_parameters():
+        if any(part in name for part in ("class", "bbox", "score")):
+            nn.init.normal_(parameter, std=0.3)
+    return model
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", MODELS)
+def test_boxes_and_scores_are_those_of_transformers(kind):
+    """Of each box transformers returns one class, and its score; RT-DETR's top-k may return a box several times."""
+    model = small(kind)
+    detector = load_detector(model, processor={"size": {"height": 96, "width": 128}}, threshold=0.0, iou=1.0)
+    assert (detector.name, detector.classes) == (kind, ("cat", "dog", "cup"))
+    assert detector.background == ("own" if kind == "detr" else "residual")
+    canvas, _ = detector.fit(torch.rand(2, 3, 60, 80))
+    assert canvas.shape == (2, 3, 96, 128)
+    found = detector.propose(canvas)
+    with torch.no_grad():
+        outputs = model(pixel_values=detector.preprocessing(canvas))
+    processor = DetrImageProcessor() if kind == "detr" else RTDetrImageProcessor()
+    theirs = processor.post_process_object_detection(outputs, threshold=0.0, target_sizes=[(96, 128)] * 2)
+    for image, each in enumerate(theirs):
+        compared = 0
+        for box, label, score in zip(each["boxes"], each["labels"], each["scores"], strict=True):
+            row = (found.boxes[image] - box).abs().amax(-1).argmin()
+            torch.testing.assert_close(found.boxes[image, row], box, atol=1e-3, rtol=1e-4)
+            if int(label) > 0:  # "N/A" is left out
+                torch.testing.assert_close(found.classes[image, row, int(label) - 1], score)
+                compared += 1
+        assert compared
+    if kind == "detr":
+        softmax = outputs.logits.softmax(-1)
+        torch.testing.assert_close(found.background, softmax[..., -1])
+    detections = detector(torch.rand(1, 3, 60, 80))
+    torch.testing.assert_close(detections.scores.sum(-1), torch.ones(detections.scores.shape[:-1]))
+    assert detections.boxes[..., 2].max() <= 80
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["detr", "rt_detr"])
+def test_gradients_reach_the_picture(kind):
+    detector = load_detector(small(kind), processor={"size": {"height": 64, "width": 64}})
+    image = torch.rand(1, 3, 64, 64, requires_grad=True)
+    detector(image).scores[..., 1:].sum().backward()
+    assert image.grad is not None
+    assert image.grad.abs().sum() > 0
+
+
+class Outputs(nn.Module):
+    """What an export to ONNX keeps."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, image):
+        outputs = self.model(pixel_values=image)
+        return outputs.logits, outputs.pred_boxes
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", MODELS)
+def test_exported_models_give_the_same_candidates(kind, tmp_path):
+    model, canvas = small(kind), torch.rand(1, 3, 96, 128)
+    names = {"input_names": ["pixel_values"], "output_names": ["logits", "pred_boxes"]}
+    with torch.no_grad():
+        torch.onnx.export(Outputs(model), (canvas,), tmp_path / "model.onnx", dynamo=False, **names)
+    exported = load_detector(tmp_path / "model.onnx", classes=[*NAMES.values()])
+    detector = load_detector(model, processor={"size": {"height": 96, "width": 128}})
+    assert exported.background == detector.background
+    found, wanted = exported.propose(canvas), detector.propose(canvas)
+    assert (wanted.classes - detector.propose(canvas.flip(-1)).classes).abs().max() > 0.01
+    torch.testing.assert_close(found.boxes, wanted.boxes, atol=1e-2, rtol=1e-3)
+    torch.testing.assert_close(found.classes, wanted.classes, atol=1e-4, rtol=1e-3)
+
+
+def test_pictures_are_resized_as_by_the_image_processor():
+    detector = load_detector(small("detr"))
+    image = torch.rand(1, 3, 100, 300)
+    theirs = DetrImageProcessor()(image[0], do_rescale=False, return_tensors="pt", do_pad=False)["pixel_values"]
+    canvas, placement = detector.fit(image)
+    assert canvas.shape == theirs.shape
+    torch.testing.assert_close(detector.preprocessing(canvas), theirs, atol=0.05, rtol=0)
+    torch.testing.assert_close(
+        placement.boxes_to_image(torch.tensor([[0.0, 0.0, canvas.shape[-1], canvas.shape[-2]]])),
+        torch.tensor([[0.0, 0.0, 300.0, 100.0]]),
+    )
+
+
+@pytest.mark.slow
+def test_a_saved_model_is_loaded_with_its_processor(tmp_path):
+    model = small("rt_detr")
+    model.save_pretrained(tmp_path)
+    RTDetrImageProcessor(size={"height": 64, "width": 96}).save_pretrained(tmp_path)
+    detector = load_detector(f"hf:{tmp_path}", limit=5)
+    assert (detector.input_size, detector.selection.limit) == ((96, 64), 5)
+    image = torch.rand(1, 3, 40, 60)
+    other = load_detector(model, processor={"size": {"height": 64, "width": 96}}, limit=5)
+    torch.testing.assert_close(detector(image).scores, other(image).scores)
+    assert detector.digest == other.digest
+    json.dumps(detector.settings())
+
+
+def test_models_that_cannot_be_read_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(DataError, match="cannot load 'hf:"):
+        load_detector(f"hf:{tmp_path}")
+    with pytest.raises(InputError, match="detector: expected hf:owner/name, got 'hf:'"):
+        load_detector("hf:")
+    small_text = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
+    text = OwlViTForObjectDetection(OwlViTConfig(text_config=small_text, vision_config=small_text, projection_dim=8))
+    with pytest.raises(InputError, match=r"classes of its own, such as RTDetr.*got OwlViT"):
+        load_detector(text)
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(InputError, match="pip install transformers"):
+        load_detector("hf:someone/model")
