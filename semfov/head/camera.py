@@ -9,11 +9,11 @@ from torch import Tensor
 
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large
-from semfov.errors import DataError, check
+from semfov.errors import DataError, InputError, check
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
 from semfov.head.sphere import AROUND, Sphere
-from semfov.head.world import FIELDS, World
+from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, panorama_directions
 
 TRIES = 25
@@ -106,12 +106,13 @@ class CameraScene(Sphere):
     still = False
 
     def __init__(self, camera: PanTiltCamera, color: Color = "rgb", *, cell: float = 6.0) -> None:
+        if isinstance(camera, type):
+            raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
         names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
         missing = [name for name in names if not hasattr(camera, name)]
         remedy = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
         check(not missing, "camera", f"a camera with {', '.join(names)}", remedy)
-        fields = tuple(float(field) for field in camera.fields)
-        check(len(fields) > 0 and 0 < min(fields) <= max(fields) < 180, "fields", "degrees between 0 and 180", fields)
+        fields = check_fields(camera.fields)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2),
