@@ -1,6 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
@@ -22,6 +22,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike
+from semfov.detection.scores import HALVES
 from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
@@ -205,6 +206,17 @@ class ActivePerception(nn.Module):
         """The agent with these parts, ready for use."""
         return cls(**parts).eval().requires_grad_(False)
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
+
+        def precise(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            return tensor.to(moved.device) if moved.dtype in HALVES else moved
+
+        super()._apply(precise, recurse)
+        self.eye.detector._apply(fn, recurse)
+        return self
+
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
@@ -322,8 +334,9 @@ class ActivePerception(nn.Module):
                 the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
                 0.5 for a belief without thresholds.
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes the
-                usual number. 0 decides without them, as does an agent without a model of verification.
+            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes 2 in
+                a photograph, and as many as there are passes for in a large picture. 0 decides without them, as does
+                an agent without a model of verification.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:

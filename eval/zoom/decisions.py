@@ -32,6 +32,7 @@ def decide_all(
     slices: Sequence[Window],
     *,
     passes: int,
+    closer: int = MOST_CLOSER,
 ) -> list[ResultRecord]:
     """Search a picture until a decision, for each target, with closer looks and without them.
 
@@ -43,6 +44,7 @@ def decide_all(
         annotation: the annotated objects.
         slices: the slices of the picture.
         passes: largest number of passes of a search.
+        closer: largest number of closer looks.
 
     Returns:
         Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
@@ -50,9 +52,9 @@ def decide_all(
     """
     shown = torch.stack([glance.show for glance in glances.see(slices)])
     records: list[ResultRecord] = []
-    ways = {OURS: MOST_CLOSER} if evidence.verification is None else {OURS: MOST_CLOSER, UNVERIFIED: 0}
-    for target, (way, closer) in product(targets, ways.items()):
-        path = search_windows(glances, evidence, classes, target, EpisodeLimits(passes), closer=closer)
+    ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
+    for target, (way, most) in product(targets, ways.items()):
+        path = search_windows(glances, evidence, classes, target, EpisodeLimits(passes), closer=most)
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]

@@ -15,6 +15,7 @@ from eval.zoom.decisions import decide_all
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
+from semfov.decision import MOST_CLOSER
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
 from semfov.runs.results import ResultRecord
@@ -57,6 +58,7 @@ class ZoomConfig(WindowLookingConfig):
             until a decision (with `target`, only that class is searched for).
         cut: what to do with boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
+        closer: largest number of closer looks of a search.
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
         seed: random seed of mosaics and random orders.
@@ -72,6 +74,7 @@ class ZoomConfig(WindowLookingConfig):
     passes: Annotated[int, Range(2, 100_000)] = 24
     measures: tuple[_Measure, ...] = ("recall", "hit", "decision")
     sought: Count = 4
+    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     observation: str | None = None
     out: Path = Path("runs/zoom")
 
@@ -152,7 +155,8 @@ class ZoomRun(WindowLooking, SceneRun):
         )
         names = "background", *self.scenes.classes
         cut = self.slices(index, glances.lattice)
-        records = decide_all(glances, self.evidence, names, targets, annotation, cut, passes=config.passes)
+        limits = {"passes": config.passes, "closer": config.closer}
+        records = decide_all(glances, self.evidence, names, targets, annotation, cut, **limits)
         return [record | {"scene": self.scenes.ids[index]} for record in records]
 
     def annotation(self, index: int) -> Annotation:

@@ -13,7 +13,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
-from semfov.decision import MOST_CLOSER, OUTCOMES, Decision, Verifier, check_thresholds, settle
+from semfov.decision import OUTCOMES, Decision, Verifier, check_thresholds, settle
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
@@ -33,6 +33,9 @@ from semfov.zoom.slices import ranked, usual_slices
 
 USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
+
+CLOSER = 100
+"""Default for the largest number of closer looks: as many as there are passes for."""
 
 NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
@@ -122,7 +125,7 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST_CLOSER,
+        closer: int = CLOSER,
     ) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one (`search_windows`).
 
@@ -288,13 +291,14 @@ def search_windows(
     *,
     confirm: float | None = None,
     give_up: float | None = None,
-    closer: int = MOST_CLOSER,
+    closer: int = CLOSER,
 ) -> ZoomPath:
     """Search a picture for one object of a class and decide whether it is there.
 
     Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
-    such a place (`semfov.decision.Verifier`). Without closer looks it is `found` when the picture holds it with
-    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+    such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without closer looks it is
+    `found` when the picture holds it with a probability of at least `confirm` and a detection shows it
+    (`semfov.decision.settle`).
 
     When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
     if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
@@ -337,6 +341,7 @@ def search_windows(
         facts = facts or SearchFacts(turn.belief)
         facts.add(glance)
         path.add(turn)
+        ending = limits.reached(len(seen), path.record)
         presence = None
         if facts.detected or ahead < thresholds.give_up:  # otherwise no probability ends the search
             presence = facts.presence(ahead)
@@ -344,12 +349,13 @@ def search_windows(
                 state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([ahead])
                 ended = int(settle(*state, thresholds))
             else:
-                room = limits.room(len(seen))
                 look = WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
-                verifier.see(look, last=ahead == 0 or room <= 1)
-                values += [place.probability for place in verifier.look_closely(room)]
+                verifier.see(look, last=ahead == 0 or limits.room(len(seen)) <= 1)
+                while ending is None and verifier.candidate is not None:
+                    values.append(verifier.candidate.probability)
+                    verifier.look()
+                    ending = limits.reached(len(seen), path.record)
                 ended = verifier.outcome()
-        ending = limits.reached(len(seen), path.record)
         if ended or ending is not None:
             break
     assert facts is not None

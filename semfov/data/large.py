@@ -143,8 +143,7 @@ class PhotographPicture(LargePicture):
     """A picture in a file that Pillow reads.
 
     Formats such as JPEG cannot be read window by window. The whole picture is decoded when a window is first needed,
-    and is kept in memory (three bytes for each pixel). Before that, the overview of a JPEG is decoded at a coarse
-    resolution (`Image.draft`), which takes a small part of the memory and of the time.
+    and is kept in memory (three bytes for each pixel). Its pixels are those that `semfov.data.read_image` reads.
 
     Args:
         path: the file.
@@ -159,33 +158,12 @@ class PhotographPicture(LargePicture):
         self.path = Path(path)
         self._array: NDArray[np.uint8] | None = None
         with _opening(self.path, "opened"), Image.open(self.path) as image:
-            self.size = image.size
-            upright = orientation(image) == 1
-            self._drafts = image.format == "JPEG" and image.mode in ("RGB", "L")
-        if not upright:
-            # Turned upright the picture may have another size, and windows refer to the upright picture.
-            self.size = self._whole().shape[1::-1]
+            self.size = _upright_size(image)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
         x1, y1, x2, y2 = box
         return self._whole()[y1:y2, x1:x2]
-
-    def reduction(self, ratio: float) -> int:
-        """Factor by which windows are read; a JPEG that is not decoded yet can be decoded at a coarse resolution."""
-        undecoded = self._drafts and self._array is None
-        return reduction_for(int(ratio)) if undecoded else super().reduction(ratio)
-
-    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
-        """Read a window; the whole of a JPEG that is not decoded yet is read as the coarsest draft allowed."""
-        whole = box == (0, 0, *self.size)
-        if not (whole and reduction > 1 and self._drafts and self._array is None):
-            return super().read(box, reduction)
-        from PIL import Image
-
-        with _opening(self.path, "decoded"), Image.open(self.path) as image:
-            image.draft("RGB", (-(-self.size[0] // reduction), -(-self.size[1] // reduction)))
-            return bytes_of(np.asarray(image.convert("RGB")))
 
     def _whole(self) -> NDArray[np.uint8]:
         if self._array is None:

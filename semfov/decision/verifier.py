@@ -1,6 +1,7 @@
 """Verification of the target by closer looks, before a search decides."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic
 
@@ -18,7 +19,7 @@ from semfov.errors import check, check_whole
 from semfov.observation.matching import box_iou
 
 MOST_CLOSER = 2
-"""Default for the largest number of closer looks in a search."""
+"""Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
 
 _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
 _FLOOR = 1e-6
@@ -42,9 +43,10 @@ class Verifier(Generic[LookType]):
 
     After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
     it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
-    and 1, or more (`surely`). Otherwise it goes on, until no look is worth a pass, or `most` closer looks were made.
-    Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
-    absent or the search undecided, by the probability that the picture holds it (`verified`).
+    and 1, or more (`surely`); after `MOST_CLOSER` closer looks, with one of at least `confirm`. Otherwise it goes on,
+    until no look is worth a pass, or `most` closer looks were made. Then it has found the target at the best of the
+    examined places, if that is probable enough. If not, the target is absent or the search undecided, by the
+    probability that the picture holds it (`verified`).
 
     The candidates are cells of a grid (`CandidateCells`) or boxes in a large picture
     (`semfov.zoom.closer.CandidateBoxes`). Closer looks may follow a look at once (`look_closely`), or take frames of
@@ -178,7 +180,7 @@ class Verifier(Generic[LookType]):
         Returns:
             0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
         """
-        return verified(self._chances, self.presence, self.thresholds.confirm, over=self.over)
+        return self._verified(self._chances, over=self.over)
 
     def conclude(self, room: float = math.inf) -> Decision:
         """Make the decision of a search that is over.
@@ -230,14 +232,24 @@ class Verifier(Generic[LookType]):
         """Choose the place that is to be looked at closely."""
         self._last = last
         recent = [chance for chance, each in zip(self._chances, self.verdicts, strict=True) if self._recent(each)]
-        sure = verified(recent, self.presence, self.thresholds.confirm, over=False) > 0
+        sure = self._verified(recent, over=False) > 0
         last = last or self.places.left < self.thresholds.give_up
         self.candidate = None if self._spent or sure else self.places.due(self.thresholds.place, last=last)
+
+    def _verified(self, chances: Sequence[float], *, over: bool) -> int:
+        """The outcome by the probabilities of some places (`verified`)."""
+        outcome = verified(chances, self.presence, self.thresholds.confirm, over=over or self._made >= MOST_CLOSER)
+        return outcome if over or OUTCOMES[outcome] == "found" else 0
+
+    @property
+    def _made(self) -> int:
+        """Number of recent closer looks."""
+        return sum(self._recent(each) for each in self.verdicts)
 
     @property
     def _spent(self) -> bool:
         """Whether all closer looks were made."""
-        return sum(self._recent(each) for each in self.verdicts) >= self.most
+        return self._made >= self.most
 
     @property
     def _chances(self) -> list[float]:

@@ -97,12 +97,12 @@ def test_between_confirm_and_sure_the_search_goes_on_and_takes_the_best_place():
     assert int(judge(step(0, {5: 0.6, 7: 0.4, 2: 0.35}, [5], 0.9, look(5, 7, 2)))) == 0
     assert closer.cells == [5]  # the next best cell was not fixated
     last = step(1, {5: 0.6, 7: 0.5, 2: 0.45}, [5, 7, 2], 0.9)
-    assert int(judge(last)) == 1  # all three closer looks are made
-    assert closer.cells == [5, 7, 2]
+    assert int(judge(last)) == 1  # after two closer looks no third one is needed
+    assert closer.cells == [5, 7]
     decision = judge.conclude()
     assert (decision.cell, decision.outcome) == (7, "found")
-    assert [each.place for each in judge.looks] == pytest.approx([0.75, 0.8, 0.4])
-    assert [each.fixation for each in judge.looks] == [0, 1, 1]
+    assert [each.place for each in judge.looks] == pytest.approx([0.75, 0.8])
+    assert [each.fixation for each in judge.looks] == [0, 1]
 
 
 @pytest.mark.parametrize(("presence", "outcome"), [(0.9, "undecided"), (0.1, "absent")])

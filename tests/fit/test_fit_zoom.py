@@ -14,6 +14,7 @@ from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
+from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.fit.verification import unverified, verify
 from semfov.fit.windows import FitZoomConfig, fit_zoom
@@ -188,7 +189,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     again = verify(searches, [model.verification], limits, model.thresholds)
     for sought, each in zip(searches, again, strict=True):
-        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8))
+        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8), closer=MOST_CLOSER)
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
         assert right is None or right == sought.right(path.decision.box)

@@ -122,10 +122,10 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
     ]
 
 
-def verifier(model, scores):
-    """A verifier of the target in class 1, with at most two closer looks."""
+def verifier(model, scores, most=2):
+    """A verifier of the target in class 1."""
     glances = Scripted(scores)
-    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(glances, box).detections, AT)
+    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(glances, box).detections, AT, most)
 
 
 def look(number, presence, left, *boxes):
@@ -156,6 +156,17 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     assert OUTCOMES[judge.outcome()] == judge.decision(over=True).outcome == outcome
     assert judge.presence == pytest.approx(presence)
     assert judge.best.place == pytest.approx(max(scores))
+
+
+@pytest.mark.parametrize(
+    ("scores", "outcome"), [([0.7, 0.5], 1), ([0.5, 0.1, 0.3, 0.65], 1), ([0.5, 0.1, 0.3, 0.4], 0)]
+)
+def test_closer_looks_go_on_until_a_place_is_probable_enough(scores, outcome):
+    judge = verifier(FromScore(0.3), list(scores), most=9)
+    judge.see(look(5, 0.9, 0.5, ONE, OTHER, *([x, 300.0, x + 40, 340] for x in (200.0, 700.0))))
+    judge.look_closely()
+    assert [round(each.place, 4) for each in judge.looks] == scores
+    assert judge.outcome() == outcome
 
 
 def test_improbable_places_are_examined_only_at_the_end():
@@ -198,11 +209,17 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     image[1, 320:344, 640:664] = 1
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     assert agent.search(image, "red", closer=0).decision.outcome == "found"
-    path = agent.search(image, "red")
+    path = agent.search(image, "red", closer=2)
     assert path.decision.outcome == "absent"
     assert path.decision.box is None
     assert len(path.closer) == 2
     assert path.why_it_ended() == "No closer look confirmed the target, and it is probably absent."
+    # As long as nothing is found the search goes on.
+    looked = []
+    path = agent.search(image, "red", on_look=lambda record: looked.append(record.passes))
+    assert len(path.closer) > 2
+    assert path.decision.outcome != "found"
+    assert looked == [*range(1, path.passes + 1)]
 
 
 def test_the_limits_of_a_search_hold(detector, picture):
