@@ -50,10 +50,8 @@ def home(tmp_path_factory):
     write_network(folder / "colours.onnx")
     (folder / "photographs").mkdir()
     write_photographs(folder / "photographs")
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert command(arguments(folder)) == 0
-    torch.set_num_threads(threads)
     return folder
 
 
@@ -197,10 +195,8 @@ def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, 
     (tmp_path / "models" / name).unlink()
     (tmp_path / "models/manifest.json").unlink()
     forbid(monkeypatch, *(FITS.keys() - {part}))
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert command(arguments(home, "--out", str(tmp_path / "models"))) == 0
-    torch.set_num_threads(threads)
     again, once = (folder / f"models/{part}.safetensors" for folder in (tmp_path, home))
     assert again.read_bytes() == once.read_bytes()
 
@@ -525,14 +521,12 @@ def test_one_progress_bar_covers_all_stages(capsys):
 
 @pytest.mark.slow
 def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     root = home / "photographs"
     agent = semfov.fit_detector(
         home / "colours.onnx", root, root / "instances.json", out=tmp_path / "out", limit=6, columns=4, rows=4,
         holdout=3, steps=3, map_steps=3, cache=home / "cache", threshold=0.05,
     )  # fmt: skip
-    torch.set_num_threads(threads)
     assert agent.eye.detector.selection.threshold == 0.05
     assert Manifest.read(tmp_path / "out").training["photographs"] == 6
     # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.
