@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
 
@@ -357,7 +356,7 @@ class ActivePerception(nn.Module):
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             usual = 30 if passes is None else MOST_SHIFTS
-            scanpath = self.fovea.search(
+            return self.fovea.search(
                 self._photograph(picture, color),
                 target,
                 EpisodeLimits(**limits),
@@ -369,7 +368,6 @@ class ActivePerception(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
             )
-            return replace(scanpath, source=_file(picture))
         index = _one_class(target, self.classes)
         if kind == "head":
             given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
@@ -430,8 +428,7 @@ class ActivePerception(nn.Module):
             _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            scanpath = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
-            return replace(scanpath, source=_file(picture))
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             given = _given(worth=worth, duration=duration, **limits)
             return self.head.find_all(_scene(picture, color), targets, **given)
@@ -490,8 +487,7 @@ class ActivePerception(nn.Module):
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
             shifts = usual if shifts is None else shifts
-            scanpath = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
-            return replace(scanpath, source=_file(picture))
+            return self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
         if kind == "head":
             given = _given(start=start, duration=duration, worth=worth, **limits)
             return self.head.explore(_scene(picture, color), seed=seed, **given)
@@ -585,11 +581,6 @@ def _only_for(kind: KindOfLook, suits: KindOfLook, instead: str, **given: Any) -
 def _given(**values: Any) -> dict[str, Any]:
     """The arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _file(picture: PictureLike) -> str | None:
-    """The file of a picture; None for one in memory."""
-    return fspath(picture) if isinstance(picture, str | PathLike) else None
 
 
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
