@@ -1,7 +1,7 @@
 """What the command is told: help, version, and mistakes that are refused in one line before anything is loaded."""
 
+import importlib
 import re
-import runpy
 import signal
 import sys
 
@@ -150,7 +150,7 @@ def test_ctrl_c_while_the_command_is_imported_ends_in_one_line(program, changes,
     monkeypatch.setattr(sys, "argv", [program])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        names = runpy.run_path(start.__file__)
-        assert (signal.getsignal(signal.SIGINT) is names["_leave"]) == changes
+        importlib.reload(start)
+        assert (signal.getsignal(signal.SIGINT) is start._leave) == changes
     finally:
         signal.signal(signal.SIGINT, before)
