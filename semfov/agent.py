@@ -1,6 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
@@ -22,6 +22,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike
+from semfov.detection.scores import HALVES
 from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
@@ -204,6 +205,17 @@ class ActivePerception(nn.Module):
     def _of(cls, parts: dict[str, Any]) -> Self:
         """The agent with these parts, ready for use."""
         return cls(**parts).eval().requires_grad_(False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
+
+        def precise(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            return tensor.to(moved.device) if moved.dtype in HALVES else moved
+
+        super()._apply(precise, recurse)
+        self.eye.detector._apply(fn, recurse)
+        return self
 
     @property
     def classes(self) -> tuple[str, ...]:

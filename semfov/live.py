@@ -8,6 +8,7 @@ from typing import get_args
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
@@ -21,11 +22,13 @@ from semfov.errors import check, check_whole, lookup
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
-from semfov.paths import Moment, reduced_copy
+from semfov.paths import Moment
+from semfov.paths.stimulus import in_bytes
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
 
+_LONGEST = 640  # longer side of the frames that records keep, in pixels
 _MOST = 1000  # largest number of looks whose detections are kept
 
 
@@ -95,6 +98,12 @@ class FrameRate:
             return f"{frames}, all of them while the detector got ready"
         first = "the first" if self.warm_up == 1 else f"the first {self.warm_up}"
         return f"{frames}, {self.mean:.1f} per second after {first}"
+
+
+def _copy(frame: Tensor) -> Tensor:
+    """A frame `(1, 3, H, W)` as bytes, reduced by a whole number: resampling a large frame takes as long as a look."""
+    side = -(-max(frame.shape[-2:]) // _LONGEST)
+    return in_bytes(F.avg_pool2d(frame, side, ceil_mode=True, count_include_pad=False)[0])
 
 
 def _rate(frames: int, seconds: float) -> float | None:
@@ -288,7 +297,7 @@ class LivePerception:
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=closer,
-            photograph=None if self._image is None else reduced_copy(self._image[0]),
+            photograph=None if self._image is None else _copy(self._image),
         )
 
     def _decision(self, step: Step, grid: Grid) -> Decision | None:

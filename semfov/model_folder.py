@@ -26,14 +26,16 @@ from semfov.io.shipped import fit_command
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.base import Sensor
 from semfov.sensor.named import SENSORS
+from semfov.zoom.evidence import GlimpseEvidence
 
-FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence
+FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence | GlimpseEvidence
 
 KINDS: dict[str, type[FolderModel]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
     "verification": Verification,
     "map": MapEvidence,
+    "windows": GlimpseEvidence,
 }
 """Classes of the parts that are models."""
 
@@ -66,7 +68,8 @@ class ModelFolder:
     """The result of `semfov fit`: models for one detector and one sensor, and which of them the agent uses.
 
     The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
-    The verification is compared with the same agent without closer looks.
+    The verification is compared with the same agent without closer looks, and the evidence for large pictures with
+    looks at slices in the order of raw scores.
 
     Args:
         path: the folder.
@@ -214,6 +217,11 @@ class ModelFolder:
             return LearnedMap(learned), Closer(self._sensor.width(sensor) / sensor["reference"])
         return Semantic(len(self.manifest.classes) + 1), Random()
 
+    def windows(self) -> GlimpseEvidence | None:
+        """The evidence for large pictures; None for an agent that looks at slices."""
+        model = self._models.get("windows")
+        return model if isinstance(model, GlimpseEvidence) else None
+
     def arguments(self, **source: Any) -> dict[str, Any]:
         """Arguments of `semfov.ActivePerception`; takes arguments for `load_detector`."""
         grid = self.manifest.grid
@@ -222,6 +230,7 @@ class ModelFolder:
             "search": self.search(),
             "explore": self.explore(),
             "verification": self.verification(),
+            "windows": self.windows(),
             "grid": grid,
         }
 

@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +69,19 @@ def kept_scenes() -> Iterator[None]:
 
 
 @pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Use one thread, so that results are reproducible to the bit; restore the number of threads afterwards."""
-    before = torch.get_num_threads()
+def one_thread() -> None:
+    """Use one thread, so that results are reproducible to the bit."""
     torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    """Restore the number of threads after each test, which commands and `one_thread` change."""
+    before = torch.get_num_threads()
+    try:
+        return (yield)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.fixture

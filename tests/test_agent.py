@@ -71,6 +71,37 @@ def test_predictive_policies_search_for_one_class_only(image):
         ahead.search(image, {"red": 1.0, "green": 0.8})
 
 
+class Weighted(Coloured):
+    """A detector with a parameter, and boxes and scores in the precision of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.white = torch.nn.Parameter(torch.ones(1))
+
+    def propose(self, canvas):
+        return super().propose(canvas.to(self.white.dtype) * self.white)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_for_the_detector_alone(image, dtype):
+    """In half precision the agent does what it does with only its detector in half precision."""
+    model = FovealObservationModel.identity(["red", "green"], [0.2])
+    eye = Eye(Foveation(40.0), Weighted(), reference=160.0)
+    agent = ActivePerception(eye, (Semantic(3, model), NonPredictive()), (Semantic(3), KL(model)), grid=(8, 6))
+    agent.requires_grad_(False)
+    other = copy.deepcopy(agent)
+    other.eye.detector.to(dtype)
+    agent.to(dtype)
+    assert agent.eye.detector.white.dtype == dtype
+    assert {value.dtype for name, value in agent.state_dict().items() if "detector" not in name} == {torch.float32}
+    for task in (lambda agent: agent.search(image, "green", start=0), lambda agent: agent.explore(image, shifts=3)):
+        found = task(agent)
+        assert found.probabilities.dtype == torch.float32
+        assert torch.equal(found.probabilities, task(other).probabilities)
+    assert agent.find_all(image, passes=1).objects.boxes.dtype == torch.float32
+    assert agent.float().eye.detector.white.dtype == torch.float32
+
+
 def test_boxes_decide_what_is_found(agent, image):
     nowhere = torch.tensor([[60.0, 60, 61, 61]])
     scanpath = agent.search(image, "green", start=0, boxes=nowhere, shifts=5)

@@ -107,3 +107,7 @@ def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
     (site / "dependencies.pth").write_text("\n".join(sorted(libraries)) + "\n", encoding="utf-8")
     assert run(python, "-W", "error", "-c", CODE, cwd=tmp_path).split() == [semfov.__version__, "8"]
+    command = home / "bin" / "semfov"
+    assert run(command, "--version", cwd=tmp_path) == f"semfov {semfov.__version__}\n"
+    assert "--give_up" in run(command, "search", "--help-all", cwd=tmp_path)
+    assert "yolov3-tiny" in run(python, "-m", "semfov", "detectors", cwd=tmp_path)

@@ -101,7 +101,7 @@ def test_public_surface():
 
 HEAVY = [
     *["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "cv2", "torch._dynamo"],
-    "gymnasium",
+    *["gymnasium", "transformers"],
 ]
 
 

@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 import semfov
-from semfov.cli import main as semfov_command
+from semfov.cli.main import main as semfov_command
 from semfov.data.fixations import Fixations
 from semfov.data.mosaics import Mosaics
 from semfov.detection.weights import fetch
@@ -143,11 +143,12 @@ def written_files(printed):
 @pytest.mark.parametrize("line", SEMFOV)
 def test_command_runs_as_printed(line, folder, run):
     words = COMMANDS[line]
-    names = written_files(run(words))
+    printed = run(words)
+    assert words[words.index("--target") + 1] in printed
     for option in ("--report", "--out"):
         if option in words:
             asked = words[words.index(option) + 1]
-            assert [name for name in names if name.startswith(asked)]
+            assert [name for name in written_files(printed) if name.startswith(asked)]
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
 from semfov import DirichletStatistics, FovealObservationModel
 
 SCORES = ("ordinary", "corner", "zeros", "unscaled", "tiny", "negative", "nan", "inf")
-DISTANCES = ("ordinary", "edge", "far", "infinite", "negative", "nan")
+DISTANCES = ("ordinary", "edge", "far", "pixels", "infinite", "negative", "nan")
 EDGES = (0.25, 0.5)
 
 
@@ -26,15 +26,15 @@ def observations(data: st.DataObject) -> str:
     kind, place = choose(data, SCORES, "scores"), choose(data, DISTANCES, "distance")
     scores = draw_scores(rng, kind, components)
     distance = {
-        "ordinary": float(rng.random()), "edge": EDGES[0], "far": 1e30, "infinite": math.inf, "negative": -0.1,
-        "nan": math.nan,
+        "ordinary": float(rng.random()), "edge": EDGES[0], "far": 9.5, "pixels": 320.0, "infinite": math.inf,
+        "negative": -0.1, "nan": math.nan,
     }[place]  # fmt: skip
     looks = torch.from_numpy(scores)[None], torch.tensor([distance], dtype=torch.float64)
     result = attempt(lambda: model.calibrate(*looks).detach())
     statistics = DirichletStatistics((components, levels), components)
     counted = attempt(lambda: statistics.update(looks[0], (torch.tensor([0]), torch.tensor([0]))))
     assert failed(counted) == (kind in ("zeros", "unscaled", "negative", "nan", "inf")), counted
-    bad = kind in ("negative", "nan", "inf") or place in ("negative", "nan")
+    bad = kind in ("negative", "nan", "inf") or place in ("pixels", "negative", "nan")
     if failed(result):
         assert bad, result
         return outcome(result)

@@ -47,6 +47,6 @@ def list_detectors(options: DetectorsOptions) -> int:
         rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
     print("\n".join(table_lines(rows)))
     print(f"\nWeights are kept in {cache_folder()}.")
-    print("Others: torchvision:MODEL, a .onnx file, a .cfg file with its weights, or a folder from semfov fit.")
+    print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")
     print("A detector without shipped models runs with --agent raw, or after semfov fit.")
     return 0

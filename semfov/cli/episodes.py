@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,12 +101,14 @@ class EpisodeOutputs:
         title: title of the page.
         searched: whether the pictures were searched for a target.
         several: whether there are several pictures, each of which gets a folder for its figures.
+        settings: settings of the eye (`Eye.settings`).
     """
 
     options: PictureOptions
     title: str
     searched: bool
     several: bool
+    settings: Mapping[str, Any]
     results: ResultsFile | None = None
     folder: Path | None = None
     drawings: tuple[Drawing, ...] = ()
@@ -143,10 +145,12 @@ class EpisodeOutputs:
             if isinstance(record, Scanpath):
                 data = episode_data(record, record.image, views, self.pool, name=name, boxes=source.boxes)
                 self.episodes.append(data)
-            elif isinstance(record, ZoomPath):
-                picture = source.file if source.scene is None else source.scene.image
-                assert picture is not None
-                self.episodes.append(zoom_data(record, picture, self.pool, name=name))
+            else:
+                # A scene has no more pixels than the record keeps.
+                whole = source.file if source.scene is None else source.scene.image
+                picture = whole if isinstance(record, ZoomPath) else None
+                data = zoom_data(record, picture, self.pool, name=name, settings=self.settings)
+                self.episodes.append(data)
 
     def finish(self) -> None:
         """Write the results and the page of all pictures so far, and list what was written."""
@@ -186,7 +190,7 @@ def look_at_pictures(
         print("no picture was given: looking at an embedded scene")
         found = [PictureSource("embedded scene", scene=scene)]
     several = len(found) > 1
-    outputs = EpisodeOutputs(options, title, title.startswith("search"), several)
+    outputs = EpisodeOutputs(options, title, title.startswith("search"), several, agent.eye.settings())
     skipped, done, tally = 0, 0, dict[str, int]()
     try:
         for number, source in _shown(found):

@@ -135,10 +135,10 @@ class Detector(nn.Module, ABC):
                 canvas of `fit`.
 
         Returns:
-            The selected boxes, in image pixels, with their score vectors.
+            The selected boxes, in image pixels, with their score vectors; in float32 for a network in half precision.
         """
         check(len(canvas) > 0, "canvas", "at least one image", 0)
-        candidates = self.propose(canvas)
+        candidates = self.propose(canvas).precise()
         if back is not None:
             candidates = replace(candidates, boxes=back(candidates.boxes))
         return select(candidates, placement, self.selection, self.background)

@@ -11,6 +11,9 @@ from semfov.errors import InputError, check_shape, lookup
 
 BackgroundPolicy = Literal["residual", "normalised", "uniform", "none", "own"]
 
+HALVES = (torch.float16, torch.bfloat16)
+"""Half precisions."""
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -37,6 +40,17 @@ class Candidates:
         """Objectness times the best class score, `(B, N)`, by which detectors rank their boxes."""
         best = self.classes.amax(-1)
         return best if self.objectness is None else best * self.objectness
+
+    def precise(self) -> "Candidates":
+        """Convert half precision, which is too coarse for pixels, to float32; other precisions stay as they are.
+
+        Returns:
+            The candidates in full precision.
+        """
+        if self.boxes.dtype not in HALVES and self.classes.dtype not in HALVES:
+            return self
+        objectness, background = (None if x is None else x.float() for x in (self.objectness, self.background))
+        return Candidates(self.boxes.float(), self.classes.float(), objectness, background)
 
     def take(self, image: int, index: Tensor) -> "Candidates":
         """Take some boxes of one image.

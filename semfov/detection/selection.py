@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
-from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
+from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates, score_vectors
 from semfov.errors import check, check_finite, check_number, check_whole, values_known
 
 
@@ -106,7 +106,7 @@ def _select_one(
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
     """Indices of the boxes that survive non-maximum suppression, most confident first."""
     boxes, confidence = boxes.detach(), confidence.detach()
-    if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not there on a CPU
+    if boxes.dtype in HALVES:  # too coarse for pixels, and not there on a CPU
         boxes, confidence = boxes.float(), confidence.float()
     full = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
     ranked, order = confidence[full].sort(descending=True, stable=True)

@@ -8,7 +8,7 @@ from torch import Tensor
 from semfov.detection.darknet import Darknet
 from semfov.detection.detector import Detector
 from semfov.detection.onnx_twin import RUNTIMES, OnnxTwin, Runtime, network_digest
-from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import InputError, check
 
@@ -109,6 +109,7 @@ class YoloV3(Detector):
         if self._twin is not None and self._chosen(self._twin.obstacle_here(self.network, canvas)) == "onnxruntime":
             return self._twin(self.network, canvas)
         maps = self.network(canvas.to(next(self.network.parameters()).dtype))
+        maps = [raw.float() if raw.dtype in HALVES else raw for raw in maps]
         size = (canvas.shape[-1], canvas.shape[-2])
         parts = [
             decode_yolo(raw, head.anchors, size, head.scale) for raw, head in zip(maps, self.network.heads, strict=True)

@@ -44,8 +44,9 @@ def fit_detector(
 
     This is `semfov fit` as a function. The detector looks at every photograph from every cell. Then
     an observation model, the exponent of its likelihoods, target evidence, the verification of targets by closer looks
-    and a map of all classes are fitted. Each of them is compared with raw scores on held-out photographs, and the
-    verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
+    and a map of all classes are fitted, and, on mosaics of enough photographs, the evidence for pictures larger than
+    the detector's input (unless `windows=False`). Each of them is compared with raw scores on held-out photographs, and
+    the verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
     again.
 
     Args:

@@ -66,10 +66,11 @@ TITLES = {
     "evidence": "Target evidence (searches)",
     "verification": "Verification (closer looks)",
     "map": "Learned map (explorations)",
+    "windows": "Evidence by magnification (large pictures)",
 }
 """Titles of the parts in reports."""
 
-UNUSED = {"verification": "no, no closer looks"}
+UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
 """What the agent does without a part that it does not use, other than to use raw scores."""
 
 
@@ -111,7 +112,7 @@ def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Pa
         "",
         "The agent uses a part only if it is better than raw scores by more than one standard error of the paired "
         "difference over the held-out photographs. The verification is compared with the same agent without closer "
-        "looks.",
+        "looks, and the evidence by magnification with looks at slices of large pictures in the order of raw scores.",
         "",
         *table(rows),
         "",

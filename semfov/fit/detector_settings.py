@@ -11,6 +11,7 @@ from semfov.fit.observation import FitObservationConfig
 from semfov.fit.settings import FovealFitConfig
 from semfov.fit.tempering import FitTemperingConfig
 from semfov.fit.verification import FitVerificationConfig
+from semfov.fit.windows import FitZoomConfig
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
@@ -18,6 +19,9 @@ FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
 MANY = 100
 """With at least this many photographs, one in five is held out and training takes all its steps."""
+
+_FOR_MOSAICS = 360
+"""The number of mosaics grows up to this number of photographs to learn from."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         fixations: looks at each photograph to fit the observation model to.
         steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
         map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
+        windows: also fit the evidence for pictures larger than the detector's input, if there are enough photographs.
+        window_steps: training steps of that evidence.
         thin: the report lists classes with fewer objects than this in the training photographs.
         out: folder to write the models to.
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
@@ -54,6 +60,8 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
     fixations: Count = 8
     steps: Count | None = None
     map_steps: Count | None = None
+    windows: bool = True
+    window_steps: Count = 400
     thin: Whole = 20
     out: Path = Path("mymodels")
 
@@ -142,4 +150,38 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             rows=self.rows,
             steps=self.map_steps or 1000,
             gain_steps=max(1, (self.map_steps or 1000) // 5),
+        )
+
+    def mosaics(self, photographs: int, tile: int) -> FitZoomConfig:
+        """Return the settings of the evidence for large pictures, with mosaics for so many photographs.
+
+        Args:
+            photographs: number of photographs, held-out ones included.
+            tile: width in pixels of the slot of a photograph.
+
+        Returns:
+            The settings. Each photograph to learn from is in about four mosaics, unless there are very many.
+        """
+        holdout = self.holdout or 5
+        held_out = -(-photographs // holdout)
+        kept = min(photographs - held_out, _FOR_MOSAICS)
+        return FitZoomConfig(
+            data=self.data,
+            detector=self.detector,
+            holdout=holdout,
+            mosaics=max(1, kept // 5),
+            far=max(1, kept // 60),
+            crowded=max(1, kept // 10),
+            judged=max(8, min(held_out // 3, 30)),
+            judged_far=1,
+            searched=max(8, kept // 12),
+            sought=3,
+            passes=16,
+            tile=tile,
+            steps=self.window_steps,
+            survey_steps=self.window_steps,
+            seed=self.seed,
+            out=self.out,
+            cache=self.cache,
+            workers=self.workers,
         )

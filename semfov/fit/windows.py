@@ -4,10 +4,10 @@ import json
 import logging
 import random
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 
@@ -35,7 +35,7 @@ from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count, Share
+from semfov.runs.settings import Count, Range, Share
 from semfov.runs.setup import make_detector, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.window_looking import TileSize
@@ -53,8 +53,9 @@ class FitZoomConfig(FitConfig, WorkConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
-        data: photographs to compose the mosaics from; one in five is held out.
+        data: photographs to compose the mosaics from.
         detector: the detector.
+        holdout: one in every n photographs is held out.
         mosaics: number of training mosaics of 4 × 4 photographs.
         far: number of training mosaics of 8 × 6 photographs, in which objects are half as large.
         crowded: number of training mosaics of 4 × 4 photographs of the third that hold most objects, for fitting the
@@ -85,6 +86,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
     """
 
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
+    holdout: Annotated[int, Range(2, 10**9)] = 5
     mosaics: Count = 400
     far: Count = 40
     crowded: Count = 240
@@ -140,7 +142,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         The mosaics: `near`, `far` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of held-out
         photographs, and `searched` to fit decisions on.
     """
-    kept, held = split_photographs(config.data, classes, 5)
+    kept, held = split_photographs(config.data, classes, config.holdout)
     tile = config.tile, config.tile * 3 // 4
     return {
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
@@ -214,26 +216,23 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model.metadata.pop("verification", None)
     if "verification" in refit:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        prepare_worker()
-        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
-        parts += ["Closer looks:", "", fit_closer(model, mosaics, opened, config)]
-        if model.verification is not None:
-            model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+        parts += fit_closer_looks(config, model, eye, mosaics, store)
     if "certainty" in refit:
-        prepare_worker()
-        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
-        parts += certainty_again(model, mosaics, opened, passes=config.passes)
-        model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
+        parts += fit_counts(config, model, eye, mosaics, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
 
 
 def look_at_all(
-    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig,
+    eye: WindowEye,
+    mosaics: dict[str, Mosaics],
+    store: GlanceStore,
+    kinds: Sequence[str] = ("near", "far", "crowded", "judged", "judged crowded"),
 ) -> dict[str, list[ZoomExample]]:
-    """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
-    looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
+    """Look at all mosaics of some kinds; returns the looks by kind of mosaic."""
+    looked = {kind: mosaics[kind] for kind in kinds}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_fit_process, settings=(config,), title="looking",
@@ -260,7 +259,7 @@ def fit_looks(
 def survey_again(
     config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
 ) -> dict[str, float]:
-    """Fit a new survey; returns its measures on held-out mosaics."""
+    """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
     survey = Survey(model.classes, foresight=model.survey.foresight)
@@ -268,7 +267,7 @@ def survey_again(
     fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
     model.survey = survey.eval().requires_grad_(False)
     model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
-    crowded = judge_survey(survey, kinds["judged crowded"])
+    crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
     return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
 
 
@@ -316,6 +315,29 @@ def fit_decision(
         f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
         "",
     ]
+
+
+def fit_closer_looks(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit the probabilities after closer looks, with the arguments and the result of `fit_decision`."""
+    prepare_worker()
+    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+    text = fit_closer(model, mosaics, opened, config)
+    if model.verification is not None:
+        model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+    return ["Closer looks:", "", text]
+
+
+def fit_counts(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
+    prepare_worker()
+    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+    lines = certainty_again(model, mosaics, opened, passes=config.passes)
+    model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
+    return lines
 
 
 @torch.no_grad()

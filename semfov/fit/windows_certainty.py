@@ -7,12 +7,12 @@ from itertools import islice
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
 from semfov.detection.objects import LEAST
 from semfov.metrics.calibration import BinarySums
 from semfov.observation.matching import match
+from semfov.runs.progress import track
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import fit_certainty
 from semfov.zoom.evidence import GlimpseEvidence
@@ -37,7 +37,7 @@ def judged_objects(
         Scores of the objects `(n,)`, and whether the box and the class of each are right `(n,)`.
     """
     scores, right = [torch.zeros(0)], [torch.zeros(0, dtype=torch.bool)]
-    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
+    for index, looks in enumerate(track(opened, title, "mosaic")):
         objects = merge([turn.glance for turn in islice(find_everything(looks, model), passes)])
         looks.save()
         annotation = mosaics.annotation(index)

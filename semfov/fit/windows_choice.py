@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from itertools import chain, islice
 
 import torch
-from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
+from semfov.runs.progress import track
 from semfov.runs.window_looking import LEAST_CONFIDENCE, found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
@@ -41,7 +41,7 @@ def choose_foresight(
     objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds.values()]
     rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
     recalls: dict[float, list[float]] = {}
-    for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
+    for value in track(FORESIGHTS, "choosing foresight", "value"):
         model.survey.foresight = value
         recalls[value] = [
             mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
@@ -74,7 +74,7 @@ def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store
     opened = open_all(eye, near, store)
     slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
-    for value in tqdm(PATIENCES, desc="choosing patience", unit="value", dynamic_ncols=True):
+    for value in track(PATIENCES, "choosing patience", "value"):
         model.patience = value
         passes[value] = mean_passes(model, opened, slots)
         for glances in opened:

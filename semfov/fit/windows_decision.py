@@ -9,7 +9,6 @@ from itertools import islice
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
@@ -17,6 +16,7 @@ from semfov.fit.descent import descend
 from semfov.fit.evidence import Bounds, choose_thresholds
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.presence import area_under_roc
+from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredGlances
@@ -80,7 +80,7 @@ def searches_of(
         For each search the number and the objects of the mosaic, the class, and the turns with the facts after each.
         Looks that are made before the next search are stored.
     """
-    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
+    for index, looks in enumerate(track(opened, title, "mosaic")):
         annotation = mosaics.annotation(index)
         for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
             turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)

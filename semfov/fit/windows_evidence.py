@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.observation.matching import box_iou
+from semfov.runs.progress import track
 from semfov.runs.window_looking import LEAST_CONFIDENCE
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
@@ -180,7 +181,7 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
     optimizer = torch.optim.AdamW(own, lr=8e-3, weight_decay=1.0)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 8e-3, total_steps=steps)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    for _ in range(steps):
+    for _ in track(range(steps), "learning what closer looks show", "step"):
         model.train()
         loss = presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
         if len(later):
@@ -262,7 +263,7 @@ def descend_examples(
     own = [*parameters]
     optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=0.1)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
-    for step in range(steps):
+    for step in track(range(steps), f"learning the {title}", "step"):
         losses = [loss_of(example) for example in random.sample(examples, min(batch, len(examples)))]
         loss = torch.stack(losses).mean()
         optimizer.zero_grad()

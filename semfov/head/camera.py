@@ -9,17 +9,19 @@ from torch import Tensor
 
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large
-from semfov.errors import DataError, check
+from semfov.data.reduction import resized
+from semfov.errors import DataError, InputError, check
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
 from semfov.head.sphere import AROUND, Sphere
-from semfov.head.world import FIELDS, World
+from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, panorama_directions
 
 TRIES = 25
 """Largest number of frames that are asked for until one is from the right direction."""
 
 _WIDEST = 8192  # pixels of the panorama in which objects are located
+_KEPT = 480  # width of the frames that are kept for drawing
 _DRAWN = 1280  # pixels across the panorama of its frames
 
 
@@ -106,12 +108,13 @@ class CameraScene(Sphere):
     still = False
 
     def __init__(self, camera: PanTiltCamera, color: Color = "rgb", *, cell: float = 6.0) -> None:
+        if isinstance(camera, type):
+            raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
         names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
         missing = [name for name in names if not hasattr(camera, name)]
         remedy = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
         check(not missing, "camera", f"a camera with {', '.join(names)}", remedy)
-        fields = tuple(float(field) for field in camera.fields)
-        check(len(fields) > 0 and 0 < min(fields) <= max(fields) < 180, "fields", "degrees between 0 and 180", fields)
+        fields = check_fields(camera.fields)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2),
@@ -141,11 +144,13 @@ class CameraScene(Sphere):
         raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
 
     def _seen(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """A frame as an image of the right size, and its pose; a copy is kept for drawing."""
+        """A frame as an image of the right size, and its pose; a small copy is kept for drawing."""
         image = as_image(picture, color=self.color, argument="frame")
         got = image.shape[-1], image.shape[-2]
         check(got == tuple(self.size), "frame", f"{self.size[0]} × {self.size[1]} pixels, as `size` has it", got)
-        self._frames[tuple(pose.tolist())] = image.mul(255).byte().cpu(), at
+        width = min(self.size[0], _KEPT)
+        small = resized(image.mul(255).byte().cpu(), (max(1, round(width * self.size[1] / self.size[0])), width))[0]
+        self._frames[tuple(pose.tolist())] = small, at
         return image, at
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
@@ -164,9 +169,10 @@ class CameraScene(Sphere):
         directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), size)
         canvas = torch.full((3, size[0] * size[1]), 0.5)
         for frame, at in self._frames.values():
-            points, inside = Camera(at, self.size).points(directions)
+            width, height = frame.shape[-1], frame.shape[-2]
+            points, inside = Camera(at, (width, height)).points(directions)
             x, y = points[inside].round().long().unbind(-1)
-            canvas[:, inside] = frame[:, y.clamp(0, self.size[1] - 1), x.clamp(0, self.size[0] - 1)].float() / 255
+            canvas[:, inside] = frame[:, y.clamp(0, height - 1), x.clamp(0, width - 1)].float() / 255
         return canvas.unflatten(-1, size[::-1])
 
 

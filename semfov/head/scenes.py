@@ -13,7 +13,7 @@ from semfov.data.large import LargePicture, open_large
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.head.sphere import BLANK, Sphere
-from semfov.head.world import FIELDS, World
+from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.perspective import even_rows, go_around, sample
 
 VIEW = (416, 312)
@@ -176,6 +176,7 @@ class Flat(World):
         cell: float = 6.0,
         color: Color = "rgb",
     ) -> None:
+        self.fields = check_fields(fields)
         self.opened: LargePicture | None = None
         if not isinstance(picture, tuple):
             self.opened = open_large(picture, color=color)
@@ -185,7 +186,7 @@ class Flat(World):
             degree = min(DEGREE, min(width, height * size[0] / size[1]) / max(fields))
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
-        self.size, self.cell, self.degree, self.fields = size, cell, degree, tuple(fields)
+        self.size, self.cell, self.degree = size, cell, degree
         self.speeds = Speeds() if speeds is None else speeds
         across, up = width / degree / 2, height / degree / 2
         self.pan, self.tilt = (-across, across), (-up, up)

@@ -9,7 +9,7 @@ from semfov.belief.grid import Grid
 from semfov.data.large import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
-from semfov.head.world import FIELDS, World
+from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
 
 AROUND = (-180.0, 180.0)
@@ -59,7 +59,7 @@ class Sphere(World):
         check(-360 <= pan[0] <= pan[1] <= 360, "pan", "limits in degrees, left and right", pan)
         check(-90 <= tilt[0] <= tilt[1] <= 90, "tilt", "limits from -90 to 90 degrees, down and up", tilt)
         self.picture, self.size, self.cell = picture, size, cell
-        self.pan, self.tilt, self.fields = pan, tilt, tuple(fields)
+        self.pan, self.tilt, self.fields = pan, tilt, check_fields(fields)
         self.speeds = Speeds() if speeds is None else speeds
         self.scene = Grid(round(360 / cell), round(180 / cell), picture)
         self.centres = panorama_directions(self.scene.centres, picture)

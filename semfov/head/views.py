@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.head.speeds import Speeds
-from semfov.head.world import World
+from semfov.head.world import World, check_fields
 
 CELL_POINTS = 10
 """Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
@@ -61,11 +61,9 @@ class Views:
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
-        fields = world.fields if fields is None else fields
-        ascending = len(fields) > 0 and list(fields) == sorted(fields)
-        check(ascending, "fields", "one or more fields of view in degrees, narrowest first", fields)
+        fields = world.fields if fields is None else check_fields(fields)
         check(fovea > 0, "fovea", "a positive fraction of the longer side", fovea)
-        self.world, self.fields, self.fovea = world, tuple(fields), fovea
+        self.world, self.fields, self.fovea = world, fields, fovea
         poses: list[Tensor] = []
         self.tiling: list[list[list[int]]] = []
         for field in fields:

@@ -1,13 +1,16 @@
 """Scenes larger than the eye's field of view, seen through a window that a head moves."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Protocol
 
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.large import LargePicture
+from semfov.errors import check
 from semfov.head.speeds import Speeds
+from semfov.io.schema import is_number
 
 FIELDS = (60.0,)
 """Default fields of view in degrees."""
@@ -26,6 +29,24 @@ class Places(Protocol):
 
     def contain(self, points: Tensor, /) -> Tensor:
         """Whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
+
+
+def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
+    """Raise `InputError` unless fields of view are ascending angles below 180 degrees.
+
+    Args:
+        fields: fields of view in degrees.
+
+    Returns:
+        The fields of view.
+
+    >>> check_fields([30, 60])
+    (30.0, 60.0)
+    """
+    fits = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
+    fits = fits and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
+    check(fits, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
+    return tuple(float(field) for field in fields)
 
 
 class World(ABC):

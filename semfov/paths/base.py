@@ -158,17 +158,18 @@ class Record(Conversion):
     def refuted(self) -> list[CloseUp]:
         """The closer looks that did not confirm that the target is there."""
         boxes = [place.box for place in self._confirmations()]
-        return [look for look in self._closer() if not any(look.box.equal(box) for box in boxes)]
+        return [look for look in self.closer_looks if not any(look.box.equal(box) for box in boxes)]
 
     def _confirmations(self) -> list[ConfirmedPlace]:
         """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self._decision_in_picture(), self.target, self._closer(), self._last())
+        return places_confirmed(self._decision_in_picture(), self.target, self.closer_looks, self._last())
 
     def _last(self) -> int:
         """Number of the last look."""
         return 0
 
-    def _closer(self) -> Sequence[CloseUp]:
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
         """The closer looks."""
         return ()
 
@@ -432,7 +433,8 @@ class GazeRecord(Record):
         """Number of the last look."""
         return len(self) - 1
 
-    def _closer(self) -> Sequence[CloseUp]:
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
         """The closer looks."""
         return self.closer
 

@@ -78,7 +78,7 @@ class Moment(Record):
     def candidates(self) -> Objects:
         """Objects of the frame, of all scores from 0.05 on, with boxes in pixels of the frame."""
         distances = distances_to(self.detections.boxes[0], self.fixation)
-        return merge_fixations([self.detections], [distances], self._closer())
+        return merge_fixations([self.detections], [distances], self.closer_looks)
 
     @property
     def probability(self) -> Tensor:
@@ -105,7 +105,9 @@ class Moment(Record):
         row, column = divmod(self.cell, self.grid.columns)
         return [f"frame {self.number}, at (column, row): ({column}, {row})", self._listed()]
 
-    def _closer(self) -> Sequence[CloseUp]:
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
+        """The closer look of the frame, if it is one."""
         return () if self.closer is None else (self.closer,)
 
     def rows(self) -> list[dict[str, Any]]:

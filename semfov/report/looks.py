@@ -21,20 +21,6 @@ ABOUT = {
 """Entries at the head of an episode, by their keys in its data."""
 
 
-NUMBER = (
-    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
-    "looks would then show."
-)
-"""What values mean where objects are counted (`semfov.zoom.policy.best_find`)."""
-
-_PROBABILITY = (
-    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
-    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
-    "is the probability, before it, that the target is at the place."
-)
-"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
-
-
 def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> str:
     """The picture with its windows and objects, all looks, and a table of the objects.
 
@@ -52,13 +38,13 @@ def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> st
     head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
     looks = "".join(_look(data, number, pool, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
-    value = _PROBABILITY if data["decided"] else NUMBER
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
-        f"Click on the number or the border of a window to choose its look.</p>"
+        f"Click on the number or the border of a window to choose its look. Green objects were confirmed by the "
+        f"decision or a closer look.</p>"
         f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data, pool)}</figure>'
-        f'{looks}</div><p class="hint">{value} A look brought the objects whose final box comes from it.</p>'
+        f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
     )
 
@@ -67,16 +53,15 @@ def _picture(data: Data, pool: Pool) -> str:
     """The picture with numbered windows and objects."""
     width, height = data["size"]
     unit = max(width, height) / 640
-    windows = list(enumerate(data["looks"]))[1:]
+    windows = [(number, look) for number, look in enumerate(data["looks"]) if not look["whole"]]
     sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     tags = place_labels([tuple(look["box"]) for _, look in windows], sizes, (width, height))
     shapes = []
     for each in data["objects"]:
-        kind = "object target" if each["label"] == data["target"] else "object"
-        title = f"<title>{escape(each['label'])} {each['score']:.2f}, look {each['look']}</title>"
+        sure = ", confirmed" if each["confirmed"] else ""
+        kind = "object confirmed" if sure else "object"
+        title = f"<title>{escape(each['label'])} {each['score']:.2f}{sure}, look {each['look']}</title>"
         shapes.append(f'<g class="{kind}" data-look="{each["look"]}">{title}{_framed(each["box"])}</g>')
-    if data["found"] is not None:
-        shapes.append(f'<g class="object found"><title>decision</title>{_framed(data["found"])}</g>')
     for (number, look), tag in zip(windows, tags, strict=True):
         x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
@@ -93,7 +78,7 @@ def _look(data: Data, number: int, pool: Pool, place: str) -> str:
     """A look: its pixels with its detections, its window and value, and a table of the detections."""
     look = data["looks"][number]
     x1, y1, x2, y2 = look["box"]
-    size, unit = (x2 - x1, y2 - y1), (x2 - x1) / 640
+    size, unit = tuple(look["size"]), look["size"][0] / 640
     shapes, tags = [], []
     rows = [["#", "class", "score", "box"]]
     for order, each in enumerate(look["detections"], 1):
@@ -106,15 +91,16 @@ def _look(data: Data, number: int, pool: Pool, place: str) -> str:
             f"{order}</text>"
         )
         tags.append(f'<g class="{kind}">{_rect(each["tag"], "tag")}{text}</g>')
-        corners = [n + low for n, low in zip(each["box"], (x1, y1, x1, y1), strict=True)]
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(corners)])
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(each["place"])])
     value = "none: the first look" if look["value"] is None else f"{look['value']:.2g}"
     facts = {
-        "Window": f"x {x1} to {x2}, y {y1} to {y2} ({size[0]} × {size[1]} px)",
+        "Window": f"x {x1} to {x2}, y {y1} to {y2} ({x2 - x1} × {y2 - y1} px)",
         "Magnification": f"{look['magnification']:.2g}",
         "Value when it was chosen": value,
         "Objects that it brought": look["brought"],
     }
+    if look["value"] is None and number:
+        del facts["Value when it was chosen"]
     if look["closer"] is not None:
         facts["Closer look"] = look["closer"]
     told = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
@@ -125,7 +111,7 @@ def _look(data: Data, number: int, pool: Pool, place: str) -> str:
     label = f"The window of look {number} with {look['count']} detection{'s' if look['count'] != 1 else ''}"
     return (
         f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
-        f'<h4 id="{place}-title">Look {number}{"" if number else ": the whole picture"}</h4>'
+        f'<h4 id="{place}-title">Look {number}{": the whole picture" if look["whole"] else ""}</h4>'
         f'<svg viewBox="0 0 {size[0]} {size[1]}" role="img" aria-label="{label}">'
         f"{_image(pool.pictures[look['view']], size)}{''.join(shapes)}{''.join(tags)}</svg>"
         f'<dl class="facts">{told}</dl>{table}{_left_out(left, "detection")}</section>'
@@ -136,9 +122,10 @@ def _objects(data: Data, count: int) -> str:
     """The table of the objects, most confident first."""
     if not count:
         return "<p>No objects were found.</p>"
-    rows = [["#", "class", "score", "box", "look"]]
+    rows = [["#", "class", "score", "box", "look", "confirmed"]]
     for order, each in enumerate(data["objects"][:LISTED], 1):
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(each["box"]), str(each["look"])])
+        place, sure = _corners(each["box"]), "yes" if each["confirmed"] else "no"
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), sure])
     caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the look of each box"
     return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
 

@@ -1,4 +1,7 @@
-"""The display of records in a notebook: for a scanpath the page to step through, in a frame, with a limited size."""
+"""The display of scanpaths in a notebook: the page to step through, in a frame, with a limited size.
+
+Functions that draw records are registered here.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ from html import escape
 from semfov.metrics.scanpath.beside import compare_scanpath
 from semfov.paths import GazeRecord, HeadPath, Moment, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
-from semfov.report.drawing import path_html
+from semfov.report.drawing import record_html
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import page_html
+from semfov.report.record import write_record, write_scanpath
 from semfov.viz.animation import animate
 from semfov.viz.head import animate_head, plot_head_path
 from semfov.viz.scanpath import plot_scanpath
@@ -73,14 +77,10 @@ def _classes_that_fit(scanpath: Scanpath) -> int:
     return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
 
 
-def record_html(record: Record) -> str:
-    """The text form of a record, for kinds that have no page or drawing."""
-    return f"<pre>{escape(repr(record))}</pre>"
-
-
 draws("notebook", Record, record_html)
 draws("notebook", Scanpath, notebook_html)
-draws("notebook", ZoomPath, path_html)
+draws("report", Record, write_record)
+draws("report", Scanpath, write_scanpath)
 draws("plot", Scanpath, plot_scanpath)
 draws("plot", ZoomPath, plot_zoom_path)
 draws("plot", HeadPath, plot_head_path)

@@ -1,20 +1,24 @@
-"""A path through a large picture as data for a page: the picture and the window of each look as JPEG."""
+"""Looks at windows of a picture as data for a page: the picture and the window of each look as JPEG."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from functools import singledispatch
+from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.data.reduction import reduction_for
-from semfov.detection.objects import Objects
 from semfov.errors import check
-from semfov.paths import ZoomPath
+from semfov.paths import HeadPath, Record, RecordedLook, ZoomPath
+from semfov.paths.stimulus import LONGEST
 from semfov.report.episode import Data, Pool, rounded, tagged
+from semfov.viz.drawing import photograph_of
+from semfov.viz.head import head_views
 from semfov.zoom.gist import FOUND
-from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 
 _Frame = tuple[int, int, int, int]
@@ -29,9 +33,23 @@ SHOWN = 15
 """Largest number of detections of a look that are drawn and listed."""
 
 
+NUMBER = (
+    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
+    "looks would then show."
+)
+"""What values of windows mean where objects are counted (`semfov.zoom.policy.best_find`)."""
+
+_PROBABILITY = (
+    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
+    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
+    "is the probability, before it, that the target is at the place."
+)
+"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
+
+
 def zoom_data(
-    path: ZoomPath,
-    picture: LargePicture | ImageLike,
+    path: Record,
+    picture: LargePicture | ImageLike | None,
     pool: Pool,
     *,
     name: str,
@@ -39,14 +57,15 @@ def zoom_data(
     width: int = 1280,
     quality: int = 75,
 ) -> Data:
-    """Collect the data of a search or an exploration of a large picture for a page, as JSON values.
+    """Collect the data of looks at windows of a picture for a page, as JSON values.
 
-    Each window is shown at the resolution at which the detector received it. Detections and objects with a score below
-    0.1 are left out.
+    Each window is shown at the resolution at which the detector received it, or that of the picture if it is coarser.
+    Detections with a score below 0.1 are left out.
 
     Args:
         path: the search or exploration.
-        picture: the picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+        picture: the picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`. It
+            may be reduced; None takes the one that the record kept.
         pool: collects the pictures.
         name: name of the picture.
         settings: settings of the eye (`WindowEye.settings()`), for the name of the detector; None leaves the name out.
@@ -57,46 +76,130 @@ def zoom_data(
         The data, for `page_html` and `write_page`.
 
     Raises:
-        InputError: the picture does not have the size of the path, or the path has no looks.
+        InputError: the picture does not have the proportions of the record's, none is there, or there are no looks.
 
     >>> import torch
-    >>> from semfov.detection import Detections
+    >>> from semfov.detection import Detections, Objects
     >>> from semfov.zoom.glances import Glance, on_lattice
     >>> lattice, nothing = Lattice.over((1600, 1200), (400, 400)), torch.zeros(0)
     >>> look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
-    >>> objects = Objects(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
     >>> path = ZoomPath(
     ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
-    ...     candidates=objects, ending="passes",
+    ...     candidates=Objects.none(), ending="passes",
     ... )
     >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
     ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup from score 0.3. The only pass was used.')
     """
-    source = open_large(picture)
-    wide, high = path.lattice.size
-    check(tuple(source.size) == (wide, high), "picture", f"the picture of the path, {wide} × {high} px", source.size)
+    source = open_large(photograph_of(path, None) if picture is None else picture)
+    wide, high = path.size
+    expected = f"the picture of the record, {wide} × {high} px, or a reduced one"
+    reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
+    check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    sure = path.objects
-    objects = _objects(sure, path.classes)
-    found = None if path.decision is None else path.decision.box
+    objects = _objects(path)
+    views = look_views(path, source)
     return {
         "name": name,
         "pixels": f"{wide} × {high} px",
         "detector": None if settings is None else settings["detector"]["name"],
-        "sensor": windows_in_words(path.lattice),
+        "sensor": sensor_words(path),
         "passes": str(path.passes),
         "decision": outcome_in_words(path),
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
-        "decided": path.decision is not None,
-        "image": pool.add(_pixels(source, (0, 0, wide, high), min(width, wide)), width, quality),
-        "found": None if found is None else [round(x, 1) for x in found.tolist()],
-        "looks": [_look(path, number, objects, source, pool, quality) for number in range(path.passes)],
+        "values": values_in_words(path),
+        "image": pool.add(_pixels(source, (0, 0, wide, high), path.size, min(width, wide)), width, quality),
+        "looks": [_look(path, look, view, objects, pool, quality) for look, view in zip(path, views, strict=True)],
         "objects": objects[:DRAWN],
         "count": len(objects),
     }
+
+
+class LookView(NamedTuple):
+    """What a look showed.
+
+    Attributes:
+        pixels: `(3, h, w)`, RGB in [0, 1].
+        size: `(width, height)` in the unit of the boxes.
+        boxes: `(L, 4)`, boxes of all detections in the view.
+        across: number of pixels across that the detector received.
+    """
+
+    pixels: Tensor
+    size: tuple[int, int]
+    boxes: Tensor
+    across: int
+
+
+@singledispatch
+def look_views(path: Record, source: LargePicture) -> Iterator[LookView]:
+    """The views of a record, from its picture.
+
+    Args:
+        path: the record.
+        source: the picture, which may be reduced.
+
+    Yields:
+        One view for each look.
+    """
+    for look in path:
+        frame = _whole_pixels(look.region, path.size)
+        across = frame[2] - frame[0]
+        yield _view(look, frame, source, path.size, across)
+
+
+@look_views.register
+def _(path: ZoomPath, source: LargePicture) -> Iterator[LookView]:
+    for look, glance in zip(path, path.glances, strict=True):
+        frame = _whole_pixels(look.region, path.size)
+        across = max(1, round((frame[2] - frame[0]) * glance.window.fixation[2]))
+        yield _view(look, frame, source, path.size, across)
+
+
+@look_views.register
+def _(path: HeadPath, source: LargePicture) -> Iterator[LookView]:
+    whole = _pixels(source, (0, 0, *path.size), path.size, 2 * LONGEST)
+    size = path.views.world.size
+    for number, pixels in enumerate(head_views(path, whole)):
+        yield LookView(pixels, size, path.detections[number].boxes[0], size[0])
+
+
+def _view(look: RecordedLook, frame: _Frame, source: LargePicture, size: tuple[int, int], across: int) -> LookView:
+    """The view of a window of the picture."""
+    x1, y1, x2, y2 = frame
+    boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
+    return LookView(_pixels(source, frame, size, across), (x2 - x1, y2 - y1), boxes, across)
+
+
+@singledispatch
+def sensor_words(path: Record) -> str | None:
+    """Describe in words through what a record looked."""
+    return None
+
+
+@sensor_words.register
+def _(path: ZoomPath) -> str:
+    return windows_in_words(path.lattice)
+
+
+@sensor_words.register
+def _(path: HeadPath) -> str:
+    wide, high = path.views.world.size
+    fields = ", ".join(f"{field:g}" for field in path.views.fields)
+    return f"views of {wide} × {high} px with fields of view of {fields} degrees"
+
+
+@singledispatch
+def values_in_words(path: Record) -> str:
+    """Explain the values of the looks, where they have a meaning that the page does not tell elsewhere."""
+    return ""
+
+
+@values_in_words.register
+def _(path: ZoomPath) -> str:
+    return f"{NUMBER if path.decision is None else _PROBABILITY} "
 
 
 def windows_in_words(lattice: Lattice) -> str:
@@ -107,47 +210,56 @@ def windows_in_words(lattice: Lattice) -> str:
     return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
 
-def outcome_in_words(path: ZoomPath) -> str:
+def outcome_in_words(path: Record) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
-    target = path.target_name
+    reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
     if path.decision is None:
         told = f"{path.objects_in_words()}."
     else:
         outcome, probability = path.decision.outcome, path.decision.probability
-        told = f"“{target}” {outcome}, probability that the picture holds it: {probability:.2f}."
-    return f"{told} {path.why_it_ended()}".rstrip()
+        told = f"“{path.target_name}” {outcome}, probability that the picture holds it: {probability:.2f}."
+    return f"{told} {reason}".rstrip()
 
 
-def _objects(objects: Objects, classes: tuple[str, ...]) -> list[Data]:
+def _objects(path: Record) -> list[Data]:
     """The objects, most confident first."""
-    parts = (objects.boxes.tolist(), objects.labels.tolist(), objects.scores.tolist(), objects.passes.tolist())
     return [
-        {"box": [round(x, 1) for x in box], "label": classes[label], "score": rounded(score), "look": look}
-        for box, label, score, look in zip(*parts, strict=True)
+        {
+            "box": [round(row[side], 1) for side in ("x1", "y1", "x2", "y2")],
+            "label": row["class"],
+            "score": rounded(row["score"]),
+            "look": row["look"],
+            "confirmed": row["confirmed"],
+        }
+        for row in path.object_rows()
     ]
 
 
-def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture, pool: Pool, quality: int) -> Data:
+def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], pool: Pool, quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
-    x, y, magnification = path.glances[number].window.fixation
-    frame = _whole_pixels(path.region(number), path.lattice.size)
-    across = max(1, round((frame[2] - frame[0]) * magnification))
-    detections = _detections(path, path.glances[number], frame)
+    (x, y), number, (x1, y1, x2, y2) = look.fixation, look.number, look.region
+    width, height = path.size
+    whole = x2 - x1 > width - 1 and y2 - y1 > height - 1
+    magnification = view.across / max(x2 - x1, 1)
+    detections = _detections(path, look, view)
     brought = Counter(each["label"] for each in objects if each["look"] == number)
-    closer = next((look for look in path.closer if look.number == number), None)
-    value, kinds = path.values[number], ", ".join(f"{count} × {label}" for label, count in brought.most_common())
-    told = [f"Look {number} of {path.passes - 1}"]
-    told[0] += f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}." if number else ", at the whole picture."
-    if number:
-        told.append(f"Its value was {value:.2g}.")
+    closer = next((each for each in path.closer_looks if each.number == number), None)
+    kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
+    last = sum(1 for _ in path) - 1
+    told = [f"Look {number} of {last}"]
+    told[0] += ", at the whole picture." if whole else f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}."
+    if look.value is not None:
+        told.append(f"Its value was {look.value:.2g}.")
     if closer is not None:
         told.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
     told.append(f"Objects that it brought: {kinds or 'none'}.")
     return {
-        "view": pool.add(_pixels(source, frame, across), across, quality),
-        "box": list(frame),
+        "view": pool.add(view.pixels, view.across, quality),
+        "box": [round(side) for side in look.region],
+        "size": list(view.size),
+        "whole": whole,
         "magnification": rounded(magnification),
-        "value": rounded(value),
+        "value": None if look.value is None else rounded(look.value),
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:SHOWN],
         "count": len(detections),
@@ -156,24 +268,23 @@ def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture
     }
 
 
-def _detections(path: ZoomPath, glance: Glance, frame: _Frame) -> list[Data]:
-    """Detections of a look, those of the target first, with boxes and labels in pixels of the window."""
-    x1, y1, x2, y2 = frame
-    rows = []
-    best = (glance.detections.labels[0].tolist(), glance.detections.confidence[0].tolist())
-    for box, vector, label, score in zip(glance.detections.boxes[0], glance.detections.scores[0], *best, strict=True):
+def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
+    """Detections of a look, those of the target first, with boxes and labels in the unit of the view."""
+    seen, rows = look.detections, []
+    parts = (view.boxes.tolist(), seen.boxes[0].tolist(), seen.labels[0].tolist(), seen.confidence[0].tolist())
+    for box, place, vector, label, score in zip(*parts[:2], seen.scores[0], *parts[2:], strict=True):
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
         if path.target is not None and label and float(vector[path.target]) >= FOUND:
             label, score = path.target, float(vector[path.target])
         if score >= FOUND:
-            place = [round(n - low, 1) for n, low in zip(box.tolist(), (x1, y1, x1, y1), strict=True)]
             first = label == path.target
-            rows.append((first, score, {"box": place, "label": path.classes[label], "score": rounded(score)}))
+            corners = {"box": [round(n, 1) for n in box], "place": [round(n, 1) for n in place]}
+            rows.append((first, score, {**corners, "label": path.classes[label], "score": rounded(score)}))
     rows.sort(key=lambda row: row[:2], reverse=True)
     kept = [detection for _, _, detection in rows]
     # Names would cover small objects. The table has them.
     numbers = [str(number) for number in range(1, min(len(kept), SHOWN) + 1)]
-    return [*tagged(kept[:SHOWN], numbers, (x2 - x1, y2 - y1)), *kept[SHOWN:]]
+    return [*tagged(kept[:SHOWN], numbers, view.size), *kept[SHOWN:]]
 
 
 def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int]) -> _Frame:
@@ -183,6 +294,19 @@ def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int])
     return x1, y1, x2, y2
 
 
-def _pixels(source: LargePicture, frame: _Frame, across: int) -> Any:
-    """Pixels `(3, h, w)` of a window in [0, 1]; very large windows are read at a coarser resolution."""
+def _pixels(source: LargePicture, frame: _Frame, size: tuple[int, int], across: int) -> Tensor:
+    """Pixels `(3, h, w)` of a window in [0, 1]; very large windows are read at a coarser resolution.
+
+    Args:
+        source: the picture, which may be reduced.
+        frame: the window, in pixels of the whole picture.
+        size: `(width, height)` of the whole picture.
+        across: number of pixels across that are wanted.
+
+    Returns:
+        The pixels.
+    """
+    scale = [there / here for there, here in zip(source.size, size, strict=True)] * 2
+    x1, y1, x2, y2 = (n * by for n, by in zip(frame, scale, strict=True))
+    frame = _whole_pixels((x1, y1, x2, y2), source.size)
     return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255

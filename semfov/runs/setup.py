@@ -94,7 +94,7 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     from semfov.data.coco import CocoScenes
 
     selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
-    ids = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
+    ids: list[Any] = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
     kept = [name for number, name in enumerate(ids) if number % every]
     return (

@@ -161,7 +161,6 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         axes = above.subplots()
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
-        lay_out(figure)
         draw_objects(axes, path, last=look, tagged=False)
         left, right = below.subplots(1, 2, width_ratios=[1, 1.25])
         left.imshow(picture_array(next(views)))

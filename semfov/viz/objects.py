@@ -54,7 +54,7 @@ def draw_objects(
 ) -> None:
     """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
 
-    The figure must be laid out, because the positions of labels depend on the layout.
+    For labels the figure must be laid out, because their positions depend on the layout.
 
     Args:
         axes: axes that hold the picture.

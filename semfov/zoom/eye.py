@@ -139,7 +139,8 @@ class WindowEye(nn.Module):
         """
         canvas, frames = self._resample(view, fixations, within)
         exact = canvas.dtype == torch.uint8
-        candidates = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
+        seen = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
+        candidates = seen.precise()
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
         place = _Placement(frames, view.picture.size, selected.boxes)

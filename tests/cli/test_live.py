@@ -46,7 +46,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
     path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
     assert main(["live", str(path), "--target", "Motorbikes", "--out", str(tmp_path / "out")]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if "frames/s" in line]
+    lines = [line for line in capsys.readouterr().out.splitlines() if "most likely at" in line]
     assert len(lines) == len(places)
     assert "motorcycle: found" in lines[7]
     assert "motorcycle: absent" in lines[-1]

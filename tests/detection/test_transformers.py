@@ -90,9 +90,14 @@ MODELS = {
 
 
 def small(kind):
-    """A random model whose scores are not all alike."""
+    """A random model whose boxes and scores depend on the picture, and are not all alike."""
     torch.manual_seed(0)
     model = MODELS[kind]().eval()
+    for layer in model.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight)
+        elif isinstance(layer, nn.BatchNorm2d):
+            nn.init.ones_(layer.weight)
     for name, parameter in model.named_parameters():
         if any(part in name for part in ("class", "bbox", "score")):
             nn.init.normal_(parameter, std=0.3)
@@ -155,7 +160,7 @@ class Outputs(nn.Module):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["detr"])
+@pytest.mark.parametrize("kind", MODELS)
 def test_exported_models_give_the_same_candidates(kind, tmp_path):
     model, canvas = small(kind), torch.rand(1, 3, 96, 128)
     names = {"input_names": ["pixel_values"], "output_names": ["logits", "pred_boxes"]}
@@ -165,8 +170,9 @@ def test_exported_models_give_the_same_candidates(kind, tmp_path):
     detector = load_detector(model, processor={"size": {"height": 96, "width": 128}})
     assert exported.background == detector.background
     found, wanted = exported.propose(canvas), detector.propose(canvas)
-    torch.testing.assert_close(found.boxes, wanted.boxes, atol=1e-3, rtol=1e-4)
-    torch.testing.assert_close(found.classes, wanted.classes, atol=1e-5, rtol=1e-4)
+    assert (wanted.classes - detector.propose(canvas.flip(-1)).classes).abs().max() > 0.01
+    torch.testing.assert_close(found.boxes, wanted.boxes, atol=1e-2, rtol=1e-3)
+    torch.testing.assert_close(found.classes, wanted.classes, atol=1e-4, rtol=1e-3)
 
 
 def test_pictures_are_resized_as_by_the_image_processor():

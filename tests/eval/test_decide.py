@@ -50,9 +50,7 @@ def arguments(tmp_path_factory):
 @pytest.fixture(scope="module")
 def finished(arguments, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    threads = torch.get_num_threads()
     assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
-    torch.set_num_threads(threads)
     return out
 
 

@@ -37,9 +37,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="session")
 def finished(small):
     """The small run, finished."""
-    threads = torch.get_num_threads()
     explore(small)
-    torch.set_num_threads(threads)
     return small
 
 

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 
 from eval.search import main
 from semfov.data.scenes import EmbeddedScenes
@@ -14,14 +13,7 @@ pytestmark = [pytest.mark.weights, pytest.mark.slow]
 IDS = ["/../../../x/evil", "../up", "a/b", "a-b", "..", "x" * 300]
 
 
-@pytest.fixture
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
-def test_a_run_writes_only_into_its_folders_whatever_the_image_ids_are(tmp_path, threads):
+def test_a_run_writes_only_into_its_folders_whatever_the_image_ids_are(tmp_path):
     from PIL import Image
 
     embedded = EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=len(IDS))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from eval.human import main
@@ -63,9 +62,7 @@ def rows(path):
 
 @pytest.fixture(scope="module")
 def finished(pictures):
-    threads = torch.get_num_threads()
     assert main(viewing(pictures, "viewing")) == 0
-    torch.set_num_threads(threads)
     return pictures / "viewing"
 
 
@@ -107,7 +104,7 @@ def test_figures_come_from_the_held_out_half(finished):
 @pytest.mark.slow
 @pytest.mark.weights
 def test_searches_of_people_models_random_draws_and_policies_are_compared(pictures):
-    out, threads = pictures / "search", torch.get_num_threads()
+    out = pictures / "search"
     code = main(
         [
             "search", "--people", str(pictures / "people"), "--files", f"[{pictures / 'model.csv'}]",
@@ -117,7 +114,6 @@ def test_searches_of_people_models_random_draws_and_policies_are_compared(pictur
             "--workers", "1",
         ]
     )  # fmt: skip
-    torch.set_num_threads(threads)
     assert code == 0
     table = rows(out / "summary.csv")
     titles = list(dict.fromkeys(row["table"] for row in table))

@@ -50,10 +50,8 @@ def home(tmp_path_factory):
     write_network(folder / "colours.onnx")
     (folder / "photographs").mkdir()
     write_photographs(folder / "photographs")
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert command(arguments(folder)) == 0
-    torch.set_num_threads(threads)
     return folder
 
 
@@ -76,12 +74,12 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map"]
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map", "windows"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
         assert "held-out photographs" in part.why, (name, part.why)
-        assert (part.file is None) == (name == "tempering")
+        assert (part.file is None) == (name in ("tempering", "windows"))
     thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
     assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
@@ -168,6 +166,7 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
+    "windows": "fit_mosaics",
 }
 
 
@@ -197,10 +196,8 @@ def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, 
     (tmp_path / "models" / name).unlink()
     (tmp_path / "models/manifest.json").unlink()
     forbid(monkeypatch, *(FITS.keys() - {part}))
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert command(arguments(home, "--out", str(tmp_path / "models"))) == 0
-    torch.set_num_threads(threads)
     again, once = (folder / f"models/{part}.safetensors" for folder in (tmp_path, home))
     assert again.read_bytes() == once.read_bytes()
 
@@ -525,14 +522,12 @@ def test_one_progress_bar_covers_all_stages(capsys):
 
 @pytest.mark.slow
 def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     root = home / "photographs"
     agent = semfov.fit_detector(
         home / "colours.onnx", root, root / "instances.json", out=tmp_path / "out", limit=6, columns=4, rows=4,
         holdout=3, steps=3, map_steps=3, cache=home / "cache", threshold=0.05,
     )  # fmt: skip
-    torch.set_num_threads(threads)
     assert agent.eye.detector.selection.threshold == 0.05
     assert Manifest.read(tmp_path / "out").training["photographs"] == 6
     # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.

@@ -22,9 +22,7 @@ SMALL = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--shard", "
 def fitted(tmp_path_factory):
     """A model fitted to two looks at each of 6 embedded scenes, in three shards."""
     out = tmp_path_factory.mktemp("fit")
-    threads = torch.get_num_threads()
     assert main([*SMALL, "1", "--out", str(out)]) == 0
-    torch.set_num_threads(threads)
     return out
 
 

@@ -166,10 +166,8 @@ SMALL = [
 def trained(tmp_path_factory):
     """A model trained on 3 embedded scenes."""
     out = tmp_path_factory.mktemp("fit_map")
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert main([*SMALL, "--out", str(out / "out"), "--cache", str(out / "cache")]) == 0
-    torch.set_num_threads(threads)
     return out
 
 

@@ -55,10 +55,8 @@ def test_there_is_no_hit_rate_when_every_fixation_is_on_the_target():
 @pytest.mark.weights
 @pytest.mark.slow
 def test_report_has_a_row_for_every_exponent(tmp_path):
-    threads = torch.get_num_threads()
     small = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--min_objects", "1", "--shard", "2"]
     assert main([*small, "--exponents", "[0.25,1.0]", "--workers", "1", "--out", str(tmp_path)]) == 0
-    torch.set_num_threads(threads)
     hits = json.loads((tmp_path / "hits.json").read_text())
     assert set(hits) == {"0.25", "1.0"}
     assert all(0 <= value <= 1 for rates in hits.values() for value in rates.values())

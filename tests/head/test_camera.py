@@ -5,11 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from examples.pan_tilt import SimulatedCamera
-from semfov import Eye, Flat, Foveation, Panorama
+from semfov import ActivePerception, Eye, Flat, Foveation, Panorama
 from semfov.agents import HeadAgent
+from semfov.belief.observers import LearnedMap, Target
 from semfov.errors import DataError, InputError
+from semfov.gaze.policies import NonPredictive, Random
 from semfov.head import (
     CameraFrame,
     CameraScene,
@@ -21,6 +24,7 @@ from semfov.head import (
     Views,
     open_scene,
 )
+from semfov.head.belief import SceneObserver
 from semfov.head.gain import OUT
 from semfov.paths import HeadPath
 from tests.small import Coloured, rand
@@ -140,9 +144,6 @@ def test_fewer_turns_are_made_when_settling_takes_long(agent, panorama):
 
 
 def test_turns_within_the_dead_zone_have_no_value(eye, models, panorama):
-    from semfov.belief.observers import Target
-    from semfov.head import SceneObserver
-
     views = Views(Panorama(panorama, speeds=Speeds(dead_zone=50.0)))
     belief = SceneObserver(Target(models[0]), views).start(1, views.grid, torch.zeros(1))
     gain, here = SearchGain(views), views.ahead
@@ -207,6 +208,12 @@ def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
 
     with pytest.raises(InputError, match=r"frame: expected 104 × 78 pixels, as `size` has it, got \(104, 77\)"):
         agent.explore(Large(panorama))
+    with pytest.raises(InputError, match=r"camera: expected a camera, got the class Own; give Own\(…\)"):
+        agent.explore(Own)
+    for fields in (60, (), (60.0, 30.0), (0.0, 60.0), (180.0,), ("60",)):
+        for make in (Panorama, Flat):
+            with pytest.raises(InputError, match=r"fields: expected one or more angles .*, such as"):
+                make(panorama, fields=fields)
     with pytest.raises(InputError, match="color: expected rgb for a Panorama"):
         agent.explore(Panorama(panorama), color="bgr")
     with pytest.raises(InputError, match="tilt: expected limits"):
@@ -214,8 +221,6 @@ def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
 
 
 def test_a_picture_is_a_panorama_if_it_is_twice_as_wide_as_high(agent, panorama, tmp_path):
-    from PIL import Image
-
     pixels = panorama.mul(255).byte().permute(1, 2, 0).numpy()
     Image.fromarray(pixels).save(tmp_path / "around.png")
     whole = agent.explore(Panorama(panorama), passes=3)
@@ -245,3 +250,29 @@ def test_the_record_of_a_camera_shows_what_it_saw_and_is_stored(agent, panorama,
     assert loaded.views.world.tilt == (-30.0, 60.0)
     torch.testing.assert_close(loaded.gaze(-1), path.gaze(-1))
     assert len(loaded.objects) == len(path.objects)
+
+
+def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_path):
+    """The kind of look follows from the picture; the record is that of the part of the agent that turns a head."""
+    one = ActivePerception(eye, (Target(models[0]), NonPredictive()), (LearnedMap(models[1]), Random())).eval()
+    head = HeadAgent(eye, *models).eval()
+    file = tmp_path / "around.png"
+    Image.fromarray(panorama.mul(255).byte().permute(1, 2, 0).numpy()).save(file)
+    limits = {"passes": 4, "duration": 20.0}
+    expected = head.search(Panorama(panorama), "blue", confirm=1.0, **limits)
+    for picture, how in ((Panorama(panorama), "auto"), (file, "head"), (panorama, "head")):
+        path = one.search(picture, "blue", how=how, confirm=1.0, **limits)
+        assert isinstance(path, HeadPath)
+        assert path.actions == expected.actions
+        torch.testing.assert_close(path.maps, expected.maps)
+    camera = Own(panorama)
+    assert one.search(camera, "blue", color="bgr", confirm=1.0, **limits).actions[0] == head.views(camera).ahead
+    assert one.find_all(camera, ["red", "blue"], color="bgr", **limits).targets == (1, 3)
+    assert [look.number for look in one.explore(camera, color="bgr", worth=0.0, **limits)] == [0, 1, 2, 3]
+    for wrong, message in (
+        ({"picture": camera, "shifts": 3}, "shifts: expected None"),
+        ({"picture": camera, "how": "windows"}, "how: expected 'head' or 'auto' for a scene"),
+        ({"picture": panorama, "duration": 3.0}, "duration: expected None"),
+    ):
+        with pytest.raises(InputError, match=message):
+            one.explore(**wrong)

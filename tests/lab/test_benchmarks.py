@@ -16,13 +16,6 @@ from benchmarks.timing import Comparison, Spread, interleaved, measure
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def same_threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize("number", range(len(COMPARISONS)))
 def test_compared_programs_give_the_same_results(number):
     with torch.inference_mode():
@@ -60,7 +53,7 @@ def test_repeated_runs_in_a_turn_are_averaged():
     assert found == {"a": [1e3 * 5 / 4]}
 
 
-def test_decisions_have_a_row_for_every_published_cost(tmp_path, monkeypatch, same_threads):
+def test_decisions_have_a_row_for_every_published_cost(tmp_path, monkeypatch):
     arguments = ["decisions", "--threads", "1", "--seconds", "0", "--out", str(tmp_path)]
     monkeypatch.setattr("sys.argv", arguments)
     decisions.main()

@@ -204,15 +204,9 @@ def run_here(folder: Path) -> int:
 
 def run_in(out: Path, cache: Path) -> int:
     """Run the small search in this process, in the given folders."""
-    import torch
-
     from eval.search import main
 
-    threads = torch.get_num_threads()
-    try:
-        return main([*SEARCH[3:], "--out", str(out), "--cache", str(cache), "--workers", "1"])
-    finally:
-        torch.set_num_threads(threads)
+    return main([*SEARCH[3:], "--out", str(out), "--cache", str(cache), "--workers", "1"])
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "of another kind"])

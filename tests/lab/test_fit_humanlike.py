@@ -151,11 +151,9 @@ def write_viewing(folder, pictures=4, subjects=4):
 @pytest.mark.slow
 @pytest.mark.weights
 def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
-    threads = torch.get_num_threads()
     given = write_viewing(tmp_path)
     small = ["--belief.columns", "4", "--belief.rows", "3", "--policies", "[kl-raw,vocus2-raw]"]
     assert main([*given, *small, "--out", str(tmp_path / "out")]) == 0
-    torch.set_num_threads(threads)
     habits = GazeHabits.from_pretrained(tmp_path / "out/yolov3-tiny.safetensors")
     assert len(habits.place) == 12
     assert habits.metadata["policy"] in ("kl-raw", "vocus2-raw")

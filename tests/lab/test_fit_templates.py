@@ -73,7 +73,6 @@ def test_features_of_objects_are_taken_at_their_centres():
 @pytest.mark.slow
 @pytest.mark.weights
 def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
-    threads = torch.get_num_threads()
     assert main(["--data.limit", "6", "--holdout", "3", "--out", str(tmp_path)]) == 0
     path = tmp_path / "yolov3-tiny.safetensors"
     model = ClassTemplates.from_pretrained(path)
@@ -87,7 +86,6 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
         "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "out"), "--templates", str(path),
     ]  # fmt: skip
     assert search(run) == 0
-    torch.set_num_threads(threads)
     records = [json.loads(line) for line in (tmp_path / "out/episodes.jsonl").read_text().splitlines()]
     assert {record["policy"] for record in records} == {"ivsn", "random"}
     assert all(len(set(record["cells"])) == len(record["cells"]) for record in records)

@@ -8,15 +8,18 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from PIL import Image
 
 from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
 from semfov.decision import CloseUp, Decision
-from semfov.detection import Objects
+from semfov.detection import Objects, Placement
 from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write_file
-from semfov.paths import GazeRecord, HeadPath, Moment, Record, ZoomPath
+from semfov.paths import GazeRecord, HeadPath, Moment, Record, Stimulus, ZoomPath, reduced_copy
+from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice
 
@@ -198,12 +201,75 @@ def test_rows_and_fixations_match_the_looks(make):
     assert (fixations.target, fixations.found) == (record.target_name, record.found)
 
 
-@pytest.mark.parametrize("make", WHOLE)
-def test_every_path_is_drawn_on_the_given_picture(make):
+def with_picture(make):
+    """A record with its photograph; a scanpath also with what its foveated views need."""
+    record = make()
+    width, height = record.size
+    photograph = reduced_copy(torch.rand(3, height, width, generator=torch.Generator().manual_seed(4)))
+    if make is not scanpath:
+        return replace(record, photograph=photograph, target=2 if make is moment else record.target)
+    sensor = {"sigma": 20.0, "levels": 3, "growth": 2.0, "convention": "kornia", "reference": 80.0}
+    settings = {"sensor": sensor, "detector": {"name": "fixed"}}
+    placement = Placement((80.0, 60.0), (1.0, 1.0), (0, 0))
+    return replace(record, stimulus=Stimulus(photograph, photograph.clone(), placement, settings))
+
+
+@pytest.mark.parametrize("make", RECORDS)
+def test_every_record_draws_itself_on_its_picture(make, tmp_path):
+    """What is printed, drawn, on the page and in the notebook are its objects, and no others."""
+    record = with_picture(make)
+    record = replace(record, least=0.1)
+    objects, sure = record.objects, record.confirmed
+    assert len(objects) > 0
+    (axes,) = record.plot().axes
+    colours = [to_hex(patch.get_edgecolor()).upper() for patch in axes.patches if patch.get_linestyle() == "-"]
+    assert colours.count(FOUND) == int(sure.sum())
+    assert colours.count(TARGET) == int((~sure).sum())
+    entries = " ".join(text.get_text() for text in axes.get_legend().get_texts())
+    texts = [text.get_text() for text in axes.texts]
+    for row in record.object_rows():
+        assert f"{row['class']} {row['score']:.2f}" in texts
+        assert f"{row['class']} {row['score']:.2f}" in repr(record)
+    assert "from score 0.1" in entries or sure.all()
+    film = record.animate(tmp_path / "film.gif")
+    with Image.open(film) as frames:
+        assert frames.n_frames == len(list(record))
+    page = record.report(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "data:image/jpeg" in page
+    shown = record._repr_html_()
+    assert "data:image/jpeg" in shown
+    if make is not scanpath:
+        assert shown.count(f'stroke="{FOUND}"') == int(sure.sum())
+        assert shown.count(f'stroke="{TARGET}"') == int((~sure).sum())
+        assert page.count('class="object confirmed"') == int(sure.sum())
+        assert page.count('class="object"') == int((~sure).sum())
+
+
+@pytest.mark.parametrize("make", RECORDS)
+def test_a_record_without_its_picture_is_drawn_on_a_given_one(make):
     record = make()
     assert isinstance(record.plot(image=torch.rand(3, 60, 80)), Figure)
     with pytest.raises(InputError, match="image: expected the photograph"):
         record.plot()
+
+
+@pytest.mark.parametrize("make", WHOLE)
+def test_a_file_keeps_the_picture_and_files_of_earlier_versions_load(make, tmp_path):
+    record = replace(with_picture(make), targets=(1, 2), least=0.4, source="a.jpg")
+    file = tmp_path / "a.safetensors"
+    record.save(file)
+    loaded = type(record).load(file)
+    assert same(loaded.image, record.image)
+    assert (loaded.targets, loaded.least, loaded.source) == ((1, 2), 0.4, "a.jpg")
+    assert repr(loaded) == repr(record)
+    bare = make()
+    bare.save(file)
+    tensors, values = read(file, bare._format.kind)
+    write_file(file, tensors, {name: values[name] for name in values.keys() - {"targets", "least", "source"}})
+    assert repr(type(bare).load(file)) == repr(bare)
+    write_file(file, {**tensors, "photograph": torch.zeros(3, 2, 1281, dtype=torch.uint8)}, values)
+    with pytest.raises(DataError, match="photograph: expected 1 to 1280 px"):
+        type(bare).load(file)
 
 
 @pytest.mark.parametrize("make", WHOLE)

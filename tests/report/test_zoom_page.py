@@ -72,7 +72,8 @@ def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, host
 def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, zoom_path):
     elements = Elements(zoom_page.read_text(encoding="utf-8"))
     assert [each["data-look"] for each in elements.of("window")] == ["1", "2"]
-    assert [each.get("data-look") for each in elements.of("object")] == ["1", "2", None]
+    assert [each.get("data-look") for each in elements.of("object")] == ["1", "2"]
+    assert ["confirmed" in each["class"] for each in elements.of("object")] == [True, False]
     looks = elements.of("look")
     assert [each["data-look"] for each in looks] == ["0", "1", "2"]
     assert not [each for each in looks if "hidden" in each]
@@ -144,7 +145,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
         (Decision("absent", 0.1), "decision", "“cat” absent, .* holds it: 0.10. No remaining look is worth"),
         (Decision("undecided", 0.6), "passes", "“cat” undecided, .* 0.60. All 3 passes were used.$"),
         (Decision("undecided", 0.6), "decision", "0.60. No remaining look is worth a pass, but .* probably there.$"),
-        (Decision("undecided", 0.2), "windows", "0.20. No remaining look can show the target.$"),
+        (Decision("undecided", 0.2), "windows", "0.20. No window is left that can show more.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
         (None, "passes", "^0 × cat from score 0.3. All 3 passes were used.$"),
         (None, "worth", "^0 × cat from score 0.3. No remaining look is expected to show enough new objects.$"),
@@ -185,7 +186,7 @@ def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpat
 
 
 def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_picture):
-    with pytest.raises(InputError, match="picture: expected the picture of the path, 400 × 300 px"):
+    with pytest.raises(InputError, match="picture: expected the picture of the record, 400 × 300 px"):
         zoom_data(zoom_path, large_picture[:, :200], Pool(), name="other")
     with pytest.raises(InputError, match="at least one look"):
         zoom_data(replace(zoom_path, glances=()), large_picture, Pool(), name="other")

@@ -42,13 +42,6 @@ def config(tmp_path):
     )
 
 
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.slow
 def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, monkeypatch, caplog):
     first = SearchRun(config)

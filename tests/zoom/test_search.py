@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
+from torchvision.transforms.functional import to_pil_image
 
 from semfov.agents import ZoomAgent
+from semfov.data.large import open_large
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 from semfov.viz.zoom import plot_zoom_path
@@ -29,6 +31,18 @@ def test_search_finds_a_target_in_the_picture(agent, picture):
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
     assert path.passes == len(path.glances)
+
+
+def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_path):
+    """However the file is given, also opened."""
+    file = tmp_path / "squares.png"
+    to_pil_image(torch.nn.functional.pad(picture, (0, 976))).save(file)
+    for given in (file, str(file), open_large(file)):
+        path = agent.find_all(given, "blue", passes=2)
+        assert path.source == str(file)
+        assert path.image.shape == (3, 492, 1280)
+        assert path.plot().axes[0].images
+    assert agent.search(picture, "red", passes=2).source is None
 
 
 def test_search_for_an_absent_target_ends(agent, picture):

@@ -15,12 +15,13 @@ from semfov.fit.parts.map import MapFit
 from semfov.fit.parts.observation import ObservationFit
 from semfov.fit.parts.tempering import TemperingFit
 from semfov.fit.parts.verification import VerificationFit
+from semfov.fit.parts.windows import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import digest_of
 
-FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit)
+FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit, WindowsFit)
 """The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
 
 

@@ -30,12 +30,8 @@ def words(name, folder, *more, workers=1):
 
 def run(name, *arguments):
     """Run a command in this process with one thread; returns its exit code."""
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    try:
-        return importlib.import_module(name.split()[0]).main(list(arguments))
-    finally:
-        torch.set_num_threads(threads)
+    return importlib.import_module(name.split()[0]).main(list(arguments))
 
 
 def contents(name, folder):

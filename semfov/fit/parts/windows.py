@@ -1,0 +1,208 @@
+"""The evidence for pictures larger than the detector's input, compared with slices in the order of raw scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from semfov.data.mosaics import Mosaics
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words, mean_percent, section
+from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.windows import (
+    FitZoomConfig,
+    fit_closer_looks,
+    fit_counts,
+    fit_decision,
+    fit_looks,
+    judge_windows,
+    look_at_all,
+    make_mosaics,
+    make_store,
+    survey_again,
+)
+from semfov.fit.windows_choice import choose_foresight, open_all
+from semfov.io.manifest import Part
+from semfov.metrics.averages import FloatArray
+from semfov.runs.looks import one_thread
+from semfov.runs.window_looking import found_in
+from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Glance, Glances
+from semfov.zoom.search import find_everything
+from semfov.zoom.slices import ranked, usual_slices
+
+ENOUGH = 16
+"""Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
+RECALL_PASSES = (4, 8, 16)
+"""Passes of the detector after which recall is reported."""
+_OF_INPUT = 1.15
+"""Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
+_LOOK = 0.04
+"""Estimate of the seconds of a pass of the detector."""
+
+Way = Callable[[Glances], Iterator[Turn[Any]]]
+"""A way of looking for all objects of a picture."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Settings of evidence that is not fitted.
+
+    Attributes:
+        why: the reason, in a sentence.
+    """
+
+    why: str
+
+
+class WindowsFit(PartFit):
+    """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
+
+    name: ClassVar[str] = "windows"
+
+    @property
+    def settings(self) -> FitZoomConfig | LeftOut:
+        """The settings of the fit."""
+        if not self.config.windows:
+            return LeftOut("not fitted, since the setting `windows` is false")
+        photographs, held_out = len(self.run.scenes), len(self.inputs.held_out)
+        if held_out < ENOUGH:
+            return LeftOut(
+                f"not fitted, since mosaics need at least {ENOUGH} held-out photographs, and {held_out} of the "
+                f"{photographs} photographs are held out"
+            )
+        return self.config.mosaics(photographs, self._tile())
+
+    def _tile(self) -> int:
+        """Width of the photographs' slots in pixels: the photographs are not enlarged."""
+        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
+        own = median(max(width, height * 4 / 3) for width, height in sizes)
+        return max(16, round(min(own, _OF_INPUT * self.run.eye.detector.input_size[0])))
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        config = self.settings
+        if isinstance(config, LeftOut):
+            return {}
+        return {
+            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
+            "learning what closer looks show": 0.1 * config.steps,
+            "learning the expected number of objects": 0.2 * config.steps,
+            "learning the survey": 0.4 * config.survey_steps,
+            "searching": 4 * config.searched,
+            "searching held-out mosaics": 4 * config.judged,
+            "looking closely": 4 * config.searched,
+            "looking closely at held-out mosaics": 4 * config.judged,
+            "exploring": config.searched,
+            "exploring held-out mosaics": config.judged,
+        }
+
+    def fit(self) -> PartResult:
+        """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
+        config = self.settings
+        if isinstance(config, LeftOut):
+            return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
+        with one_thread():
+            return self._fit(config)
+
+    def _fit(self, config: FitZoomConfig) -> PartResult:
+        eye = WindowEye(self.run.eye.detector).eval().requires_grad_(False)
+        mosaics = make_mosaics(config, eye.detector.classes)
+        store = make_store(config, eye)
+        model, figures = fit_mosaics(config, eye, mosaics, store)
+        judged = mosaics["judged"]
+        opened = open_all(eye, judged, store)
+        curves = {
+            "fitted": photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
+            "raw": photograph_recalls(judged, opened, in_raw_order),
+        }
+        gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
+        at = RECALL_PASSES[-1] - 1
+        why = (
+            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {RECALL_PASSES[-1]} passes, "
+            f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
+            f"passes {in_words(gain, 'points gained', 100)}"
+        )
+        rows = [["looks", *(f"after {n} passes" for n in RECALL_PASSES), "mean"]]
+        rows += [
+            [name, *(mean_percent(curve[:, n - 1]) for n in RECALL_PASSES), mean_percent(curve.mean(1))]
+            for name, curve in curves.items()
+        ]
+        text = section(
+            f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
+            f"objects of each photograph, and the mean over 1 to {RECALL_PASSES[-1]} passes. `raw` looks at slices in "
+            "the order of the sums of the overview's raw scores, as the agent does without this part.",
+            rows,
+        )
+        return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
+
+
+def fit_mosaics(
+    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> tuple[GlimpseEvidence, str]:
+    """Look at the mosaics, and fit the evidence, its foresight, its decisions, closer looks and expected numbers.
+
+    Args:
+        config: the settings.
+        eye: the eye that looks.
+        mosaics: the mosaics (`make_mosaics`).
+        store: store of the looks.
+
+    Returns:
+        The model and a report in Markdown.
+    """
+    examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
+    model = fit_looks(config, eye, mosaics, examples)
+    survey_again(config, model, examples)
+    judged = mosaics["judged"]
+    choose_foresight(model, eye, {"judged": judged}, store)
+    chosen = f"Foresight chosen on the same mosaics for finding all objects: {model.survey.foresight:g}."
+    lines = [judge_windows(model, examples["judged"])[0], chosen, ""]
+    lines += fit_decision(config, model, eye, mosaics, store)
+    lines += fit_closer_looks(config, model, eye, mosaics, store)
+    lines += fit_counts(config, model, eye, mosaics, store)
+    return model, "\n".join(lines)
+
+
+def in_raw_order(glances: Glances) -> Iterator[Turn[Any]]:
+    """Look at slices in the order of the overview's scores, as an agent without evidence does."""
+    return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
+
+
+@torch.inference_mode()
+def photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: Way) -> FloatArray:
+    """Measure the recall in each photograph of some mosaics after each pass.
+
+    Args:
+        mosaics: the mosaics.
+        opened: the looks at each of them.
+        way: the way of looking.
+
+    Returns:
+        `(P, 16)`, the share of its objects that were found, for each photograph with objects in any mosaic.
+    """
+    found, there = np.zeros((len(mosaics.scenes), RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
+    for index, glances in enumerate(opened):
+        tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
+        photograph = np.repeat(
+            [tile.index for tile in tiles], [len(mosaics.scenes.annotation(tile.index).boxes) for tile in tiles]
+        )
+        np.add.at(there, photograph, 1)
+        seen: list[Glance] = []
+        turns = way(glances)
+        for number in range(RECALL_PASSES[-1]):
+            turn = next(turns, None)
+            if turn is not None:
+                seen.append(turn.glance)
+            np.add.at(found[:, number], photograph, found_in(seen, annotation).numpy())
+        glances.save()
+    return found[there > 0] / there[there > 0, None]

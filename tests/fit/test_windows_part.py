@@ -1,0 +1,124 @@
+"""The evidence for large pictures in a folder of models, fitted on mosaics of photographs of coloured squares."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semfov import ActivePerception
+from semfov.data.mosaics import Mosaics
+from semfov.data.scenes import EmbeddedScenes
+from semfov.fit.detector import manifest_of
+from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.parts.folder import FolderFit
+from semfov.fit.parts.windows import RECALL_PASSES, in_raw_order, photograph_recalls
+from semfov.fit.windows import FitZoomConfig
+from semfov.io.manifest import Manifest
+from semfov.model_folder import ModelFolder
+from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.looking import looking_of
+from semfov.runs.window_looking import found_in
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom import GlimpseEvidence, WindowEye
+from tests.colours import COLOURS, write_network, write_photographs
+from tests.small import Tiles
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The parent folder of a network and of photographs, 16 of which are held out."""
+    folder = tmp_path_factory.mktemp("windows")
+    write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs", 48)
+    return folder
+
+
+def folder_of(home, **settings):
+    """The fits of a folder; the parts before the last one are not made."""
+    root = home / "photographs"
+    config = FitDetectorConfig(
+        model=home / "colours.onnx",
+        data=DataConfig(root, root / "instances.json", min_instances=0, max_target_area=None),
+        detector=DetectorConfig(background=None), columns=4, rows=4, window_steps=20, workers=1,
+        out=home / "models", cache=home / "cache",
+    )  # fmt: skip
+    config = replace(config, **settings).named()
+    return FolderFit(config, looking_of(replace(config, out=config.out / "progress")))
+
+
+@pytest.mark.slow
+def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continues(home, tmp_path, monkeypatch):
+    folder = folder_of(home)
+    fitted = folder.fit("windows")
+    config = folder.fits["windows"].settings
+    assert isinstance(config, FitZoomConfig)
+    # Slots of 4 to 3 that hold square photographs of 64 pixels would be 85 wide, more than the detector needs.
+    assert config.tile == 74
+    model = GlimpseEvidence.from_pretrained(home / "models" / fitted.part.file)
+    assert model.thresholds is not None
+    assert "% of the objects are found in 16 passes" in fitted.part.why
+    assert all(f"| {name} " in fitted.report for name in ("fitted", "raw"))
+    # Looks and the finished part are read again; only the fit is repeated when its record is lost.
+    before = (home / "models/windows.safetensors").read_bytes()
+    (home / "models/progress/windows.json").unlink()
+    monkeypatch.setattr("semfov.zoom.glances.LiveGlances.see", None)
+    assert folder_of(home).fit("windows") == fitted
+    assert (home / "models/windows.safetensors").read_bytes() == before
+    monkeypatch.undo()
+    monkeypatch.setattr("semfov.fit.parts.windows.fit_mosaics", None)
+    folder = folder_of(home)
+    assert folder.fit("windows") == fitted
+    part = replace(fitted.part, used=True)
+    folder.parts["windows"] = replace(fitted, part=part)
+    manifest_of(folder.config, folder.inputs.run, folder).write(home / "models")
+    agent = ActivePerception.from_pretrained(home / "models")
+    assert all(torch.equal(tensor, model.state_dict()[name]) for name, tensor in agent.windows.state_dict().items())
+    picture = torch.full((3, 192, 256), 0.49)
+    picture[:, 96:104, 160:168] = torch.from_numpy(COLOURS[2] / 255).float()[:, None, None]
+    record = agent.find_all(picture, "blue", how="windows", passes=16)
+    assert len(record.objects) == 1
+    torch.testing.assert_close(record.objects.boxes[0], torch.tensor([160.0, 96, 168, 104]), atol=4, rtol=0)
+    # A part that is not used, or that a folder of an earlier version lacks, leaves the agent without it.
+    for parts in ({"windows": fitted.part.__class__(None, None, False, "")}, {}):
+        replace(Manifest.read(home / "models"), parts=parts).write(home / "models")
+        assert ModelFolder(home / "models").windows() is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"windows": False}, "not fitted, since the setting `windows` is false"),
+        (
+            {"holdout": 4},
+            "not fitted, since mosaics need at least 16 held-out photographs, and 12 of the 48 photographs are held "
+            "out",
+        ),
+    ],
+)
+def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, settings, why):
+    monkeypatch.setattr("semfov.fit.parts.windows.fit_mosaics", None)
+    folder = folder_of(home, out=tmp_path, **settings)
+    assert folder.stages["windows"] == {}
+    part = folder.fit("windows").part
+    assert (part.file, part.used, part.why) == (None, False, why)
+
+
+def test_recall_is_that_of_the_objects_of_each_photograph():
+    eye, scenes = WindowEye(Tiles(name="bright")), EmbeddedScenes(("person", "cat", "cup"), count=5)
+    mosaics = Mosaics(scenes, 2, 2, tile=(96, 72), count=3)
+    opened = [StoredGlances(eye, mosaics, index, None) for index in range(3)]
+    shares = {}
+    for index, glances in enumerate(opened):
+        tiles = mosaics.tiles(index)
+        looks = [turn.glance for turn in in_raw_order(glances)]
+        found = torch.stack([found_in(looks[:n], mosaics.annotation(index)) for n in range(1, len(looks) + 1)], -1)
+        # When all slices were looked at, recall stays the same.
+        assert len(looks) < RECALL_PASSES[-1]
+        found = torch.cat([found, found[:, -1:].expand(-1, RECALL_PASSES[-1] - len(looks))], -1).double()
+        counts = [len(scenes.annotation(tile.index).boxes) for tile in tiles]
+        for tile, part in zip(tiles, found.split(counts), strict=True):
+            shares.setdefault(tile.index, []).append(part.mean(0))
+    expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
+    assert expected.amax() > 0
+    torch.testing.assert_close(torch.from_numpy(photograph_recalls(mosaics, opened, in_raw_order)), expected)
