@@ -27,6 +27,7 @@ from semfov.fit.windows import (
     survey_again,
 )
 from semfov.fit.windows_choice import choose_foresight, open_all
+from semfov.fit.windows_verification import shipped_verification
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
@@ -168,7 +169,7 @@ def fit_mosaics(
     chosen = f"Foresight chosen on the same mosaics for finding all objects: {model.survey.foresight:g}."
     lines = [judge_windows(model, examples["judged"])[0], chosen, ""]
     lines += fit_decision(config, model, eye, mosaics, store)
-    lines += fit_closer_looks(config, model, eye, mosaics, store)
+    lines += fit_closer_looks(config, model, eye, mosaics, store, shipped_verification())
     lines += fit_counts(config, model, eye, mosaics, store)
     return model, "\n".join(lines)
 
