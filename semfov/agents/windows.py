@@ -438,7 +438,7 @@ class _Windows:
             targets=self.targets,
             glances=tuple(self.seen),
             values=tuple(self.values),
-            candidates=merge(self.seen, self.target),
+            candidates=merge(self.seen, self.targets or self.target),
             certainty=self.certainty,
             ending=ending,
         )
