@@ -17,6 +17,7 @@ fits the agent to a detector of your own. Each part is also a function or a diff
 import warnings
 from typing import TYPE_CHECKING, Any
 
+import semfov.cli.start  # noqa: F401 (before what takes long to import)
 from semfov.agent import ActivePerception
 from semfov.agents import HeadAgent, ZoomAgent
 from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers

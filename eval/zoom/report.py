@@ -7,6 +7,7 @@ import torch
 
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
+from eval.zoom.numbers import number_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import complete
@@ -63,6 +64,8 @@ def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
         ]
     if decided := [record for record in records if record["measure"] == "decision"]:
         lines += decision_tables(decided)
+    if counted := [record for record in records if record["measure"] == "number"]:
+        lines += number_table(counted, run.config.passes)
     return "\n".join(lines)
 
 

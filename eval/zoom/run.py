@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from eval.zoom.decisions import decide_all
+from eval.zoom.numbers import count_objects
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
@@ -34,7 +35,7 @@ from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, slices
 
-_Measure = Literal["recall", "hit", "decision"]
+_Measure = Literal["recall", "hit", "decision", "number"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class ZoomConfig(WindowLookingConfig):
         overlap: overlap of neighbouring slices, as a share of their side.
         passes: largest number of detector passes.
         measures: what to measure: `recall` after each pass; passes to the first `hit`, in mosaics, for classes that a
-            slice shows; the `decision` at the end of a search.
+            slice shows; the `decision` at the end of a search; the `number` of objects that an exploration gives.
         sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
             until a decision (with `target`, only that class is searched for).
         cut: what to do with boxes at a window's border.
@@ -121,6 +122,12 @@ class ZoomRun(WindowLooking, SceneRun):
         if "decision" in measures:
             records += self._decisions(index, glances)
         watch.lap("decision")
+        if "number" in measures:
+            counted = count_objects(
+                glances, self.evidence, self.target, self.annotation(index), passes=self.config.passes
+            )
+            records += [record | {"scene": self.scenes.ids[index]} for record in counted]
+        watch.lap("number")
         glances.save()
         return records, watch.seconds
 

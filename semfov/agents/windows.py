@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from os import PathLike, fspath
 from typing import Any, Self
 
 import torch
@@ -172,7 +171,7 @@ class ZoomAgent(nn.Module):
                     give_up=give_up,
                     closer=closer,
                 )
-        return _with_picture(path, glances, picture)
+        return _with_picture(path, glances)
 
     def find_all(
         self,
@@ -223,7 +222,7 @@ class ZoomAgent(nn.Module):
                 if ending is not None:
                     break
         record = path.record(ending or ("windows" if self.evidence is None else "worth"))
-        return _with_picture(record, glances, picture)
+        return _with_picture(record, glances)
 
     def explore(
         self,
@@ -276,10 +275,11 @@ def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     return Lattice.over(size, canvas).levels >= 3
 
 
-def _with_picture(path: ZoomPath, glances: LiveGlances, picture: _Picture) -> ZoomPath:
+def _with_picture(path: ZoomPath, glances: LiveGlances) -> ZoomPath:
     """The record with a reduced copy of its picture, and with its file."""
-    file = fspath(picture) if isinstance(picture, str | PathLike) else None
-    return replace(path, photograph=reduced_copy(glances.view.picture), source=file)
+    picture = glances.view.picture
+    source = None if picture.path is None else str(picture.path)
+    return replace(path, photograph=reduced_copy(picture), source=source)
 
 
 def search_windows(
@@ -438,7 +438,7 @@ class _Windows:
             targets=self.targets,
             glances=tuple(self.seen),
             values=tuple(self.values),
-            candidates=merge(self.seen, self.target),
+            candidates=merge(self.seen, self.targets or self.target),
             certainty=self.certainty,
             ending=ending,
         )

@@ -139,6 +139,7 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
   --out FOLDER             folder for the models (default mymodels)
   --holdout N              hold out one in N photographs, on which each part is compared with raw scores
   --windows false          no evidence for large pictures (it takes 80 photographs, of which mosaics are made)
+  --windows false          without evidence for pictures larger than the detector's input
   --workers N              processes that look (default: one for each core)
 
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw

@@ -34,9 +34,11 @@ class LargePicture(ABC):
 
     Attributes:
         size: `(width, height)` in pixels.
+        path: its file; None for a picture in memory.
     """
 
     size: tuple[int, int]
+    path: Path | None = None
 
     @abstractmethod
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
@@ -152,6 +154,8 @@ class PhotographPicture(LargePicture):
         DataError: the file is missing, or is not a picture.
     """
 
+    path: Path
+
     def __init__(self, path: str | PathLike[str]) -> None:
         from PIL import Image
 
@@ -192,6 +196,8 @@ class TiffPicture(LargePicture):
     Raises:
         DataError: `tifffile` is not installed, or the page is not grey or RGB with 8 or 16 bits.
     """
+
+    path: Path
 
     def __init__(self, path: str | PathLike[str]) -> None:
         try:

@@ -1,11 +1,14 @@
 """What the command is told: help, version, and mistakes that are refused in one line before anything is loaded."""
 
+import importlib
 import re
+import signal
+import sys
 
 import pytest
 
 import semfov
-from semfov.cli import agent, live, search
+from semfov.cli import agent, live, search, start
 from semfov.cli.main import SUBCOMMANDS, main
 from semfov.errors import InputError
 from semfov.runs.command import make_parser
@@ -34,6 +37,7 @@ REFUSED = {
     "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
     "search --target cup --seed -1": "seed: expected a whole number from 0",
     "search --target cup --out a.xls": "out: expected a folder, or a file that ends in .coco.json, .json, .csv",
+    "search --target cup --draw scanpath": "draw: expected --out FOLDER beside --draw, got none",
     "search --target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
     "search --target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
     "search --target cup --detector my.weights": "detector: expected a cfg and its weights",
@@ -139,3 +143,15 @@ def test_an_agent_without_models_is_not_made_from_a_folder():
 
 
 make_agent = agent.make_agent
+
+
+@pytest.mark.parametrize(("program", "changes"), [("/usr/bin/semfov", True), ("study.py", False)])
+def test_ctrl_c_while_the_command_is_imported_ends_in_one_line(program, changes, monkeypatch):
+    """The package sets a handler first, but only if it is imported by the command."""
+    monkeypatch.setattr(sys, "argv", [program])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        importlib.reload(start)
+        assert (signal.getsignal(signal.SIGINT) is start._leave) == changes
+    finally:
+        signal.signal(signal.SIGINT, before)

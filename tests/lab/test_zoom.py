@@ -1,6 +1,7 @@
 """The experiment with large pictures: results with and without a store, resuming, and orders of windows."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
+from eval.zoom.numbers import number_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.config import DataConfig
 from semfov.runs.zoom_orders import in_order, quad_tree, shuffled
@@ -84,13 +86,27 @@ def test_damaged_stored_looks_are_computed_again(config):
 
 @pytest.mark.slow
 def test_measures_can_be_left_out(config, capsys):
-    zoom_report.zoom(replace(config, measures=("decision",)))
+    zoom_report.zoom(replace(config, measures=("decision", "number")))
     text = capsys.readouterr().out
     assert "Is the target present?" in text
+    assert "| objects from score 0.3 |" in text
     assert "Recall" not in text
     assert {json.loads(line)["measure"] for line in (config.out / "records.jsonl").read_text().splitlines()} == {
-        "decision"
+        "decision",
+        "number",
     }
+
+
+def test_numbers_of_objects_match_hand_calculations():
+    records = [
+        {"measure": "number", "way": way, "scene": scene, "number": number, "objects": 4}
+        for way, numbers in (("shown", (6.0, 3.0)), ("expected", (4.5, 4.5)))
+        for scene, number in enumerate(numbers)
+    ]
+    text = re.sub(" +", " ", "\n".join(number_table(records, 24)))
+    assert "2 pictures with 4.0 objects" in text
+    assert "| shown | 4.50 | 1.50 | +0.50 |" in text
+    assert "| expected | 4.50 | 0.50 | +0.50 |" in text
 
 
 def test_tables_of_decisions_match_hand_calculations():

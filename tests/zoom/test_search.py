@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
+from torchvision.transforms.functional import to_pil_image
 
 from semfov.agents import ZoomAgent
+from semfov.data.large import open_large
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 from semfov.viz.zoom import plot_zoom_path
@@ -29,6 +31,18 @@ def test_search_finds_a_target_in_the_picture(agent, picture):
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
     assert path.passes == len(path.glances)
+
+
+def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_path):
+    """However the file is given, also opened."""
+    file = tmp_path / "squares.png"
+    to_pil_image(torch.nn.functional.pad(picture, (0, 976))).save(file)
+    for given in (file, str(file), open_large(file)):
+        path = agent.find_all(given, "blue", passes=2)
+        assert path.source == str(file)
+        assert path.image.shape == (3, 492, 1280)
+        assert path.plot().axes[0].images
+    assert agent.search(picture, "red", passes=2).source is None
 
 
 def test_search_for_an_absent_target_ends(agent, picture):
@@ -159,6 +173,15 @@ def test_merging_prefers_whole_boxes_to_cut_boxes():
     assert merge([near]).boxes.tolist() == [[100.0, 100, 140, 200]]
 
 
+def test_parts_seen_in_another_look_are_not_objects_of_their_own():
+    near = make_glance(2, 0, 0, [[100.0, 100, 140, 200]], [0.5], [False])
+    far = make_glance(0, 0, 0, [[95.0, 150, 130, 200], [130.0, 150, 170, 200]], [0.9, 0.8], [False, False])
+    assert merge([far, near]).boxes.tolist() == [[130.0, 150, 170, 200], [100.0, 100, 140, 200]]
+    # What a coarse look sees as one thing does not hide what a closer look sees in it.
+    group = make_glance(0, 0, 0, [[90.0, 90, 300, 210]], [0.9], [False])
+    assert len(merge([group, near])) == 2
+
+
 def test_merging_keeps_small_objects_in_front_of_large_ones():
     look = make_glance(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
     assert len(merge([look])) == 2
@@ -196,11 +219,11 @@ def test_merging_equals_a_plain_loop():
             if score >= 0.05:
                 rows.append((bool(glance.cut[n]), -glance.window.fixation[2], -score, turn, label, box))
     kept = []
-    for cut, _, score, turn, label, box in sorted(rows):
+    for _, _, score, turn, label, box in sorted(rows):
         for _, other_turn, other_label, other in kept:
             shared = overlap(box, other)
             same = shared >= 0.5 * (area(box) + area(other) - shared)
-            same = same or (cut and turn != other_turn and shared >= 0.8 * area(box))
+            same = same or (turn != other_turn and shared >= 0.75 * area(box))
             if same and label == other_label:
                 break
         else:
