@@ -19,8 +19,8 @@ from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import ResultsFile, kind_of
 from semfov.cli.text import looks_text, outcome_text, plain_name
 from semfov.data.large import picture_size
-from semfov.data.sources import PHOTOGRAPHS, Picture, embedded_picture, is_video
-from semfov.errors import DataError, InputError, SemfovError, check
+from semfov.data.sources import Picture, embedded_picture, is_video, picture_files
+from semfov.errors import InputError, SemfovError, check
 from semfov.head import Flat, Panorama
 from semfov.head.world import World
 from semfov.paths import GazeRecord, Scanpath, ZoomPath
@@ -81,14 +81,7 @@ def picture_sources(options: PictureOptions) -> list[PictureSource]:
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
-        if not path.exists():
-            raise DataError(f"picture: no such file or folder: {name}; check the path")
-        files = [path]
-        if path.is_dir():
-            files = sorted(each for each in path.iterdir() if each.suffix.lower() in PHOTOGRAPHS)
-            if not files:
-                raise DataError(f"picture: expected photographs ({', '.join(PHOTOGRAPHS)}) in {name}, got none")
-        found += [PictureSource(str(each), each) for each in files]
+        found += [PictureSource(str(each), each) for each in picture_files(path)]
     return found
 
 
@@ -127,7 +120,6 @@ class EpisodeOutputs:
             self.folder = options.out.with_name(options.out.name.partition(".")[0]) if kind is not None else options.out
         usual = ALL_DRAWINGS if options.out is not None and kind is None else ()
         self.drawings = usual if options.draw is None else options.draw
-        check(not self.drawings or self.folder is not None, "draw", "--out FOLDER with --draw", "none")
 
     def add(self, number: int, source: PictureSource, record: GazeRecord, seconds: float) -> None:
         """Write what is wanted of a picture."""

@@ -11,7 +11,7 @@ from semfov.cli.options import ExploreOptions, FindOptions, PictureOptions, Sear
 from semfov.cli.results import kind_of
 from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
-from semfov.errors import InputError
+from semfov.errors import InputError, check
 from semfov.paths import GazeRecord
 
 
@@ -95,6 +95,7 @@ def _check(options: PictureOptions) -> Any:
     picture_sources(options)
     if options.out is not None:
         kind_of(options.out)
+    check(not options.draw or options.out is not None, "draw", "--out FOLDER beside --draw", "none")
     return start_of(options.start)
 
 

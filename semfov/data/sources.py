@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError
@@ -38,32 +37,31 @@ class Picture:
     boxes: Tensor | None = None
 
 
-def open_pictures(source: Path) -> Iterator[Picture]:
-    """Read a photograph, or the photographs of a folder.
+def picture_files(source: Path) -> list[Path]:
+    """List a photograph, or the photographs of a folder in the order of their names.
 
     Args:
-        source: a file, or a folder whose photographs are read in the order of their names.
+        source: a file or a folder.
 
-    Yields:
-        The pictures.
+    Returns:
+        The files.
 
     Raises:
         DataError: the file is missing, or the folder has no photographs.
     """
-    if source.is_dir():
-        files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
-        if not files:
-            raise DataError(f"photo: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, got none")
-        yield from (Picture(path.name, read_image(path)) for path in files)
-    else:
-        check_there(source)
-        yield Picture(source.name, read_image(source))
+    check_there(source)
+    if not source.is_dir():
+        return [source]
+    files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
+    if not files:
+        raise DataError(f"picture: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, got none")
+    return files
 
 
 def check_there(source: Path) -> None:
     """Raise `DataError` where a file or folder does not exist."""
     if not source.exists():
-        raise DataError(f"photo: no such file or folder: {source}; check the path")
+        raise DataError(f"picture: no such file or folder: {source}; check the path")
 
 
 def is_video(source: Path) -> bool:

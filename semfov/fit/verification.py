@@ -393,11 +393,15 @@ def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) 
 
 def shipped_mean() -> Verification:
     """Return the mean of two shipped models (`SHIPPED`), without thresholds: the centre of the prior."""
-    known = [Verification.from_pretrained(name).linear for name in SHIPPED]
+    return mean_of([Verification.from_pretrained(name) for name in SHIPPED])
+
+
+def mean_of(models: Sequence[Verification]) -> Verification:
+    """Return the model whose parameters are the means of those of some models, without thresholds."""
     model = Verification()
     with torch.no_grad():
-        model.linear.weight.copy_(torch.stack([each.weight for each in known]).mean(0))
-        model.linear.bias.copy_(torch.stack([each.bias for each in known]).mean(0))
+        for name, parameter in model.named_parameters():
+            parameter.copy_(torch.stack([each.get_parameter(name) for each in models]).mean(0))
     return model.eval().requires_grad_(False)
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import torch
 
+from semfov.belief.verification import Verification
 from semfov.data.crowded import Crowded
 from semfov.data.mosaics import Mosaics
 from semfov.errors import check
@@ -318,12 +319,17 @@ def fit_decision(
 
 
 def fit_closer_looks(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig,
+    model: GlimpseEvidence,
+    eye: WindowEye,
+    mosaics: dict[str, Mosaics],
+    store: GlanceStore,
+    prior: Verification | None = None,
 ) -> list[str]:
-    """Fit the probabilities after closer looks, with the arguments and the result of `fit_decision`."""
+    """Fit the probabilities after closer looks, with the result of `fit_decision` and its arguments, and a prior."""
     prepare_worker()
     opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
-    text = fit_closer(model, mosaics, opened, config)
+    text = fit_closer(model, mosaics, opened, config, prior)
     if model.verification is not None:
         model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
     return ["Closer looks:", "", text]

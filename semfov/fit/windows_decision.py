@@ -156,7 +156,8 @@ def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -
     # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
     model.thresholds = chosen.changed(place=0.0)
     rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
-    for number in (each for each in (*_JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
+    last = anywhere.shape[1]
+    for number in sorted({last, *(each for each in _JUDGED if each < last)}):
         presence = BinarySums.of(anywhere[:, number - 1], there)
         raw = BinarySums.of(searches.best[:, number - 1], there)
         area = area_under_roc(anywhere[:, number - 1], there) if bool(there.any() and not there.all()) else float("nan")

@@ -9,11 +9,20 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.decision import SAME, settle
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import VerificationResult, choose_confirm, examine, fit, verification_report, verify
+from semfov.fit.verification import (
+    VerificationResult,
+    choose_confirm,
+    examine,
+    fit,
+    mean_of,
+    verification_report,
+    verify,
+)
 from semfov.fit.windows_decision import searches_of
 from semfov.observation.matching import box_iou
 from semfov.runs.zoom_store import StoredGlances
@@ -160,11 +169,19 @@ def mosaic_searches(
         yield MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
 
 
+def shipped_verification() -> Verification:
+    """Return the mean of the verifications of all shipped evidence, without thresholds."""
+    files = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
+    known = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
+    return mean_of([each for each in known if each is not None])
+
+
 def fit_closer(
     model: GlimpseEvidence,
     mosaics: Mapping[str, Mosaics],
     opened: Mapping[str, Sequence[StoredGlances]],
     config: Limits,
+    prior: Verification | None = None,
 ) -> str:
     """Fit the verification on some mosaics, choose its threshold on held-out ones, and add it to the model.
 
@@ -173,6 +190,7 @@ def fit_closer(
         mosaics: the mosaics `searched`, to fit to, and `judged`, of held-out photographs.
         opened: the stored looks at each of them.
         config: the settings.
+        prior: verification that the fitted one keeps close to, the more so the fewer the closer looks; None: none.
 
     Returns:
         The report in Markdown, which says so if there are too few places to fit to.
@@ -188,7 +206,7 @@ def fit_closer(
     model.verification = None
     if known is None or held_out is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
-    fitted = fit(known, known.fold == 0)
+    fitted = fit(known, known.fold == 0, prior)
     assert model.thresholds is not None
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     decisions = list(verify(searches["judged"], [fitted], limits, model.thresholds))

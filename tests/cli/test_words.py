@@ -37,6 +37,7 @@ REFUSED = {
     "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
     "search --target cup --seed -1": "seed: expected a whole number from 0",
     "search --target cup --out a.xls": "out: expected a folder, or a file that ends in .coco.json, .json, .csv",
+    "search --target cup --draw scanpath": "draw: expected --out FOLDER beside --draw, got none",
     "search --target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
     "search --target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
     "search --target cup --detector my.weights": "detector: expected a cfg and its weights",

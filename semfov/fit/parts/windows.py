@@ -26,7 +26,8 @@ from semfov.fit.windows import (
     make_store,
     survey_again,
 )
-from semfov.fit.windows_choice import choose_foresight, open_all
+from semfov.fit.windows_choice import open_all
+from semfov.fit.windows_verification import shipped_verification
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
@@ -149,7 +150,7 @@ class WindowsFit(PartFit):
 def fit_mosaics(
     config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, str]:
-    """Look at the mosaics, and fit the evidence, its foresight, its decisions, closer looks and expected numbers.
+    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers.
 
     Args:
         config: the settings.
@@ -163,12 +164,9 @@ def fit_mosaics(
     examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
     model = fit_looks(config, eye, mosaics, examples)
     survey_again(config, model, examples)
-    judged = mosaics["judged"]
-    choose_foresight(model, eye, {"judged": judged}, store)
-    chosen = f"Foresight chosen on the same mosaics for finding all objects: {model.survey.foresight:g}."
-    lines = [judge_windows(model, examples["judged"])[0], chosen, ""]
+    lines = [judge_windows(model, examples["judged"])[0]]
     lines += fit_decision(config, model, eye, mosaics, store)
-    lines += fit_closer_looks(config, model, eye, mosaics, store)
+    lines += fit_closer_looks(config, model, eye, mosaics, store, shipped_verification())
     lines += fit_counts(config, model, eye, mosaics, store)
     return model, "\n".join(lines)
 
