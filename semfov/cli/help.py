@@ -138,7 +138,7 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
   --detector.classes LIST  names of the detector's classes, "[cat,dog]", where its file does not hold them
   --out FOLDER             folder for the models (default mymodels)
   --holdout N              hold out one in N photographs, on which each part is compared with raw scores
-  --windows false          no evidence for large pictures (it takes 80 photographs, of which mosaics are made)
+  --windows false          no evidence for large pictures (it takes about 50 photographs, of which mosaics are made)
   --windows false          without evidence for pictures larger than the detector's input
   --workers N              processes that look (default: one for each core)
 

@@ -19,9 +19,6 @@ LEAST = 0.3
 FAINTEST = 0.05
 """Score from which on boxes are merged into candidates."""
 
-PART = 0.75
-"""Share of a box that lies in a box of another look, from which on it is a part of the same object."""
-
 _BORDER = 2 / 416
 """Boxes that come this near to a border of their window, in longer sides of the window, are cut by it."""
 
@@ -95,7 +92,7 @@ def merge_boxes(
     size: tuple[float, float] | None = None,
     score: float = FAINTEST,
     iou: float = 0.5,
-    inside: float = PART,
+    inside: float = 0.8,
 ) -> Objects:
     """Merge boxes from several windows of a picture into one box for each object.
 
@@ -113,7 +110,7 @@ def merge_boxes(
         size: `(width, height)` of the picture, whose border cuts no object; None takes the border of all windows.
         score: boxes with a lower score are left out.
         iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a box that lies in a box of another window, from which on it is the same object.
+        inside: share of the area of a cut box from which on it is the same object.
 
     Returns:
         Objects, most confident first. Their `passes` number the windows in the order in which they first appear.
@@ -160,16 +157,15 @@ def merge_looks(
     *,
     score: float = FAINTEST,
     iou: float = 0.5,
-    inside: float = PART,
-    parts: bool = True,
+    inside: float = 0.8,
     around: float | None = None,
 ) -> Objects:
     """Merge the boxes of several looks into one box for each object.
 
-    Two boxes of one class are the same object when their intersection over union is at least `iou`. Of two boxes of the
-    same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
-    sharply is kept, and of those the one with the higher score. A box of another look is a part of the same object, and
-    is not kept, when at least `inside` of its area lies in the kept one.
+    Two boxes of one class are the same object when their intersection over union is at least `iou`. Boxes of two looks
+    are also the same object when one of them is cut, and at least `inside` of its area lies in the other. Of two boxes
+    of the same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
+    sharply is kept, and of those the one with the higher score.
 
     Args:
         boxes: `(M, 4)`, in picture pixels.
@@ -180,8 +176,7 @@ def merge_looks(
         sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
         score: boxes with a lower score are left out.
         iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a box that lies in a box of another look, from which on it is the same object.
-        parts: whether that holds for boxes that are not cut, too.
+        inside: share of the area of a cut box from which on it is the same object.
         around: width of a picture whose left and right borders meet; None for others.
 
     Returns:
@@ -193,16 +188,16 @@ def merge_looks(
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
     box, value, label, cut, number = boxes[order], scores[order], labels[order], cut[order], looks[order]
-    kept = _unlike(box, label, cut | parts, number, iou, inside, around)
+    kept = _unlike(box, label, cut, number, iou, inside, around)
     kept = kept[value[kept].argsort(descending=True, stable=True)]
     return Objects(box[kept], value[kept], label[kept], number[kept])
 
 
 def _unlike(
-    box: Tensor, label: Tensor, partial: Tensor, number: Tensor, iou: float, inside: float, around: float | None
+    box: Tensor, label: Tensor, cut: Tensor, number: Tensor, iou: float, inside: float, around: float | None
 ) -> Tensor:
     """Indices of the boxes that stay when each one, in order, removes later ones that are the same object."""
-    corners, labels, looks = box.numpy(), label.numpy().astype(np.float64), number.numpy()
+    corners, labels, looks, broken = box.numpy(), label.numpy().astype(np.float64), number.numpy(), cut.numpy()
     count = len(corners)
     if around is not None:
         # Every box is there a second time, one turn further, so that boxes meet across the seam.
@@ -225,7 +220,7 @@ def _unlike(
     union = area[first] + area[second] - shared
     same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
     part = shared / np.maximum(area, 1e-6)[second]
-    same |= (part >= np.float32(inside)) & partial.numpy()[second] & (looks[first] != looks[second])
+    same |= (part >= np.float32(inside)) & broken[second] & (looks[first] != looks[second])
     return torch.from_numpy(survivors(count, first[same], second[same]))
 
 

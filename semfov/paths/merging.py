@@ -81,7 +81,7 @@ def merge_fixations(
     if not boxes:
         return Objects.none()
     parts = (torch.cat(part) for part in (boxes, scores, labels, numbers, broken, sharpness))
-    return merge_looks(*parts, score=0.0, inside=0.8, parts=False, around=around).above(FAINTEST)
+    return merge_looks(*parts, score=0.0, around=around).above(FAINTEST)
 
 
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:

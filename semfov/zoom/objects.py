@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, PART, Objects, merge_looks
+from semfov.detection.objects import FAINTEST, Objects, merge_looks
 from semfov.zoom.glances import Glance
 
 
@@ -15,7 +15,7 @@ def merge(
     *,
     score: float = FAINTEST,
     iou: float = 0.5,
-    inside: float = PART,
+    inside: float = 0.8,
 ) -> Objects:
     """Merge the detections of several looks at windows into one box for each object.
 
@@ -28,7 +28,7 @@ def merge(
             no class, takes the best class of each box.
         score: boxes with a lower score are left out.
         iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a box that lies in a box of another look, from which on it is the same object.
+        inside: share of the area of a cut box from which on it is the same object.
 
     Returns:
         Objects, most confident first.
