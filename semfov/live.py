@@ -1,6 +1,7 @@
 """Active perception of a camera or a video: one look at every frame, and a belief that continues between frames."""
 
 import sys
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from time import perf_counter
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.agents.windows import pays
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
@@ -257,6 +259,13 @@ class LivePerception:
 
     def _begin(self, image: Tensor, view: View) -> LiveLooks:
         """Start the episode at the first frame."""
+        size, canvas = (image.shape[-1], image.shape[-2]), self.eye.detector.input_size
+        if pays(size, canvas):
+            warnings.warn(
+                f"frames of {size[0]} × {size[1]} px are reduced to {canvas[0]} × {canvas[1]} px, where small objects "
+                "do not show; give a part of the frames, or search single frames by windows (ActivePerception.search)",
+                stacklevel=4,
+            )
         grid = Grid(*self.cells, (image.shape[-1], image.shape[-2]))
         start, generator = self._first
         looks = LiveLooks(self.eye, view, grid, self.target)

@@ -270,3 +270,9 @@ def test_the_rate_leaves_out_the_first_frames():
     few.add()
     assert few.summary() == "1 frame, all of them while the detector got ready"
     assert (few.now, few.mean) == (None, None)
+
+
+def test_frames_that_are_reduced_by_much_are_not_reduced_in_silence():
+    frame = torch.rand(3, 480, 640)
+    with pytest.warns(UserWarning, match=r"frames of 640 × 480 px are reduced to .* by windows"):
+        agent_with(Semantic(3)).live("red").step(frame)
