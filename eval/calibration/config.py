@@ -15,8 +15,7 @@ class CalibrationConfig(WorkConfig):
         data: photographs to evaluate on, by default all of them.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        model: fitted observation model, by name or file (None: the one shipped for the detector and growth; for the
-            published belief, the one fitted by maximum likelihood if it is shipped for the sensor).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and sensor).
         fixations: number of random fixations in each photograph.
         iou: smallest intersection over union at which a detection matches an object.
         seed: random seed of the fixations and of the searches.

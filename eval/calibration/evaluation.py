@@ -16,7 +16,7 @@ from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, ProtocolConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import make_observation, plain, published_model
+from semfov.runs.setup import make_observation, plain
 from semfov.runs.tables import table
 from semfov.runs.workers import rank
 from semfov.viz import plot_reliability
@@ -56,7 +56,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
         sensor=config.sensor,
         belief=BeliefConfig(
             *config.grid,
-            model=config.model or published_model(config.detector, config.sensor),
+            model=config.model,
             target_model=config.target_model,
             map_model=config.map_model,
         ),

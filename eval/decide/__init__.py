@@ -5,8 +5,8 @@
 Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
 for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
 rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
-published belief with the same thresholds and with the rule of the published agent, and one sharp look at the whole
-photograph. Detections from every cell are stored and shared with `python -m eval.search`.
+belief by Kaplan's rule with the same thresholds and with the rule of the published agent, and one sharp look at the
+whole photograph. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
 import json

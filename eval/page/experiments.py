@@ -244,7 +244,8 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
-        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
+        belief = BeliefConfig(model=f"{settings.name}-sharp")
+        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor, belief=belief)
 
 
 def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:

@@ -153,8 +153,8 @@ class BeliefConfig(Settings):
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected, with the miss rates of the observation model.
-        model: fitted observation model, by name or file (None: semfov's own model for the detector and growth; for the
-            published one, give the detector's name followed by `-published` or `-published-narrow`).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and sensor; for a
+            published sensor it is the published one, for others one of our own).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
         map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
         context: context that is added to the log odds of the target: `none`, the `place` where the class usually is,
