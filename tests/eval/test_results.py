@@ -165,7 +165,7 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
         write_manifest(runs[name].out)
         parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
-    for number, kind in enumerate(("presence", "decisions", "landings")):
+    for number, kind in enumerate(("presence", "decisions", "differences", "landings")):
         assert lines_of(f"decide-tiny {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
     for number, kind in enumerate(("by-looks", "by-distance")):
         rows = [cells_of(row) for row in lines_of(f"beliefs-nano {kind}", runs)]
