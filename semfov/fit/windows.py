@@ -34,7 +34,7 @@ from semfov.fit.windows_evidence import (
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
-from semfov.io.transfer import from_bytes, to_bytes
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share
@@ -180,7 +180,7 @@ def look(task: tuple[str, int]) -> bytes:
     glances = StoredGlances(_process["eye"], mosaics, index, _process["store"])
     glances.see(windows_of(mosaics, index, glances.lattice))
     glances.save()
-    return to_bytes(_process["store"].read(mosaics.digest(index)))
+    return pack_tensors(_process["store"].read(mosaics.digest(index)))
 
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
@@ -249,7 +249,7 @@ def look_at_all(
     for (kind, index), looks in done:
         digest = mosaics[kind].digest(index)
         if store.read(digest) is None:
-            store.write(digest, from_bytes(looks))
+            store.write(digest, unpack_tensors(looks))
     prepare_worker()
     return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 
-def to_bytes(tensors: Mapping[str, Tensor]) -> bytes:
+def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
     """Convert tensors to bytes in the safetensors format.
 
     Args:
@@ -15,7 +15,7 @@ def to_bytes(tensors: Mapping[str, Tensor]) -> bytes:
         The bytes.
 
     >>> import torch
-    >>> from_bytes(to_bytes({"a": torch.tensor([1.5])}))
+    >>> unpack_tensors(pack_tensors({"a": torch.tensor([1.5])}))
     {'a': tensor([1.5000])}
     """
     from safetensors.torch import save
@@ -24,8 +24,8 @@ def to_bytes(tensors: Mapping[str, Tensor]) -> bytes:
     return save({name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()})
 
 
-def from_bytes(data: bytes) -> dict[str, Tensor]:
-    """Convert the bytes of `to_bytes` back to tensors.
+def unpack_tensors(data: bytes) -> dict[str, Tensor]:
+    """Convert the bytes of `pack_tensors` back to tensors.
 
     Args:
         data: the bytes.

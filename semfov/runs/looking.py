@@ -8,7 +8,7 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.io.transfer import from_bytes, to_bytes
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.results import ResultRecord
@@ -81,12 +81,12 @@ class Looking(SceneRun):
     def stored(self, index: int) -> bytes | None:
         """The looks at a scene, which fits read."""
         tensors = self.store.read(self.digest(index))
-        return None if tensors is None else to_bytes(tensors)
+        return None if tensors is None else pack_tensors(tensors)
 
     def keep(self, index: int, stored: bytes) -> None:
         """Store the looks at a scene, if this process does not see them."""
         if self.store.read(self.digest(index)) is None:
-            self.store.write(self.digest(index), from_bytes(stored))
+            self.store.write(self.digest(index), unpack_tensors(stored))
 
 
 def looking_of(config: Any) -> Looking:

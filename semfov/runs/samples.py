@@ -19,7 +19,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
-from semfov.io.transfer import from_bytes, to_bytes
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.observation.matching import match
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import look_from
@@ -271,7 +271,7 @@ def _prepare(settings: SampleSettings, folder: Path) -> None:
 
 
 def _run_shard(shard: int) -> bytes:
-    return to_bytes(_process["sampler"].sample(shard).tensors())
+    return pack_tensors(_process["sampler"].sample(shard).tensors())
 
 
 def collect_samples(settings: SampleSettings, folder: Path, where: Where, title: str) -> tuple[Sampler, Samples]:
@@ -303,7 +303,7 @@ def collect_samples(settings: SampleSettings, folder: Path, where: Where, title:
         unit="shard",
     )
     for shard, tensors in done:
-        sampler.save(shard, Samples(**from_bytes(tensors)))
+        sampler.save(shard, Samples(**unpack_tensors(tensors)))
     parts = []
     for shard in sampler.shards:
         part = sampler.load(shard)
