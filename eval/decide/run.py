@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from eval.comparison.run import Run
+from eval.comparison.telling import class_frequencies
 from eval.decide.config import DecisionConfig
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
@@ -90,6 +92,11 @@ class DecisionRun(Run):
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
             self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
 
+    @cached_property
+    def frequencies(self) -> list[Tensor]:
+        """The share of the other scenes that hold each class, by index of the scene."""
+        return class_frequencies(self.scenes)
+
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
@@ -149,6 +156,7 @@ class DecisionRun(Run):
                 "target": target,
                 "present": bool(goal.any()),
                 "sharp": float(highest_score(sharp, target)),
+                "frequency": float(self.frequencies[index][target]),
                 "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }

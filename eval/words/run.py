@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from eval.comparison.summary import Curve, announce, collect_records, curve_of, manifest, sensing
+from eval.comparison.summary import MANIFEST, Curve, announce, collect_records, curve_of, manifest, sensing
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.belief import ContextPrior
@@ -97,7 +97,7 @@ def words(config: WordsConfig) -> None:
         "words.md": text,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
         "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
-        "manifest.json": json.dumps(manifest(run, "eval.words", seconds), indent=2) + "\n",
+        MANIFEST: manifest(run, "eval.words", seconds),
     }
     for name, content in files.items():
         write_text(config.out / name, content)
