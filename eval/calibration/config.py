@@ -28,6 +28,7 @@ class CalibrationConfig(WorkConfig):
         cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the
             former, the user's cache for the latter).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
