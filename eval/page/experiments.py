@@ -94,14 +94,13 @@ BEYOND_EXPLORATION = (
 )
 """Exploration policies with semfov's own models."""
 
-SCORES: tuple[Scores, ...] = ("raw", "calibrated")
-"""Scores as likelihoods, and calibrated ones."""
+_SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
 SAMPLES = 16
 """Number of drawn looks in the policies that take an expectation over them."""
 
 EXPECTED = tuple(
-    PolicyConfig("predictive", scores, samples=samples) for scores in SCORES for samples in (None, SAMPLES)
+    PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, SAMPLES)
 )
 """Predictive searches with the expected scores, and with the expectation over drawn looks."""
 
