@@ -18,13 +18,12 @@ import yaml
 
 from eval.comparison.run import Run
 from semfov.io.code import commit
-from semfov.io.compatibility import recommended_model
 from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
-from semfov.runs.setup import growth_of, plain
+from semfov.runs.setup import observation_name, plain
 from semfov.runs.tables import percent
 from semfov.version import __version__
 
@@ -207,5 +206,5 @@ def sensing(run: Run) -> str:
     what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"
     if run.models.observation is None:
         return what
-    own = model or recommended_model(run.eye.detector.name, growth_of(run.eye))
-    return f"{what}, observation model {Path(own).stem}"
+    own = Path(model or observation_name(run.eye)).name.removesuffix(".safetensors")
+    return f"{what}, observation model {own}"

@@ -5,8 +5,8 @@
 Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
 for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
 rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
-published belief with the same thresholds and with the rule of the published agent, and one sharp look at the whole
-photograph. Detections from every cell are stored and shared with `python -m eval.search`.
+belief by Kaplan's rule with the same thresholds and with the rule of the published agent, and one sharp look at the
+whole photograph. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,6 @@ from eval.decide.run import DecisionRun
 from semfov.errors import DataError
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.workers import rank
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
 
@@ -30,8 +29,6 @@ def search_and_decide(config: DecideConfig) -> None:
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
     run = DecisionRun(with_models(DecisionConfig(**settings)))
     finish(run, "deciding")
-    if rank() > 0:
-        return
     records, seconds = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")

@@ -14,7 +14,7 @@ from eval.zoom.numbers import number_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import complete
+from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
@@ -23,9 +23,8 @@ from semfov.viz.style import save_figure
 def zoom(config: ZoomConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = ZoomRun(config)
-    records = complete(run, "zooming")
-    if records is None:
-        return
+    finish(run, "zooming")
+    records, _ = gather(run)
     text = zoom_summary(records, run)
     written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:

@@ -71,6 +71,7 @@ class ZoomConfig(WindowLookingConfig):
         cache: folder for the stored looks, shared between runs (None: the user's cache).
         store: keep looks on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     target: str | None = None

@@ -18,8 +18,8 @@ from semfov.runs.tables import mean_or_dash, share
 POLICIES = [
     "target-evidence",
     "random gaze",
-    "published belief",
-    "published belief, a detection at the gaze",
+    "calibrated belief",
+    "calibrated belief, a detection at the gaze",
 ]
 REFERENCES = ["one sharp look, highest score", "sharp look and its quarters, highest score", "class frequency"]
 
