@@ -6,13 +6,15 @@
 Results are measured on the photographs listed in configs/results_photographs.txt; settings are chosen on the
 photographs of the fit set. In the pages a table stands between the comments `<!-- table NAME -->` or
 `<!-- table EXPERIMENT NAME -->` and `<!-- end -->`; the command replaces what is between them, and leaves the text
-unchanged. Detections are computed once and shared by all experiments. To continue a stopped run, give the same command
-again.
+unchanged. Behind the name it writes the commit, the day and the number of photographs of the runs. A table is kept as
+it is until all its experiments have run, and so is a figure; the command ends with a list of what it renewed and kept.
+Detections are computed once and shared by all experiments. To continue a stopped run, give the same command again.
 """
 
 import re
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,16 +27,17 @@ from eval.explore import explore
 from eval.explore.config import ExploreConfig
 from eval.page.curves import OBJECTS
 from eval.page.experiments import STUDIES, ResultsConfig, experiments
-from eval.page.figures import draw_figures
+from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import findings
+from eval.page.origin import missing, origin
 from eval.page.tables import (
     Runs,
     agreement,
     beside_paper,
-    finished,
     paired,
     paired_maps,
     photographs,
+    published,
     readings,
     study_table,
     told_table,
@@ -45,10 +48,8 @@ from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
 from semfov.runs.command import run_command
 
-NOT_RUN = ["*Not run yet.*"]
-
 END = "<!-- end -->"
-PLACE = re.compile(rf"(<!-- table (.+?) -->).*?{END}", re.DOTALL)
+PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{END}", re.DOTALL)
 """A table of a page, between the comment that names it and the one that ends it."""
 
 
@@ -61,9 +62,17 @@ def results(config: ResultsConfig) -> None:
         HANDLERS[type(runs[name])](runs[name])
     pages = (config.page, config.tables)
     texts = [read_page(page) for page in pages]
+    kept: list[str] = []
     for page, text in zip(pages, texts, strict=True):
-        write_text(page, fill_page(text, runs))
-    for path in [*pages, *draw_figures(config.pictures, runs)]:
+        filled, others = fill_page(text, runs)
+        write_text(page, filled)
+        kept += others
+    drawn = draw_figures(config.pictures, runs)
+    renewed = [found["name"] for text in texts for found in PLACE.finditer(text) if found["name"] not in kept]
+    kept += [f"{name}.png" for name in PAGE_FIGURES if config.pictures / f"{name}.png" not in drawn]
+    print(f"\nrenewed: {', '.join([*renewed, *(path.name for path in drawn)]) or 'nothing'}")
+    print(f"kept, because experiments have not run: {', '.join(kept) or 'nothing'}")
+    for path in [*pages, *drawn]:
         print(f"written: {path}")
 
 
@@ -75,30 +84,66 @@ def read_page(path: Path) -> str:
         raise DataError(f"page: {path} cannot be read ({error.strerror}); check the path") from None
 
 
-def fill_page(text: str, runs: Runs) -> str:
-    """Replace every table of a page by that of the runs; raises InputError where a comment names no table."""
-    return PLACE.sub(lambda found: "\n\n".join((found[1], "\n".join(fill_line(found[2], runs)), END)), text)
+@dataclass(frozen=True)
+class PageTable:
+    """A table of the pages.
+
+    Attributes:
+        made_of: names of the experiments that it is made of.
+        make: gives its lines.
+    """
+
+    made_of: tuple[str, ...]
+    make: Callable[[Runs], list[str]]
 
 
-def fill_line(line: str, runs: Runs) -> list[str]:
-    """The table that a line names: a table of several experiments, of a study, or of one experiment."""
+def fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
+    """Renew the tables of a page whose experiments have all run.
+
+    Args:
+        text: the page.
+        runs: the experiments.
+
+    Returns:
+        The page, and the names of the tables that were kept.
+
+    Raises:
+        InputError: a comment names no table.
+    """
+    kept = []
+
+    def fill(found: re.Match[str]) -> str:
+        made = page_table(found["name"], runs)
+        if missing(made.made_of, runs):
+            kept.append(found["name"])
+            return found[0]
+        source = origin(runs[name].out for name in made.made_of)
+        return "\n\n".join((f"<!-- table {found['name']} -- {source} -->", "\n".join(made.make(runs)), END))
+
+    return PLACE.sub(fill, text), kept
+
+
+def page_table(line: str, runs: Runs) -> PageTable:
+    """The table that a comment names: of several experiments, of a study, or of one experiment."""
     if line in STUDIES:
-        return study_table(line, runs)
+        return PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
     if line in WHOLE:
-        return WHOLE[line](runs)
+        return WHOLE[line]
     name, _, kind = line.partition(" ")
-    run = runs.get(lookup(name, [*runs, *STUDIES, *WHOLE], "experiment"))
+    lookup(name, [*runs, *STUDIES, *WHOLE], "experiment")
     make = TABLES[lookup(kind, TABLES, "table")]
-    return make(run.out) if run is not None and finished(run) else NOT_RUN
+    return PageTable((name,), lambda runs: make(runs[name].out))
 
 
-WHOLE: dict[str, Callable[[Runs], list[str]]] = {
-    "paper": beside_paper,
-    "findings": findings,
-    "photographs": photographs,
-    "readings": readings,
+_SEARCHES, _EXPLORATIONS = (tuple(published(kind).values()) for kind in ("search", "explore"))
+
+WHOLE = {
+    "paper": PageTable(_SEARCHES, beside_paper),
+    "findings": PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
+    "photographs": PageTable(_SEARCHES[:1], photographs),
+    "readings": PageTable(_SEARCHES[:1], readings),
 }
-"""Tables made from several experiments, or from none."""
+"""Tables of the pages that are not of a single experiment."""
 
 SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
 EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
@@ -122,7 +167,8 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
     "presence": partial(told_table, "decisions.md", 0),
     "decisions": partial(told_table, "decisions.md", 1),
-    "landings": partial(told_table, "decisions.md", 2),
+    "differences": partial(told_table, "decisions.md", 2),
+    "landings": partial(told_table, "decisions.md", 3),
     "by-looks": partial(told_table, "beliefs.md", 0, columns=BELIEVED),
     "by-distance": partial(told_table, "beliefs.md", 1, columns=BELIEVED),
     "paired-map": paired_maps,

@@ -57,6 +57,25 @@ def recommended_arguments(
     }
 
 
+def published_model(detector: str, sensor: str, threshold: float) -> str:
+    """Name the observation model of the published agent.
+
+    Args:
+        detector: name of the detector.
+        sensor: name of a sensor in `PUBLISHED_SENSORS`.
+        threshold: the detector's score threshold; a threshold that no model was fitted at has the model of the default.
+
+    Returns:
+        The name of the model, whether or not it is shipped.
+
+    >>> published_model("yolox-nano", "published", 0.02), published_model("yolox-nano", "published", 0.03)
+    ('yolox-nano-published', 'yolox-nano-published')
+    """
+    name = f"{detector}-{sensor}"
+    own = f"{name}-{threshold:g}"
+    return own if (FovealObservationModel.shipped / f"{own}.safetensors").is_file() else name
+
+
 def published_arguments(
     name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
@@ -69,8 +88,8 @@ def published_arguments(
     else:
         fovea, grid = lookup(sensor or "published", PUBLISHED_SENSORS, "published sensor"), (10, 10)
         eye = Eye(named_sensor(fovea), load_detector(name, **options))
-        shipped = shipped_model(FovealObservationModel, f"{eye.detector.name}-{fovea}", fspath(name))
-        model = FovealObservationModel.from_pretrained(shipped)
+        fitted = published_model(eye.detector.name, fovea, eye.detector.selection.threshold)
+        model = FovealObservationModel.from_pretrained(shipped_model(FovealObservationModel, fitted, fspath(name)))
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
     policy = Predictive(model) if search == "predictive" else NonPredictive()
     return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}

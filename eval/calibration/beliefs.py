@@ -49,7 +49,7 @@ CELL_GROUPS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0
 
 ALL_CLASSES = {
     "raw": PolicyConfig("non-predictive"),
-    "published": PolicyConfig("non-predictive", "calibrated"),
+    "calibrated": PolicyConfig("non-predictive", "calibrated"),
     "tempered": PolicyConfig("non-predictive", tempering=0.5),
 }
 """Beliefs fused by Kaplan's rule: from raw scores, from calibrated scores, and from raw scores tempered by 0.5."""

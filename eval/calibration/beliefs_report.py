@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
-from eval.comparison.summary import sensing
+from eval.comparison.summary import MANIFEST, manifest, sensing
 from eval.decide.run import LANDINGS, LANDINGS_TOLD, landing_cells
 from semfov.errors import DataError
 from semfov.io.files import write_text
@@ -42,12 +42,13 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     Raises:
         DataError: no scene has a class that may be searched for.
     """
-    records, _ = gather(run)
+    records, seconds = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise target_area")
     sums = add_up(records)
     text = beliefs_summary(records, sums, run)
     files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
+    files[MANIFEST] = manifest(run, "eval.calibration", seconds)
     for name, content in files.items():
         write_text(run.config.out / name, content)
     groups = (

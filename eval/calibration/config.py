@@ -15,8 +15,7 @@ class CalibrationConfig(WorkConfig):
         data: photographs to evaluate on, by default all of them.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        model: fitted observation model, by name or file (None: the one shipped for the detector and growth; for the
-            published belief, the one fitted by maximum likelihood if it is shipped for the sensor).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and sensor).
         fixations: number of random fixations in each photograph.
         iou: smallest intersection over union at which a detection matches an object.
         seed: random seed of the fixations and of the searches.
@@ -29,6 +28,7 @@ class CalibrationConfig(WorkConfig):
         cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the
             former, the user's cache for the latter).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

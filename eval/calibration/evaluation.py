@@ -16,9 +16,8 @@ from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, ProtocolConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import make_observation, plain, published_model
+from semfov.runs.setup import make_observation, plain
 from semfov.runs.tables import table
-from semfov.runs.workers import rank
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 
@@ -33,9 +32,7 @@ def judge_calibration(config: CalibrationConfig) -> None:
 def judge_scores(config: CalibrationConfig) -> None:
     """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
     settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
-    if rank() > 0:
-        return
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
     model = make_observation(config.model, sampler.foveal_eye)
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
@@ -56,7 +53,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
         sensor=config.sensor,
         belief=BeliefConfig(
             *config.grid,
-            model=config.model or published_model(config.detector, config.sensor),
+            model=config.model,
             target_model=config.target_model,
             map_model=config.map_model,
         ),
@@ -64,11 +61,11 @@ def judge_beliefs(config: CalibrationConfig) -> None:
         out=config.out,
         cache=config.cache,
         workers=config.workers,
+        scheduler=config.scheduler,
     )
     run = BeliefCalibrationRun(search)
     finish(run, "believing")
-    if rank() == 0:
-        announce(*write_belief_report(run))
+    announce(*write_belief_report(run))
 
 
 def calibration_table(

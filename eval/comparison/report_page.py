@@ -22,7 +22,7 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.setup import plain
 from semfov.viz.views import foveated_views
 
-WHERE = ("out", "cache", "workers")
+WHERE = ("out", "cache", "workers", "scheduler")
 """Settings of folders and processes, which do not change the results and are left out of the page."""
 
 MOST_BYTES = 4_500_000

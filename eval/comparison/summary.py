@@ -8,6 +8,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,12 @@ import yaml
 
 from eval.comparison.run import Run
 from semfov.io.code import commit
-from semfov.io.compatibility import recommended_model
 from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
-from semfov.runs.setup import growth_of, plain
+from semfov.runs.setup import observation_name, plain
 from semfov.runs.tables import percent
 from semfov.version import __version__
 
@@ -115,7 +115,7 @@ def write_files(
         **tables,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
         "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
-        "manifest.json": json.dumps(manifest(run, program, seconds), indent=2) + "\n",
+        MANIFEST: manifest(run, program, seconds),
     }
     for name, text in files.items():
         write_text(inside(run.config.out, name), text)
@@ -169,11 +169,17 @@ LAST_COLUMN = "max. SEM over repetitions"
 """Heading of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
 
 
-def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
-    """Provenance of the results: versions, commit, checksums and seed; and the time that each stage took."""
-    return {
+MANIFEST = "manifest.json"
+"""Name of the file that says where the results of a run come from; it is written when the run has ended."""
+
+
+def manifest(run: Run, program: str, seconds: dict[str, float]) -> str:
+    """Provenance of the results as JSON: commit, day, versions, checksums, seed, and the time of each stage."""
+    told = {
         "command": ["python", "-m", program, *sys.argv[1:]],
         "commit": commit(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "scenes": len(run.scenes),
         "versions": {
             "semfov": __version__,
             "python": platform.python_version(),
@@ -191,6 +197,7 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, obj
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
     }
+    return json.dumps(told, indent=2) + "\n"
 
 
 def sensing(run: Run) -> str:
@@ -199,5 +206,5 @@ def sensing(run: Run) -> str:
     what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"
     if run.models.observation is None:
         return what
-    own = model or recommended_model(run.eye.detector.name, growth_of(run.eye))
-    return f"{what}, observation model {Path(own).stem}"
+    own = Path(model or observation_name(run.eye)).name.removesuffix(".safetensors")
+    return f"{what}, observation model {own}"

@@ -5,24 +5,21 @@
 Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
 for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
 rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
-published belief with the same thresholds and with the rule of the published agent, and one sharp look at the whole
-photograph. Detections from every cell are stored and shared with `python -m eval.search`.
+belief by Kaplan's rule with the same thresholds and with the rule of the published agent, and one sharp look at the
+whole photograph. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import fields
 
 from eval.comparison.model_folder import with_models
-from eval.comparison.summary import announce, sensing
+from eval.comparison.summary import announce, sensing, write_files
 from eval.decide.config import DecideConfig, DecisionConfig
 from eval.decide.report import decision_summary, probabilities
 from eval.decide.run import DecisionRun
 from semfov.errors import DataError
-from semfov.io.files import write_text
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.workers import rank
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
 
@@ -32,17 +29,12 @@ def search_and_decide(config: DecideConfig) -> None:
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
     run = DecisionRun(with_models(DecisionConfig(**settings)))
     finish(run, "deciding")
-    if rank() > 0:
-        return
-    records, _ = gather(run)
+    records, seconds = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     text = decision_summary(records, sensing(run))
-    files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
-    for name, content in files.items():
-        write_text(config.out / name, content)
-    picture = save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")
-    announce(text, [*(config.out / name for name in files), picture])
+    written = write_files(run, "eval.decide", {"decisions.md": text}, records, seconds)
+    announce(text, [*written, save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,36 +1,17 @@
 """Tables of decisions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from eval.comparison.telling import CALIBRATED, ERRORS_TOLD, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import AGENT, LANDINGS, LANDINGS_TOLD, UNVERIFIED, landing_cells
-from semfov.metrics.calibration import calibration_error
-from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 
-SHARES = (0.01, 0.02, 0.05)
-"""False alarm rates at which the tables give the hit rate."""
-
-
-def telling(told: Mapping[str, Tensor], there: Tensor) -> list[list[str]]:
-    """How well scores tell whether the target is present.
-
-    Args:
-        told: scores `(M,)` of the searches, by name.
-        there: `(M,)` boolean, whether the target is present.
-
-    Returns:
-        A row for each name: area under the ROC curve, then hit rates in percent at the false alarm rates `SHARES`.
-    """
-    if not there.any() or there.all():
-        return [["-"] * (1 + len(SHARES)) for _ in told]
-    return [
-        [f"{area_under_roc(score, there):.3f}", *(f"{100 * hits_at(score, there, share):.0f}" for share in SHARES)]
-        for score in told.values()
-    ]
+SHARP = "one sharp look, highest score"
+"""Name of the highest score of the target in a sharp look at the whole scene."""
 
 
 def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -39,8 +20,9 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     first = groups[names[0]]
     told = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
-    told["one sharp look, highest score"] = torch.tensor([record["sharp"] for record in first])
+    told[SHARP] = torch.tensor([record["sharp"] for record in first])
     told["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+    told[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
     return told, torch.tensor([record["present"] for record in first])
 
 
@@ -49,17 +31,19 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     told, there = probabilities(records)
-    rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE"]]
+    first = groups[names[0]]
+    places = {name: torch.tensor([reported(record) for record in group]) for name, group in groups.items()}
+    telling = Telling(told, there, [record["scene"] for record in first], {**places, SHARP: sharp_places(first)})
+    rows = [["", *TELLING, *CALIBRATED]]
     # The references give scores, not probabilities.
-    errors = [f"{calibration_error(told[name], there):.3f}" if name in groups else "-" for name in told]
-    rows += [[name, *figures, error] for name, figures, error in zip(told, telling(told, there), errors, strict=True)]
+    errors = [calibrated(told[name], there) if name in groups else ["-", "-"] for name in told]
+    rows += [[name, *figures, *error] for name, figures, error in zip(told, telling.rows(), errors, strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
                 "expected", "IoU"]]  # fmt: skip
     for name, group in groups.items():
         present = [record for record in group if record["present"]]
         absent = [record for record in group if not record["present"]]
         found = [record for record in present if record["outcome"] == "found"]
-        places = [record["right_place"] for record in group if record["outcome"] == "found"]
         expected = [100 * record["place"] for record in group if record["place"] is not None]
         decided.append(
             [
@@ -69,12 +53,12 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
                 share(sum(record["outcome"] == "undecided" for record in group), len(group)),
                 mean_or_dash([record["looks"] for record in present]),
                 mean_or_dash([record["looks"] for record in absent]),
-                share(sum(places), len(places)),
+                telling.place(name),
                 mean_or_dash(expected),
                 mean_or_dash([record["overlap"] for record in found if record["overlap"] is not None], 2),
             ]
         )
-    decided.append(sharp_decisions(groups[names[0]]))
+    decided.append(sharp_decisions(first, telling.place(SHARP)))
     closely = ""
     if UNVERIFIED in groups:
         each = mean_or_dash([record["closer"] for record in groups[AGENT]], 2)
@@ -83,7 +67,8 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
         [
             f"Is the target present? {len(there)} searches ({sensed}), {int(there.sum())} of them for a present class. "
             "Hit rates in % at the given false alarm rates, and the expected calibration error (ECE) of the final "
-            "probability.",
+            f"probability. {ERRORS_TOLD} `{FREQUENCY}`: the share of the other scenes that hold the class; absent "
+            "classes are drawn with equal probability.",
             "",
             *table(rows),
             "",
@@ -95,6 +80,11 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
             "",
             *table(decided),
             "",
+            f"The same searches compared with {names[0]}, paired over scenes: differences of the area, and of the hit "
+            "rates and the share of right places in percentage points.",
+            "",
+            *telling.differences(names[0]),
+            "",
             LANDINGS_TOLD,
             "",
             *table([["", *LANDINGS], *landing_rows(groups)]),
@@ -103,21 +93,38 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     )
 
 
-def sharp_decisions(records: Sequence[ResultRecord]) -> list[str]:
-    """Row of one sharp look, with the threshold of its score chosen for as many hits as these searches have."""
+def reported(record: ResultRecord) -> float:
+    """1 if a search has found the target at the right place, 0 at a wrong one, and NaN if it has not found it."""
+    return float(record["right_place"]) if record["outcome"] == "found" else torch.nan
+
+
+def sharp_finds(records: Sequence[ResultRecord]) -> list[bool]:
+    """Whether a sharp look reports the target, with a threshold of its score for as many hits as the searches have."""
     present = [record for record in records if record["present"]]
     hits = sum(record["outcome"] == "found" for record in present)
     least = sorted((record["sharp"] for record in present), reverse=True)[hits - 1] if hits else float("inf")
-    told = [record for record in records if record["sharp"] >= least and record["sharp_place"] is not None]
+    return [record["sharp"] >= least and record["sharp_place"] is not None for record in records]
+
+
+def sharp_places(records: Sequence[ResultRecord]) -> Tensor:
+    """The same as `reported` for one sharp look, `(M,)`."""
+    told = zip(records, sharp_finds(records), strict=True)
+    return torch.tensor([float(record["sharp_place"]["right"]) if found else torch.nan for record, found in told])
+
+
+def sharp_decisions(records: Sequence[ResultRecord], place: str) -> list[str]:
+    """Row of one sharp look (`sharp_finds`), whose share of right places is `place`."""
+    told = [record for record, found in zip(records, sharp_finds(records), strict=True) if found]
     there = [record["sharp_place"]["overlap"] for record in told if record["present"]]
+    present = sum(record["present"] for record in records)
     return [
         "one sharp look",
-        share(len(there), len(present)),
-        share(len(told) - len(there), len(records) - len(present)),
+        share(len(there), present),
+        share(len(told) - len(there), len(records) - present),
         "-",
         "1.0",
         "1.0",
-        share(sum(record["sharp_place"]["right"] for record in told), len(told)),
+        place,
         "-",
         mean_or_dash(there, 2),
     ]

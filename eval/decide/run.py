@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from eval.comparison.run import Run
+from eval.comparison.telling import class_frequencies
 from eval.decide.config import DecisionConfig
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
@@ -29,21 +31,18 @@ from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import choose_classes, search_steps
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_observation, make_verification, published_model
+from semfov.runs.setup import make_observation, make_verification
 from semfov.strategy import Strategy
 
 _Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
-AGENT, UNVERIFIED, RANDOM, PUBLISHED, AT_THE_GAZE = (
-    "target-evidence",
-    "target-evidence, no closer looks",
-    "random gaze",
-    "published belief",
-    "published belief, a detection at the gaze",
-)
-"""Ways to search: the agent's, with closer looks and without; the agent's belief with random gaze; and the paper's
-belief and gaze with two rules."""
+AGENT, UNVERIFIED, RANDOM = "target-evidence", "target-evidence, no closer looks", "random gaze"
+"""Ways to search: the agent's, with closer looks and without, and the agent's belief with random gaze."""
+
+PUBLISHED, CALIBRATED = "published belief", "calibrated belief"
+"""Beliefs by Kaplan's rule from calibrated scores: with an observation model of the paper's, fitted by maximum
+likelihood, or with one that is trained for the posterior of the class."""
 
 SEEN_FROM = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
@@ -53,7 +52,8 @@ class DecisionRun(Run):
     """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
 
     The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
-    thresholds as the others, and, without thresholds, as soon as a detection at the gaze shows the target.
+    thresholds as the others, and, without thresholds, as soon as a detection at the gaze shows the target. It is called
+    calibrated where the observation model of the eye is not the paper's.
 
     Args:
         config: settings of the run.
@@ -88,7 +88,16 @@ class DecisionRun(Run):
         if model is not None:
             self.models = replace(self.models, observation=model)
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
-            self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
+            name = CALIBRATED if model.metadata.get("method") == "discriminative" else PUBLISHED
+            self.compared |= {
+                name: (published, self._by_thresholds),
+                f"{name}, a detection at the gaze": (published, at_the_gaze),
+            }
+
+    @cached_property
+    def frequencies(self) -> list[Tensor]:
+        """The share of the other scenes that hold each class, by index of the scene."""
+        return class_frequencies(self.scenes)
 
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
@@ -105,10 +114,10 @@ class DecisionRun(Run):
         )
 
     def _published(self) -> FovealObservationModel | None:
-        """The observation model of the published belief; None if the settings name none and none is shipped."""
+        """The observation model of the settings or of the eye; None if the settings name none and none is shipped."""
         name = self.config.belief.model
         try:
-            return make_observation(name or published_model(self.config.detector, self.config.sensor), self.eye)
+            return make_observation(name, self.eye)
         except InputError:
             if name is not None:
                 raise
@@ -149,6 +158,7 @@ class DecisionRun(Run):
                 "target": target,
                 "present": bool(goal.any()),
                 "sharp": float(highest_score(sharp, target)),
+                "frequency": float(self.frequencies[index][target]),
                 "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }

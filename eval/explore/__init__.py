@@ -16,15 +16,13 @@ from eval.explore.report import exploration_report
 from eval.explore.run import ExploreRun
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
-from semfov.runs.workers import rank
 
 
 def explore(config: ExploreConfig) -> None:
     """Run a scene exploration experiment and write its tables, figures and records."""
     run = ExploreRun(with_models(config))
     finish(run, "exploring")
-    if rank() == 0:
-        exploration_report(run)
+    exploration_report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

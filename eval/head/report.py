@@ -14,7 +14,7 @@ from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import complete
+from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import percent, table
 from semfov.viz.style import line_style, save_figure
 
@@ -25,9 +25,8 @@ _Measure = Callable[[ResultRecord], float]
 def head(config: HeadConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = HeadRun(config)
-    records = complete(run, "looking around")
-    if records is None:
-        return
+    finish(run, "looking around")
+    records, _ = gather(run)
     text = head_summary(records, config)
     announce(text, [*write_summary(config.out, "head", text, records), *_curves(records, config)])
 

@@ -24,17 +24,15 @@ from eval.human.viewing.scores import halves, score_all
 from eval.human.viewing.sequences import score_sequences
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
-from semfov.runs.workers import rank
 
 
 def viewing(config: ViewingConfig) -> None:
     """Compare policies with people who view pictures freely."""
     run = ViewingRun(config)
     finish(run, "following people")
-    if rank() == 0:
-        fitted, reported = halves(run)
-        scored = score_all(run, fitted, reported)
-        viewing_report(run, scored, score_sequences(scored, reported), reported)
+    fitted, reported = halves(run)
+    scored = score_all(run, fitted, reported)
+    viewing_report(run, scored, score_sequences(scored, reported), reported)
 
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {

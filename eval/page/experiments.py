@@ -189,6 +189,7 @@ class ResultsConfig(Settings):
         out: folder for the runs.
         cache: folder for the stored detections (None: the user's cache).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     root: Path
@@ -206,6 +207,7 @@ class ResultsConfig(Settings):
     out: Path = Path("runs/results")
     cache: Path | None = None
     workers: Workers | None = None
+    scheduler: str | None = None
 
 
 def experiments(config: ResultsConfig) -> dict[str, Experiment]:
@@ -227,7 +229,8 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
     for name in DETECTORS:
         settings = detector(name, config)
-        common: dict[str, Any] = {"data": data, "detector": settings, "cache": config.cache, "workers": config.workers}
+        work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
+        common: dict[str, Any] = {"data": data, "detector": settings, **work}
         seek, tour = partial(SearchConfig, **common, scanpaths=0), partial(ExploreConfig, **common)
         for fovea in FOVEAE:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
@@ -244,14 +247,16 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
-        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
+        belief = BeliefConfig(model=f"{settings.name}-sharp")
+        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor, belief=belief)
 
 
 def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
     """Experiments on photographs of the fit set, on which settings are chosen."""
     data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
     nano = detector("nano", config)
-    few: dict[str, Any] = {"data": data, "detector": nano, "cache": config.cache, "workers": config.workers}
+    work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
+    few: dict[str, Any] = {"data": data, "detector": nano, **work}
     few["sensor"] = SensorConfig(name="published")
     for title, study in STUDIES.items():
         base = ExploreConfig(**few) if study.explores else SearchConfig(**few, scanpaths=0)

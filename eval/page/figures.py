@@ -5,7 +5,8 @@ from pathlib import Path
 
 from eval.page.curves import per_image, records_of, repetition_error
 from eval.page.findings import LAST
-from eval.page.tables import Runs, published_columns
+from eval.page.origin import missing
+from eval.page.tables import Runs, published, published_columns
 from semfov.metrics.averages import FloatArray
 from semfov.viz.style import save_figure
 
@@ -48,10 +49,9 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
 
     written = []
     for name, figure in PAGE_FIGURES.items():
-        folders = published_columns(figure.kind, runs)
-        if any(run is None for run in folders.values()):
+        if missing(published(figure.kind).values(), runs):
             continue
-        panels = {title: panel(run, figure) for title, run in folders.items() if run is not None}
+        panels = {title: panel(folder, figure) for title, folder in published_columns(figure.kind, runs).items()}
         drawn = plot_curve_panels(panels, label=LABELS[figure.kind])
         written.append(save_figure(drawn, folder / f"{name}.png"))
     return written

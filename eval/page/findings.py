@@ -194,8 +194,6 @@ def findings(runs: Runs) -> list[str]:
     folders = {kind: published_columns(kind, runs) for kind in LAST}
     rows = [["the paper finds", "shown", *folders["search"]]]
     for finding in FINDINGS:
-        answers = (
-            "not run yet" if folder is None else finding.answer(folder) for folder in folders[finding.kind].values()
-        )
+        answers = [finding.answer(folder) for folder in folders[finding.kind].values()]
         rows.append([finding.text, finding.shown, *answers])
     return table(rows)

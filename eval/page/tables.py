@@ -25,23 +25,19 @@ from semfov.runs.tables import table
 
 Runs = dict[str, Experiment]
 
-TOLD = ("summary.md", "decisions.md", "beliefs.md")
-"""Files with the tables of experiments."""
+
+def published(kind: str) -> dict[str, str]:
+    """Names of the published experiments of a kind, by column heading."""
+    return {
+        f"{title}, {width}": f"{kind}-{fovea}-{name}"
+        for name, title in DETECTORS.items()
+        for fovea, width in FOVEAE.items()
+    }
 
 
-def finished(run: Experiment | None) -> bool:
-    """Whether a run has written its tables."""
-    return run is not None and any((run.out / name).exists() for name in TOLD)
-
-
-def published_columns(kind: str, runs: Runs) -> dict[str, Path | None]:
-    """Folders of the published experiments of a kind, by column heading; None for an experiment that has not run."""
-    found = {}
-    for name, title in DETECTORS.items():
-        for fovea, width in FOVEAE.items():
-            run = runs[f"{kind}-{fovea}-{name}"]
-            found[f"{title}, {width}"] = run.out if finished(run) else None
-    return found
+def published_columns(kind: str, runs: Runs) -> dict[str, Path]:
+    """Folders of the published experiments of a kind, by column heading."""
+    return {heading: runs[name].out for heading, name in published(kind).items()}
 
 
 def beside_paper(runs: Runs) -> list[str]:
@@ -57,33 +53,27 @@ def beside_paper(runs: Runs) -> list[str]:
     return table(rows)
 
 
-def performance_cell(folder: Path | None, policy: str, shifts: int) -> str:
+def performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
-    if folder is None:
-        return "not run yet"
     curves = per_image(records_of(folder, policy, commonest=True), shifts)[:, shifts]
     return f"{100 * curves.mean():.1f} ± {100 * standard_error(curves):.1f}"
 
 
-def largest_error(folder: Path | None, policy: str) -> str:
+def largest_error(folder: Path, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
-    if folder is None:
-        return "not run yet"
     return f"{100 * repetition_error(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS)).max():.3f}"
 
 
 def readings(runs: Runs) -> list[str]:
     """Expected performance of random gaze for the commonest class, for both readings of n in the paper."""
-    folder = next((folder for folder in published_columns("search", runs).values() if folder is not None), None)
+    folder = runs["search-published-nano"].out
     rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.TABLE_SHIFTS)]]
     rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
-    if folder is not None:
-        goals = [len(r["goal"]) for r in records_of(folder, "random", commonest=True) if r["repetition"] == 0]
-        curve = np.mean([random_search(count, max(paper.TABLE_SHIFTS)) for count in goals], axis=0)
-        rows.append(
-            ["n gaze shifts (the reading of this page)", *(f"{100 * curve[n]:.1f}" for n in paper.TABLE_SHIFTS)]
-        )
-        rows.append(["n fixations, the first among them", *(f"{100 * curve[n - 1]:.1f}" for n in paper.TABLE_SHIFTS)])
+    goals = [len(r["goal"]) for r in records_of(folder, "random", commonest=True) if r["repetition"] == 0]
+    curve = np.mean([random_search(count, max(paper.TABLE_SHIFTS)) for count in goals], axis=0)
+    first = {"n gaze shifts (the reading of this page)": 0, "n fixations, the first among them": 1}
+    for reading, less in first.items():
+        rows.append([reading, *(f"{100 * curve[n - less]:.1f}" for n in paper.TABLE_SHIFTS)])
     return table(rows)
 
 
@@ -94,14 +84,11 @@ def study_table(title: str, runs: Runs) -> list[str]:
     shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
     rows = [["setting", *(["policy"] if several else []), *shifts]]
     for label in study.settings:
-        run = runs.get(f"{title} {label}")
+        folder = runs[f"{title} {label}"].out
         for choice in study.policies:
             policy = name_of(choice, "exploration" if study.explores else "search")
             head = [label, *([policy] if several else [])]
-            if run is None or not finished(run):
-                rows.append([*head, *("not run yet" for _ in shifts)])
-                continue
-            curves = per_image(records_of(run.out, policy), max(study.shifts))
+            curves = per_image(records_of(folder, policy), max(study.shifts))
             mean, error = curves.mean(0), standard_error(curves)
             rows.append([*head, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in study.shifts)])
     return table(rows)

@@ -17,15 +17,13 @@ from eval.search.report import search_report
 from eval.search.run import SearchRun
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
-from semfov.runs.workers import rank
 
 
 def search(config: SearchConfig) -> None:
     """Run a visual search experiment and write its tables, figures and records."""
     run = SearchRun(with_models(config))
     finish(run, "searching")
-    if rank() == 0:
-        search_report(run)
+    search_report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

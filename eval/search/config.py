@@ -30,6 +30,7 @@ class SearchConfig(RunConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         scanpaths: number of episodes to draw as figures.
         models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
     """

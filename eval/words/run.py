@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from eval.comparison.summary import Curve, announce, collect_records, curve_of, manifest, sensing
+from eval.comparison.summary import MANIFEST, Curve, announce, collect_records, curve_of, manifest, sensing
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.belief import ContextPrior
@@ -25,7 +25,6 @@ from semfov.runs.scene_run import finish
 from semfov.runs.settings import Seed, Share, Weight
 from semfov.runs.setup import plain
 from semfov.runs.tables import table
-from semfov.runs.workers import rank
 
 _SHIFTS = (1, 3, 5, 10, 30)
 """Gaze shifts at which the table gives the share of targets found."""
@@ -53,6 +52,7 @@ class WordsConfig(ScenesConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
@@ -86,8 +86,6 @@ def words(config: WordsConfig) -> None:
     settings = {each.name: getattr(config, each.name) for each in fields(ScenesConfig)}
     run = WordsRun(SearchConfig(**settings, protocol=config.protocol, policies=tuple(arms.values()), scanpaths=0))
     finish(run, "searching")
-    if rank() > 0:
-        return
     records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
@@ -99,7 +97,7 @@ def words(config: WordsConfig) -> None:
         "words.md": text,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
         "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
-        "manifest.json": json.dumps(manifest(run, "eval.words", seconds), indent=2) + "\n",
+        MANIFEST: manifest(run, "eval.words", seconds),
     }
     for name, content in files.items():
         write_text(config.out / name, content)
@@ -127,7 +125,7 @@ def _with(base: PolicyConfig, config: WordsConfig, context: str | ContextPrior) 
             context.weights = dict.fromkeys(context.weights, config.weights)
         # The name depends on the content, so that results with another context are never reused.
         path = inside(config.out, f"context-{context.digest()[:16]}.safetensors")
-        if rank() == 0 and not path.exists():
+        if not path.exists():
             context.save(path)
         context = str(path)
     return replace(base, context=config.context, context_model=context)

@@ -7,7 +7,7 @@ from itertools import product
 
 import torch
 
-from eval.decide.report import SHARES, telling
+from eval.comparison.telling import CALIBRATED, ERRORS_TOLD, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
 from semfov.agents.limits import EpisodeLimits
 from semfov.agents.windows import search_windows
@@ -90,7 +90,8 @@ def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Te
     ways = by_way(records)
     told = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
     searches = next(iter(ways.values()))
-    for name, key in (("the overview, highest score", "overview"), ("all slices, highest score", "slices")):
+    scores = {"the overview, highest score": "overview", "all slices, highest score": "slices", FREQUENCY: "frequency"}
+    for name, key in scores.items():
         told[name] = torch.tensor([record[key] for record in searches])
     return told, torch.tensor([record["present"] for record in searches])
 
@@ -103,17 +104,19 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     passes = {way: mean_or_dash([record["passes"] for record in of]) for way, of in ways.items()}
     passes["the overview, highest score"] = "1"
     passes["all slices, highest score"] = mean_or_dash([record["count"] for record in searches])
-    rows = [["", "passes", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE", "Brier"]]
-    for (name, score), figures in zip(told.items(), telling(told, there), strict=True):
-        sums = BinarySums.of(score, there)
-        rows.append([name, passes[name], *figures, f"{sums.ece:.3f}", f"{sums.brier:.3f}"])
+    passes[FREQUENCY] = "-"
+    places = {way: torch.tensor([right_box(record) for record in of]) for way, of in ways.items()}
+    telling = Telling(told, there, [record["scene"] for record in searches], places)
+    rows = [["", "passes", *TELLING, *CALIBRATED, "Brier"]]
+    for (name, score), figures in zip(told.items(), telling.rows(), strict=True):
+        brier = f"{BinarySums.of(score, there).brier:.3f}"
+        rows.append([name, passes[name], *figures, *calibrated(score, there), brier])
     decided = [["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]]
     for way, of in ways.items():
         for kind in (True, False):
             group = [r for r in of if r["present"] is kind]
             counts = [share(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
-            found = [r for r in group if r["outcome"] == "found"]
-            right = share(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
+            right = telling.place(way) if kind else ""
             looks, chance = (
                 mean_or_dash([r["passes"] for r in group]),
                 mean_or_dash([r["probability"] for r in group], 2),
@@ -122,7 +125,8 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
             decided.append([name, counts[0], right, *counts[1:], looks, chance])
     return [
         f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
-        "in % at the given false alarm rates. `ours` is the probability at the end of a search.",
+        f"in % at the given false alarm rates. `ours` is the probability at the end of a search. {ERRORS_TOLD} "
+        f"`{FREQUENCY}`: the share of the other pictures that hold the class.",
         "",
         *table(rows),
         "",
@@ -130,4 +134,15 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
         "",
         *table(decided),
         "",
+        f"The same searches compared with {OURS}, paired over pictures: differences of the area, and of the hit rates "
+        "and the share of right boxes in percentage points.",
+        "",
+        *telling.differences(OURS),
+        "",
     ]
+
+
+def right_box(record: ResultRecord) -> float:
+    """1 if the box of a find of a present target is right (IoU 0.5), 0 if it is wrong, and NaN without such a find."""
+    found = record["present"] and record["outcome"] == "found"
+    return float((record["overlap"] or 0) >= 0.5) if found else torch.nan

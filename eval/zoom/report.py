@@ -1,16 +1,20 @@
 """Runs an experiment with large pictures to its end, and writes its tables and curves."""
 
 from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
 from statistics import mean, median
 
 import torch
+from torch import Tensor
 
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.numbers import number_table
 from eval.zoom.run import ZoomConfig, ZoomRun
+from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import complete
+from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
@@ -19,9 +23,8 @@ from semfov.viz.style import save_figure
 def zoom(config: ZoomConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = ZoomRun(config)
-    records = complete(run, "zooming")
-    if records is None:
-        return
+    finish(run, "zooming")
+    records, _ = gather(run)
     text = zoom_summary(records, run)
     written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:
@@ -74,20 +77,56 @@ def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
     passes = run.config.passes
     at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
     pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
-    rows = [["", *map(str, at), "area under the curve", "boxes for each object"]]
-    for way, group in finding.items():
-        line = curve(group, passes)
+    figures = Bootstrap.of(partial(recall_and_precision, finding, at), range(len(run.scenes)))
+    rows = [["", *map(str, at), "area under the curve", "boxes for each object", "boxes that are right"]]
+    for (way, group), value, error in zip(finding.items(), figures.value, figures.error, strict=True):
+        found, right = recall_cells(value, error)
         boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
-        rows.append([way, *(f"{line[n - 1]:.3f}" for n in at), f"{mean(line):.3f}", f"{boxes:.2f}"])
+        rows.append([way, *found, f"{mean(curve(group, passes)):.3f}", f"{boxes:.2f}", right])
+    apart = figures.less(list(finding).index("ours"))
+    less = [["difference to ours", *map(str, at), "boxes that are right"]]
+    for way, value, error in zip(finding, apart.value, apart.error, strict=True):
+        found, right = recall_cells(value, error, "+")
+        less += [[way, *found, right]] if way != "ours" else []
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
     return [
         f"Recall of {objects} {what} in {len(run.scenes)} pictures after n passes of the detector, including the "
-        f"overview (score 0.1, IoU 0.5); a pass takes {pixels:.3f} million pixels.",
+        f"overview (score 0.1, IoU 0.5), and the share of the boxes after the last pass that show an object, one box "
+        f"for each object; a pass takes {pixels:.3f} million pixels. ± is the standard error by bootstrap over "
+        "pictures; differences are paired.",
         "",
         *table(rows),
         "",
+        *table(less),
+        "",
     ]
+
+
+def recall_and_precision(finding: dict[str, list[ResultRecord]], at: Sequence[int], pictures: Tensor) -> Tensor:
+    """Recall after `at` passes, and the share of right boxes after the last, for each way of looking at pictures.
+
+    Args:
+        finding: for each way of looking, a record of each picture.
+        at: numbers of passes.
+        pictures: indices of the pictures, some of them repeated.
+
+    Returns:
+        `(ways, len(at) + 1)`, float64; NaN where there is no box.
+    """
+    rows = []
+    for group in finding.values():
+        chosen = [group[picture] for picture in pictures.tolist()]
+        line, boxes = curve(chosen, max(at)), sum(record["boxes"] for record in chosen)
+        precision = sum(record["right"] for record in chosen) / boxes if boxes else torch.nan
+        rows.append([*(line[n - 1] for n in at), precision])
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def recall_cells(value: Tensor, error: Tensor, sign: str = "") -> tuple[list[str], str]:
+    """Cells of a table row for figures of `recall_and_precision` and their standard errors: recall, and precision."""
+    cells = [f"{each:{sign}.3f} ± {apart:.3f}" for each, apart in zip(value.tolist(), error.tolist(), strict=True)]
+    return cells[:-1], cells[-1] if value[-1].isfinite() else "-"
 
 
 def _curves(records: list[ResultRecord], run: ZoomRun):  # type: ignore[no-untyped-def]

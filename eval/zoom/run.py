@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
+from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
 from eval.zoom.numbers import count_objects
 from semfov.data.classes import class_index
@@ -18,7 +20,9 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER
 from semfov.detection.detections import Detections
+from semfov.detection.objects import Objects
 from semfov.episode import Stopwatch
+from semfov.observation.matching import match
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
@@ -67,6 +71,7 @@ class ZoomConfig(WindowLookingConfig):
         cache: folder for the stored looks, shared between runs (None: the user's cache).
         store: keep looks on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     target: str | None = None
@@ -164,7 +169,16 @@ class ZoomRun(WindowLooking, SceneRun):
         cut = self.slices(index, glances.lattice)
         limits = {"passes": config.passes, "closer": config.closer}
         records = decide_all(glances, self.evidence, names, targets, annotation, cut, **limits)
-        return [record | {"scene": self.scenes.ids[index]} for record in records]
+        known = self.frequencies[index]
+        return [
+            record | {"scene": self.scenes.ids[index], "frequency": float(known[names.index(record["target"])])}
+            for record in records
+        ]
+
+    @cached_property
+    def frequencies(self) -> list[Tensor]:
+        """The share of the other scenes that hold each class, by index of the scene."""
+        return class_frequencies(self.scenes)
 
     def annotation(self, index: int) -> Annotation:
         """The objects to be found: of the target class, or all."""
@@ -177,14 +191,15 @@ class ZoomRun(WindowLooking, SceneRun):
     def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
         counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
-        boxes = len(merge(seen, self.target, score=FOUND))
+        objects = merge(seen, self.target, score=FOUND)
         return {
             "measure": "recall",
             "way": name,
             "scene": self.scenes.ids[index],
             "objects": len(annotation.boxes),
             "found": counts,
-            "boxes": boxes,
+            "boxes": len(objects),
+            "right": right_boxes(objects, annotation),
             "windows": [list(glance.window.fixation) for glance in seen],
         }
 
@@ -225,6 +240,15 @@ class ZoomRun(WindowLooking, SceneRun):
                     }
                 )
         return records
+
+
+def right_boxes(objects: Objects, annotation: Annotation) -> int:
+    """Number of boxes that show an annotated object of their class (IoU 0.5); each object counts for one box."""
+    right = 0
+    for label in objects.labels.unique().tolist():
+        there = annotation.boxes[annotation.labels == label]
+        right += int((match(objects.boxes[objects.labels == label], there, torch.ones(len(there)).long()) > 0).sum())
+    return right
 
 
 def without_cut(glance: Glance) -> Glance:

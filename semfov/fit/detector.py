@@ -22,7 +22,7 @@ from semfov.runs.looking import Looking, looking_of
 from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import detector_options, plain
-from semfov.runs.workers import available_cores, rank
+from semfov.runs.workers import available_cores
 
 _log = logging.getLogger(__name__)
 
@@ -109,8 +109,6 @@ def fit_folder(config: FitDetectorConfig) -> None:
     with WholeBar("fitting", {"looking": {"looking": seconds_of_looks(run)}, **folder.stages}) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
-        if rank() > 0:
-            return
         for part in PARTS:
             with whole.stage(part):
                 folder.fit(part)

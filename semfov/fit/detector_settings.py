@@ -48,6 +48,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         out: folder to write the models to.
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
         workers: number of processes that look (None: one for each CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     model: Path | None = None
@@ -184,4 +185,5 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             out=self.out,
             cache=self.cache,
             workers=self.workers,
+            scheduler=self.scheduler,
         )

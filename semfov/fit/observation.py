@@ -33,7 +33,6 @@ from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.setup import plain
 from semfov.runs.tables import table
-from semfov.runs.workers import rank
 from semfov.runs.zoom_samples import MosaicSettings
 from semfov.version import __version__
 from semfov.viz import plot_reliability
@@ -71,6 +70,7 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
         out: folder for the model, the report and the figures.
         cache: folder for the labelled detections (None: `out`).
         workers: number of processes (None: one for each CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
@@ -100,9 +100,7 @@ def fit_fom(config: FitObservationConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     kind = MosaicSettings if config.mosaics else SampleSettings
     settings = kind.of(config)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
-    if rank() > 0:
-        return
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
     held_out = samples.scene % config.holdout == 0
     if not held_out.any() or held_out.all():
         raise DataError(

@@ -17,7 +17,6 @@ from semfov.io.pretrained import Pretrained
 from semfov.runs.looking import Looking, looking_of
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import plain
-from semfov.runs.workers import rank
 
 Model = TypeVar("Model", bound=Pretrained)
 
@@ -35,7 +34,7 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
     Returns:
         The metadata.
     """
-    left_out = {"out", "cache", "workers", "data", "detector", "sensor", *besides}
+    left_out = {"out", "cache", "workers", "scheduler", "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
 
@@ -116,8 +115,6 @@ def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[An
     """
     run = looking_of(config)
     finish(run, "looking")
-    if rank() > 0:
-        return
     fitted = fit(config, run)
     path = model_path(config, run.eye.detector.name)
     fitted.model.save(path)

@@ -62,6 +62,7 @@ class FitOnLooksConfig(FovealFitConfig, NameConfig, WorkConfig):
         out: folder for the model and the report.
         cache: folder for the detections from every cell, shared with the evaluations (None: the user's cache).
         workers: number of processes that look (None: one for each CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))

@@ -22,7 +22,6 @@ from semfov.runs.samples import Sampler, Samples, SampleSettings, collect_sample
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
-from semfov.runs.workers import rank
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,7 @@ class FitTemperingConfig(FovealFitConfig, WorkConfig):
         out: folder for the report.
         cache: folder for the labelled detections (None: `out`).
         workers: number of processes that look (None: one for each CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     calibrated: bool = False
@@ -69,9 +69,7 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
     settings = SampleSettings.of(config)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.workers, "looking")
-    if rank() > 0:
-        return
+    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
     model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = tempering_report(hits)

@@ -34,13 +34,14 @@ from semfov.fit.windows_evidence import (
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.setup import make_detector, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.window_looking import TileSize
-from semfov.runs.workers import available_cores, run_tasks
+from semfov.runs.workers import run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -84,6 +85,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
         out: folder for the model and the report.
         cache: folder for the looks (None: the user's cache).
         workers: number of processes (None: one for each CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
@@ -171,14 +173,14 @@ def prepare_fit_process(config: FitZoomConfig) -> None:
     _process.update(eye=eye, mosaics=make_mosaics(config, eye.detector.classes), store=make_store(config, eye))
 
 
-def look(task: tuple[str, int]) -> tuple[str, int]:
-    """Look at all windows of a mosaic that are not in the store yet."""
+def look(task: tuple[str, int]) -> bytes:
+    """Look at all windows of a mosaic that are not in the store yet; returns all looks at it."""
     kind, index = task
     mosaics = _process["mosaics"][kind]
     glances = StoredGlances(_process["eye"], mosaics, index, _process["store"])
     glances.see(windows_of(mosaics, index, glances.lattice))
     glances.save()
-    return task
+    return pack_tensors(_process["store"].read(mosaics.digest(index)))
 
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
@@ -235,10 +237,19 @@ def look_at_all(
     """Look at all mosaics of some kinds; returns the looks by kind of mosaic."""
     looked = {kind: mosaics[kind] for kind in kinds}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
-    workers = config.workers or available_cores()
-    for _ in run_tasks(look, todo, workers=workers, setup=prepare_fit_process, settings=(config,), title="looking",
-                       unit="mosaic"):  # fmt: skip
-        pass
+    done = run_tasks(
+        look,
+        todo,
+        where=config.where,
+        setup=prepare_fit_process,
+        settings=(config,),
+        title="looking",
+        unit="mosaic",
+    )
+    for (kind, index), looks in done:
+        digest = mosaics[kind].digest(index)
+        if store.read(digest) is None:
+            store.write(digest, unpack_tensors(looks))
     prepare_worker()
     return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
 

@@ -108,6 +108,31 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
     return error_of(reliability(confidence, correct, bins))
 
 
+def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000, seed: int = 0) -> Tensor:
+    r"""Expected calibration errors of perfectly calibrated predictions, which are above 0 by chance.
+
+    The outcomes are drawn from the predicted probabilities (Bröcker and Smith, 2007, consistency resampling):
+
+    .. math:: y_i \sim \mathrm{Bernoulli}(p_i)
+
+    Args:
+        confidence: `(M,)`, predicted probabilities p.
+        bins: number of bins.
+        samples: number of draws of all outcomes.
+        seed: random seed of the outcomes.
+
+    Returns:
+        `(samples,)`, float64, the errors.
+
+    >>> errors_by_chance(torch.tensor([1.0, 0.0])).max()
+    tensor(0., dtype=torch.float64)
+    """
+    p = confidence.detach().to("cpu", torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(samples, len(p), generator=generator, dtype=torch.float64) < p
+    return torch.stack([calibration_error(p, outcome, bins) for outcome in drawn])
+
+
 def error_of(bins: Tensor) -> Tensor:
     """Expected calibration error from the sums of `reliability`.
 

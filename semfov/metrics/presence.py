@@ -1,6 +1,7 @@
 """Measures of deciding whether a target is present."""
 
 import math
+from bisect import bisect_right
 
 import torch
 from torch import Tensor
@@ -51,8 +52,10 @@ def threshold_for(absent: Tensor, share: float) -> float:
     True
     """
     check(len(absent) > 0, "absent", "at least one case without the target", "none")
-    allowed = int(share * len(absent))
-    if allowed >= len(absent):
+    count = len(absent)
+    # A product of floats can fall on the wrong side of a whole number: 0.29 · 100 is less than 29.
+    allowed = bisect_right(range(1, count + 1), share, key=lambda alarms: alarms / count)
+    if allowed >= count:
         return -math.inf
     order = absent.double().sort(descending=True).values
     return float(torch.nextafter(order[allowed], torch.tensor(torch.inf, dtype=torch.float64)))

@@ -14,6 +14,7 @@ from semfov.gaze.policies import Task
 from semfov.gaze.saliency.cells import Reduction
 from semfov.model_folder import ModelFolder
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers
+from semfov.runs.workers import Where
 from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
@@ -153,8 +154,8 @@ class BeliefConfig(Settings):
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected, with the miss rates of the observation model.
-        model: fitted observation model, by name or file (None: semfov's own model for the detector and growth; for the
-            published one, give the detector's name followed by `-published` or `-published-narrow`).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and sensor; for a
+            published sensor it is the published one, for others one of our own).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
         map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
         context: context that is added to the log odds of the target: `none`, the `place` where the class usually is,
@@ -275,9 +276,16 @@ class WorkConfig(OutcomeConfig):
         out: folder of the outcomes.
         cache: folder for what is stored, shared between runs (None: the user's cache).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     workers: Workers | None = None
+    scheduler: str | None = None
+
+    @property
+    def where(self) -> Where:
+        """Where the work is done."""
+        return self.workers if self.scheduler is None else self.scheduler
 
 
 @dataclass(frozen=True)
@@ -292,6 +300,7 @@ class LookingConfig(WorkConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
@@ -312,6 +321,7 @@ class ScenesConfig(LookingConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -329,6 +339,7 @@ class PoliciesConfig(LookingConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
@@ -357,6 +368,7 @@ class RunConfig(PoliciesConfig, ScenesConfig):
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).

@@ -8,6 +8,7 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.results import ResultRecord
@@ -77,12 +78,22 @@ class Looking(SceneRun):
         self.detections(index)
         return [], {}
 
+    def stored(self, index: int) -> bytes | None:
+        """The looks at a scene, which fits read."""
+        tensors = self.store.read(self.digest(index))
+        return None if tensors is None else pack_tensors(tensors)
+
+    def keep(self, index: int, stored: bytes) -> None:
+        """Store the looks at a scene, if this process does not see them."""
+        if self.store.read(self.digest(index)) is None:
+            self.store.write(self.digest(index), unpack_tensors(stored))
+
 
 def looking_of(config: Any) -> Looking:
     """Prepare the looks from every cell that a fit needs.
 
     Args:
-        config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
+        config: settings of the fit: data, detector, sensor, columns, rows, out, cache, workers and scheduler.
 
     Returns:
         The looks, none of which has been taken yet (`finish` takes them).
@@ -96,5 +107,6 @@ def looking_of(config: Any) -> Looking:
             out=config.out,
             cache=config.cache,
             workers=config.workers,
+            scheduler=config.scheduler,
         )
     )

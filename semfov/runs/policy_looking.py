@@ -54,6 +54,10 @@ class PolicyLooking(Looking):
             if name is not None
         }
 
+    def stored(self, index: int) -> bytes | None:
+        """Nothing: the records are all that a comparison needs."""
+        return None
+
     def candidate(self, name: str, index: int) -> Candidate:
         """The policy of this name in tables, for a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]

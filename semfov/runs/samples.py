@@ -19,13 +19,14 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
+from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.observation.matching import match
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import look_from
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes, prepare_worker
 from semfov.runs.store import SceneStore, looks_digest
-from semfov.runs.workers import available_cores, mine, run_tasks, wait_for_others
+from semfov.runs.workers import Where, run_tasks
 from semfov.zoom.eye import WindowEye
 
 
@@ -102,6 +103,10 @@ class Samples:
             scenes=torch.full((len(fixations),), index),
             fixations=fixations,
         )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name."""
+        return {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
     def join(cls, parts: list[Samples]) -> Samples:
@@ -232,7 +237,7 @@ class Sampler:
 
     def save(self, shard: int, samples: Samples) -> None:
         """Store the samples of a shard."""
-        self.store.write(self.digest(shard), {name: getattr(samples, name) for name in _NAMES})
+        self.store.write(self.digest(shard), samples.tensors())
 
     def scenes_of(self, shard: int) -> range:
         """The photographs of a shard."""
@@ -265,21 +270,19 @@ def _prepare(settings: SampleSettings, folder: Path) -> None:
     _process["sampler"] = settings.sampler(folder)
 
 
-def _run_shard(shard: int) -> int:
-    sampler = _process["sampler"]
-    sampler.save(shard, sampler.sample(shard))
-    return shard
+def _run_shard(shard: int) -> bytes:
+    return pack_tensors(_process["sampler"].sample(shard).tensors())
 
 
-def collect_samples(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
+def collect_samples(settings: SampleSettings, folder: Path, where: Where, title: str) -> tuple[Sampler, Samples]:
     """Collect the labelled detections of all photographs in order; finished shards are read, the others computed.
 
-    The result is the same to the last bit for any number of workers and ranks.
+    The result is the same to the last bit wherever the work is done, on processors of one kind.
 
     Args:
         settings: the settings of the samples.
         folder: folder of the shards.
-        workers: number of processes (None: one per CPU core).
+        where: where the work is done (`semfov.runs.workers.Where`).
         title: label of the progress bar.
 
     Returns:
@@ -289,19 +292,18 @@ def collect_samples(settings: SampleSettings, folder: Path, workers: int | None,
         DataError: the file of a shard is missing or damaged.
     """
     sampler = settings.sampler(folder)
-    todo = [shard for shard in mine(sampler.shards) if sampler.load(shard) is None]
+    todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
     done = run_tasks(
         _run_shard,
         todo,
-        workers=workers or available_cores(),
+        where=where,
         setup=_prepare,
         settings=(settings, folder),
         title=title,
         unit="shard",
     )
-    for _ in done:
-        pass
-    wait_for_others(sampler.shards, lambda shard: sampler.load(shard) is not None)
+    for shard, tensors in done:
+        sampler.save(shard, Samples(**unpack_tensors(tensors)))
     parts = []
     for shard in sampler.shards:
         part = sampler.load(shard)

@@ -20,11 +20,11 @@ from semfov.io.pretrained import Pretrained
 from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
-from semfov.runs.workers import available_cores, mine, rank, run_tasks, wait_for_others
+from semfov.runs.workers import run_tasks
 
 _log = logging.getLogger(__name__)
 
-_BESIDES = ("out", "cache", "store", "workers", "data", "detector")
+_BESIDES = ("out", "cache", "store", "workers", "scheduler", "data", "detector")
 
 
 class SceneRun(ABC):
@@ -85,6 +85,14 @@ class SceneRun(ABC):
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
 
+    def stored(self, index: int) -> bytes | None:
+        """What a worker has stored of a scene and the run needs later; None if that is nothing."""
+        return None
+
+    def keep(self, index: int, stored: bytes) -> None:
+        """Store what a worker has stored of a scene, if this process does not see it."""
+        raise NotImplementedError(f"{type(self).__name__} stores nothing of a scene")
+
 
 def store_folder(chosen: Path | None) -> Path:
     """Folder of the stores: the chosen one, or the user's cache."""
@@ -96,9 +104,14 @@ def store_folder(chosen: Path | None) -> Path:
 
 
 def finish(run: SceneRun, title: str) -> None:
-    """Run this rank's share of the scenes that are not finished yet, and wait for the other ranks."""
+    """Run the scenes that are not finished yet, and store their outcomes.
+
+    Args:
+        run: the run; its settings tell where the work is done.
+        title: label of the progress bar.
+    """
     results = run.results
-    todo = [index for index in mine(range(len(run.scenes))) if results.load(index) is None]
+    todo = [index for index in range(len(run.scenes)) if results.load(index) is None]
     older = results.by_other_code()
     if todo and older:
         _log.warning(
@@ -108,31 +121,18 @@ def finish(run: SceneRun, title: str) -> None:
             older,
         )
     done = run_tasks(
-        finish_scene,
+        outcomes_of,
         todo,
-        workers=run.config.workers or available_cores(),
+        where=run.config.where,
         setup=prepare_process,
         settings=(type(run), run.config),
         title=title,
         unit="scene",
     )
-    for _ in done:
-        pass
-    wait_for_others(range(len(run.scenes)), lambda index: results.load(index) is not None)
-
-
-def complete(run: SceneRun, title: str) -> list[ResultRecord] | None:
-    """Run all scenes that are not finished yet.
-
-    Args:
-        run: the run.
-        title: label of the progress bar.
-
-    Returns:
-        The records of all scenes; None in a process of torchrun that does not write the report.
-    """
-    finish(run, title)
-    return gather(run)[0] if rank() == 0 else None
+    for index, (records, seconds, stored) in done:
+        if stored is not None:
+            run.keep(index, stored)
+        results.save(index, records, seconds)
 
 
 def gather(run: SceneRun) -> tuple[list[ResultRecord], dict[str, float]]:
@@ -163,9 +163,7 @@ def prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
     _process["run"] = make(config)
 
 
-def finish_scene(index: int) -> int:
-    """Run all episodes of a scene and store their outcomes; returns the index of the scene."""
+def outcomes_of(index: int) -> tuple[list[ResultRecord], dict[str, float], bytes | None]:
+    """Run all episodes of a scene; returns their records, the seconds of each stage, and what was stored."""
     run = _process["run"]
-    records, seconds = run.outcomes(index)
-    run.results.save(index, records, seconds)
-    return index
+    return *run.outcomes(index), run.stored(index)

@@ -21,10 +21,10 @@ from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
-from semfov.presets import PUBLISHED_SENSORS
+from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
-from semfov.sensor import Foveation
+from semfov.sensor import Foveation, named_sensor
 from semfov.zoom.eye import WindowEye
 
 
@@ -163,9 +163,7 @@ def growth_of(eye: Eye) -> float:
 
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
-    if name is None:
-        name = shipped_model(FovealObservationModel, recommended_model(eye.detector.name, growth_of(eye)), "MODEL")
-    model = FovealObservationModel.from_pretrained(name)
+    model = FovealObservationModel.from_pretrained(observation_name(eye) if name is None else name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
@@ -180,11 +178,28 @@ def make_zoom_observation(name: str | None, eye: WindowEye) -> FovealObservation
     return model.requires_grad_(False)
 
 
-def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
-    """Name of the observation model fitted by maximum likelihood for detector and sensor; None if none is shipped."""
-    name = f"{detector.name}-{sensor.name}"
-    shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
-    return name if sensor.name in PUBLISHED_SENSORS and shipped else None
+def observation_name(eye: Eye) -> str:
+    """Name of the observation model that is shipped for an eye.
+
+    For a published sensor it is the model of `semfov.ActivePerception.published`, which is fitted by maximum
+    likelihood. For any other sensor it is the model of our own for the growth of its fovea.
+
+    Args:
+        eye: sensor and detector.
+
+    Returns:
+        The name of the model.
+
+    Raises:
+        InputError: no model is shipped for the eye.
+    """
+    detector, settings = eye.detector, eye.sensor.settings()
+    for sensor in PUBLISHED_SENSORS:
+        known = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()
+        name = published_model(detector.name, sensor, detector.selection.threshold)
+        if known and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
+            return name
+    return shipped_model(FovealObservationModel, recommended_model(detector.name, growth_of(eye)), "MODEL")
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:

@@ -1,4 +1,4 @@
-"""Runs tasks in several processes on this machine and, under torchrun, on several machines."""
+"""Runs tasks in this process, in processes of this machine, or in any executor, such as a cluster's."""
 
 import logging
 import multiprocessing
@@ -7,55 +7,35 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from itertools import islice
 from multiprocessing import resource_tracker
-from typing import TypeVar
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Generic, TypeVar
 
 from semfov.errors import SemfovError
+from semfov.io.code import package_digest
 from semfov.io.files import discard_unfinished
-from semfov.runs.progress import task_bar
-
-_log = logging.getLogger(__name__)
+from semfov.runs.cluster import ClusterLost, open_cluster
+from semfov.runs.progress import Bar, task_bar
 
 _Task = TypeVar("_Task")
 Result = TypeVar("Result")
 
+Where = int | str | Executor | None
+"""Where tasks run: in so many processes of this machine (1: in this one; None: one for each CPU core), on the workers
+of the Dask scheduler with this address, or in an executor."""
 
-def rank() -> int:
-    """Number of this process among those that torchrun started, 0 without torchrun."""
-    return int(os.environ.get("RANK", "0"))
+OUTSTANDING = 256
+"""Number of tasks that an executor is given at once; the others wait here, so that memory does not grow with them."""
 
+_PATIENCE = 5
+"""Number of times that a cluster may be lost before its tasks count as failed."""
 
-def world() -> int:
-    """Number of processes that torchrun started, 1 without torchrun."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
-
-
-def mine(tasks: Sequence[_Task]) -> list[_Task]:
-    """The tasks of this rank: every `world`-th."""
-    return list(tasks[rank() :: world()])
-
-
-def wait_for_others(tasks: Sequence[_Task], finished: Callable[[_Task], bool], *, seconds: float = 1.0) -> None:
-    """Wait until the tasks of all ranks are finished, however long that takes; without torchrun return at once.
-
-    The ranks communicate only through the results in their shared folder. (torchrun ends all ranks when one fails.)
-
-    Args:
-        tasks: the tasks of all ranks.
-        finished: whether the result of a task exists.
-        seconds: time between two checks of the folder.
-    """
-    if world() == 1:
-        return
-    left = [task for task in tasks if not finished(task)]
-    if left:
-        _log.info("waiting for %d tasks of other ranks", len(left))
-    while left:
-        time.sleep(seconds)
-        left = [task for task in left if not finished(task)]
+_log = logging.getLogger(__name__)
 
 
 def available_cores() -> int:
@@ -67,57 +47,157 @@ def run_tasks(
     function: Callable[[_Task], Result],
     tasks: Sequence[_Task],
     *,
-    workers: int,
+    where: Where,
     setup: Callable[..., None],
     settings: tuple[object, ...],
     title: str,
     unit: str,
-) -> Iterator[Result]:
-    """Run `function(task)` for every task, and yield the results in any order, with a progress bar.
+) -> Iterator[tuple[_Task, Result]]:
+    """Run `function(task)` for every task, and yield tasks and results in any order, with a progress bar.
+
+    Results come back to this process, which stores them: workers need not see its folders.
 
     Args:
         function: a module-level function; it reads the globals that `setup` has set in its module.
         tasks: the tasks.
-        workers: number of processes; 1 runs all tasks in this process.
+        where: number of processes, address of a Dask scheduler, or an executor (`Where`). The workers of an executor
+            have the same version of this package; an executor that is given stays open.
         setup: called once in each process with `settings`, before its first task.
         settings: arguments of `setup`.
         title: label of the progress bar.
         unit: name of a task in the progress bar.
 
     Yields:
-        The results, as tasks finish.
+        Each task with its result, as tasks finish.
 
     Raises:
-        SemfovError: a process died. An error of a task is raised unchanged. Either error ends all processes.
+        InputError: there is no scheduler at the address.
+        SemfovError: a process died, or a cluster was lost. An error of a task is raised unchanged. All of them end the
+            processes that were started here.
     """
     if not tasks:
         return
-    with closing(task_bar(len(tasks), title, unit, hidden=rank() > 0)) as bar:
-        if workers <= 1 or len(tasks) == 1:
-            setup(*settings)
-            for task in tasks:
-                yield function(task)
-                bar.update()
-            return
-        before = multiprocessing.active_children()
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(workers, len(tasks)), context, _prepare, (setup, settings)) as pool:
-            try:
-                with _deaf_children():
-                    submitted = [pool.submit(function, task) for task in tasks]
-                for done in as_completed(submitted):
-                    yield done.result()
+    processes = available_cores() if where is None else where
+    with closing(task_bar(len(tasks), title, unit)) as bar:
+        if isinstance(processes, int):
+            if processes <= 1 or len(tasks) == 1:
+                setup(*settings)
+                for task in tasks:
+                    yield task, function(task)
                     bar.update()
-            except BaseException as error:
-                # Running tasks may be killed: their files are written atomically, either completely or not at all.
-                for child in set(multiprocessing.active_children()) - set(before):
-                    child.terminate()
-                if not isinstance(error, BrokenProcessPool):
-                    raise
-                raise SemfovError(
-                    f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
-                    "continues where this one stopped, or add --workers 1 to use a single process"
-                ) from None
+            else:
+                yield from _in_processes(function, tasks, processes, (setup, settings), title, bar)
+            return
+        job = _Job(function, setup, settings, package_digest())
+        if isinstance(processes, Executor):
+            yield from _results(processes, job, tasks, bar)
+        else:
+            yield from _on_cluster(processes, job, tasks, title, bar)
+
+
+class _Job(Generic[_Task, Result]):
+    """A function with its setup, for workers that no initializer prepares."""
+
+    def __init__(
+        self, function: Callable[[_Task], Result], setup: Callable[..., None], settings: tuple[object, ...], code: str
+    ) -> None:
+        self.function, self.setup, self.settings, self.code = function, setup, settings, code
+        self.folder = Path.cwd()
+
+    def __call__(self, task: _Task) -> Result:
+        """Prepare the process unless its last task has, and run the task; threads of a worker take turns."""
+        with _turn:
+            if package_digest() != self.code:
+                raise SemfovError("a worker has another version of semfov; install the same version on all machines")
+            wanted = (self.setup, self.settings)
+            if _ready != [wanted]:
+                _ready.clear()
+                if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
+                    os.chdir(self.folder)
+                self.setup(*self.settings)
+                _ready.append(wanted)
+            return self.function(task)
+
+
+_turn = threading.Lock()
+_ready: list[tuple[Callable[..., None], tuple[object, ...]]] = []
+"""The setup that this process has had."""
+
+
+def _results(
+    executor: Executor,
+    function: Callable[[_Task], Result],
+    tasks: Sequence[_Task],
+    bar: Bar,
+    starting: AbstractContextManager[object] | None = None,
+) -> Iterator[tuple[_Task, Result]]:
+    """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish."""
+    finished: SimpleQueue[Future[Result]] = SimpleQueue()
+    running: dict[Future[Result], _Task] = {}
+    waiting = iter(tasks)
+
+    def submit(number: int) -> None:
+        for task in islice(waiting, number):
+            future = executor.submit(function, task)
+            running[future] = task
+            future.add_done_callback(finished.put)
+
+    try:
+        with starting or nullcontext():
+            submit(OUTSTANDING)
+        while running:
+            done = finished.get()
+            yield running.pop(done), done.result()
+            bar.update()
+            submit(1)
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _in_processes(
+    function: Callable[[_Task], Result],
+    tasks: Sequence[_Task],
+    processes: int,
+    preparation: tuple[Callable[..., None], tuple[object, ...]],
+    title: str,
+    bar: Bar,
+) -> Iterator[tuple[_Task, Result]]:
+    before = multiprocessing.active_children()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(tasks)), context, _prepare, preparation) as pool:
+        try:
+            yield from _results(pool, function, tasks, bar, _deaf_children())
+        except BaseException as error:
+            # Running tasks may be killed: their files are written atomically, either completely or not at all.
+            for child in set(multiprocessing.active_children()) - set(before):
+                child.terminate()
+            if not isinstance(error, BrokenProcessPool):
+                raise
+            raise SemfovError(
+                f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
+                "continues where this one stopped, or add --workers 1 to use a single process"
+            ) from None
+
+
+def _on_cluster(
+    address: str, job: Callable[[_Task], Result], tasks: Sequence[_Task], title: str, bar: Bar
+) -> Iterator[tuple[_Task, Result]]:
+    """Run tasks on a cluster; those that were lost with its scheduler are given to the next one at the same address."""
+    left = dict.fromkeys(tasks)
+    for attempt in range(_PATIENCE):
+        try:
+            with open_cluster(address, again=attempt > 0) as executor:
+                for task, result in _results(executor, job, [*left], bar):
+                    yield task, result
+                    del left[task]
+            return
+        except ClusterLost as error:
+            _log.warning("%s: %s; waiting for a scheduler at %s, %d tasks are left", title, error, address, len(left))
+    raise SemfovError(
+        f"{title}: the scheduler at {address} was lost {_PATIENCE} times; run the same command again, and it continues "
+        "where this one stopped"
+    )
 
 
 @contextmanager

@@ -18,10 +18,10 @@ from semfov.runs.tables import mean_or_dash, share
 POLICIES = [
     "target-evidence",
     "random gaze",
-    "published belief",
-    "published belief, a detection at the gaze",
+    "calibrated belief",
+    "calibrated belief, a detection at the gaze",
 ]
-SHARP = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
+REFERENCES = ["one sharp look, highest score", "sharp look and its quarters, highest score", "class frequency"]
 
 
 def rows_of(text):
@@ -71,7 +71,8 @@ def test_run_writes_table_and_records(finished):
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
     places, lands = [*POLICIES, "one sharp look"], POLICIES
-    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *places, *lands]
+    compared = ["difference to target-evidence", *POLICIES[1:], *REFERENCES]
+    assert [row[0] for row in rows] == [*POLICIES, *REFERENCES, *places, *compared, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
     assert "4 searches" in text
     assert "2 of them for a present class" in text
@@ -79,12 +80,12 @@ def test_run_writes_table_and_records(finished):
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])
         there = torch.tensor([record["present"] for record in group])
-        assert row[1] == f"{area_under_roc(score, there):.3f}"
+        assert row[1].startswith(f"{area_under_roc(score, there):.3f} ± ")
 
 
 def record(policy, present, outcome, probability, looks, **more):
     base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
-    base |= {"place": None, "closer": 0}
+    base |= {"place": None, "closer": 0, "scene": 1, "frequency": 1 - probability}
     base |= {"sharp": probability / 2, "tiled": probability / 4}
     return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
         base | more
@@ -125,21 +126,32 @@ def test_table_matches_hand_calculations():
     text = decision_summary([*first, *second], "sensed")
     assert "Closer looks" not in text
     assert "6 searches (sensed), 4 of them for a present class." in text
-    area, other, sharp, tiled, a, b, look, landed, nowhere = rows_of(text)
+    area, other, sharp, tiled, frequency, a, b, look, *differences, landed, nowhere = rows_of(text)
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
+    assert hits == ["25", "25", "25"]
+    # One scene: all samples are the same.
+    hits = [f"{each} ({each} to {each})" for each in hits]
     # 5 of 8 pairs are in order: 0.9 is above both absent targets, the other scores are above only the lower one.
     # Of 15 bins, 0.8 and 0.85 share one, in which half of the targets are there; the others are alone.
-    assert area == ["a", "0.625", *hits, f"{(0.1 + 2 * (0.825 - 0.5) + 0.7 + 0.4 + 0.1) / 6:.3f}"]
-    assert hits == ["25", "25", "25"]
-    # All in one bin: 0.5 for a share of 4 in 6.
-    assert other == ["b", "0.500", "0", "0", "0", "0.167"]
-    assert sharp == [SHARP[0], "0.625", *hits, "-"]
-    assert tiled == [SHARP[1], "0.625", *hits, "-"]
-    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "80.0", "0.50"]
+    ece = f"{(0.1 + 2 * (0.825 - 0.5) + 0.7 + 0.4 + 0.1) / 6:.3f}"
+    assert area[:-1] == ["a", "0.625 ± 0.000", *hits, ece]
+    # All in one bin: 0.5 for a share of 4 in 6. By chance N of 6 come true with the odds of six coins, |N - 3| / 6.
+    assert other[:-1] == ["b", "0.500 ± 0.000", *["0 (0 to 0)"] * 3, "0.167"]
+    mean, limit = other[-1].split(", to ")
+    assert float(mean) == pytest.approx((2 * 3 + 12 * 2 + 30 * 1) / 64 / 6, abs=0.01)
+    assert limit == f"{2 / 6:.3f}"
+    assert sharp == [REFERENCES[0], "0.625 ± 0.000", *hits, "-", "-"]
+    assert tiled == [REFERENCES[1], "0.625 ± 0.000", *hits, "-", "-"]
+    assert frequency[:2] == [REFERENCES[2], "0.375 ± 0.000"]
+    place = "33.3 (33.3 to 33.3)"
+    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", place, "80.0", "0.50"]
     assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
-    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", "33.3", "-", "0.30"]
+    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", place, "-", "0.30"]
+    assert [row[0] for row in differences] == ["difference to a", "b", *REFERENCES]
+    assert differences[1][1:] == ["-0.125 ± 0.000", *["-25 (-25 to -25)"] * 3, "-"]
+    assert differences[2][1:] == ["+0.000 ± 0.000", *["+0 (+0 to +0)"] * 3, "+0.0 (+0.0 to +0.0)"]
     assert landed == ["a", "3", "0.300 → 0.600", "2", "0.300 → 0.850", "1", "0.300 → 0.100"]
     assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 

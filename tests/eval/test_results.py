@@ -1,6 +1,7 @@
 """The pages of results: tables from the files of runs, and paired differences."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from eval.page.curves import behind
 from eval.page.experiments import ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
+from eval.page.origin import missing, origin
 from eval.page.tables import agreement, paired
-from eval.results import PLACE, TABLES, WHOLE, fill_line, fill_page, results
+from eval.results import PLACE, WHOLE, fill_page, page_table, results
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.config import SensorConfig
@@ -22,8 +24,13 @@ from semfov.runs.presets import label
 ROOT = Path(__file__).parents[2]
 
 
-def write_records(folder, records):
+def write_manifest(folder, commit="1a2b3c4d" * 5, date="2026-11-23", scenes=6):
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "manifest.json").write_text(json.dumps({"commit": commit, "date": date, "scenes": scenes}))
+
+
+def write_records(folder, records):
+    write_manifest(folder)
     shown = (
         "| policy | CP@1 | CP@5 | CP@10 | CP@15 | CP@30 |\n|---|---|---|---|---|---|\n| random | 1 | 2 | 3 | 4 | 5 |\n"
     )
@@ -47,6 +54,10 @@ def searches(policies, found_at):
         for scene in range(6)
         for repetition in range(4)
     ]
+
+
+def lines_of(name, runs):
+    return page_table(name, runs).make(runs)
 
 
 def cells_of(row):
@@ -106,21 +117,38 @@ def place(name, content="anything"):
     return f"<!-- table {name} -->\n\n{content}\n\n<!-- end -->"
 
 
-def test_tables_of_a_page_are_replaced_and_its_text_stays(searched):
+def test_tables_of_runs_are_renewed_and_the_rest_of_the_page_stays(searched):
     runs, _ = searched
     page = "before\n{}\nbetween\n{}\nafter\n"
-    text = fill_page(page.format(place("beyond-search-tiny search"), place("explore-published-nano explore", "")), runs)
+    others = [place("explore-published-nano explore -- 7654321, 2026-11-01, 300 photographs"), place("sensitivity")]
+    other = "\n".join([*others, place("findings")])
+    text, kept = fill_page(page.format(place("beyond-search-tiny search"), other), runs)
     shown = ["| policy | CP@1 | CP@5 | CP@15 | CP@30 |", "|--------|------|------|-------|-------|"]
     table = "\n".join([*shown, "| random | 1    | 2    | 4     | 5     |"])
-    missing = place("explore-published-nano explore", "*Not run yet.*")
-    assert text == page.format(place("beyond-search-tiny search", table), missing)
-    assert fill_page(text, runs) == text
+    renewed = place("beyond-search-tiny search -- 1a2b3c4, 2026-11-23, 6 photographs", table)
+    assert text == page.format(renewed, other)
+    assert kept == ["explore-published-nano explore", "sensitivity", "findings"]
+    assert fill_page(text, runs) == (text, kept)
 
 
-def test_tables_of_experiments_that_have_not_run_say_so(runs):
-    assert "\n".join(fill_line("sensitivity", runs)).count("not run yet") > 50
-    assert "\n".join(fill_line("explore-sensor", runs)).count("not run yet") == 6 * 2 * 7
-    assert "\n".join(fill_line("paper", runs)).count("not run yet") == 6 * 4 * 4
+def test_a_table_of_several_experiments_waits_for_all_of_them(runs):
+    for made in WHOLE.values():
+        assert missing(made.made_of, runs) == list(made.made_of) != []
+    study = page_table("sensitivity", runs).made_of
+    for name in study[1:]:
+        write_manifest(runs[name].out)
+    assert missing(study, runs) == ["sensitivity as published"]
+    measured = {name: run for name, run in runs.items() if " " not in name}
+    assert missing(study, measured) == list(study), "without a fit set no study runs"
+
+
+def test_the_origin_of_a_table_names_every_commit_day_and_number_of_photographs(tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    write_manifest(folders[0])
+    write_manifest(folders[1], "7" * 40 + "+", "2026-11-24")
+    write_manifest(folders[2], None)
+    assert origin(folders[:1]) == "1a2b3c4, 2026-11-23, 6 photographs"
+    assert origin(folders) == "1a2b3c4 and 7777777+ and no commit, 2026-11-23 and 2026-11-24, 6 photographs"
 
 
 def test_unknown_tables_are_refused(runs):
@@ -134,13 +162,13 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
     """Tables are chosen by their number in the file, without the prose around them."""
     heads = "| looks | cells | belief | NLL | ECE | mean probability | share that hold it |"
     for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
-        runs[name].out.mkdir(parents=True)
+        write_manifest(runs[name].out)
         parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
-    for number, kind in enumerate(("presence", "decisions", "landings")):
-        assert fill_line(f"decide-tiny {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
+    for number, kind in enumerate(("presence", "decisions", "differences", "landings")):
+        assert lines_of(f"decide-tiny {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
     for number, kind in enumerate(("by-looks", "by-distance")):
-        rows = [cells_of(row) for row in fill_line(f"beliefs-nano {kind}", runs)]
+        rows = [cells_of(row) for row in lines_of(f"beliefs-nano {kind}", runs)]
         assert rows[0] == ["looks", "belief", "NLL", "ECE", "mean probability", "share that hold it"]
         assert rows[2] == [str(number), *"xxxxx"]
 
@@ -158,25 +186,26 @@ def test_every_table_of_the_pages_can_be_filled(page, runs):
     text = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
     assert text.count("<!--") == 2 * len(PLACE.findall(text))
     for found in PLACE.finditer(text):
-        name, _, kind = found[2].partition(" ")
-        assert name in WHOLE or not kind or (name in runs and kind in TABLES), found[2]
-        _, comment, empty, *rows = ["", *found[0].splitlines()]
-        assert (comment, empty) == (found[1], "")
+        assert set(page_table(found["name"], runs).made_of) <= runs.keys()
+        assert re.fullmatch(r"[0-9a-f]{7}.*, 2\d{3}-\d\d-\d\d.*, \d+ photographs", found["origin"]), found["name"]
+        comment, empty, *rows = found[0].splitlines()
+        assert (comment, empty) == (f"<!-- table {found['name']} -- {found['origin']} -->", "")
         assert len(rows) > 4
-        assert all(row.startswith("|") for row in rows[:-2]), found[2]
+        assert all(row.startswith("|") for row in rows[:-2]), found["name"]
 
 
 def test_no_table_is_on_both_pages():
     names = [
-        name for page in ("results", "tables") for _, name in PLACE.findall((ROOT / f"docs/{page}.md").read_text())
+        name for page in ("results", "tables") for name, _ in PLACE.findall((ROOT / f"docs/{page}.md").read_text())
     ]
     assert len(set(names)) == len(names) > 30
 
 
-def test_one_command_writes_both_pages(runs, tmp_path):
+def test_one_command_writes_both_pages_and_says_which_tables_it_renewed(searched, tmp_path, capsys):
+    runs, _ = searched
     pages = [tmp_path / f"{name}.md" for name in ("results", "tables")]
     for page in pages:
-        page.write_text(f"{page}\n{place('paper')}\n")
+        page.write_text(f"{page}\n{place('paper')}\n{place('beyond-search-tiny search')}\n")
     config = ResultsConfig(
         root=tmp_path,
         annotations=tmp_path / "a.json",
@@ -187,8 +216,13 @@ def test_one_command_writes_both_pages(runs, tmp_path):
         out=tmp_path / "out",
     )
     results(config)
+    rows = "\n".join(lines_of("beyond-search-tiny search", runs))
+    table = place("beyond-search-tiny search -- 1a2b3c4, 2026-11-23, 6 photographs", rows)
     for page in pages:
-        assert page.read_text() == fill_page(f"{page}\n{place('paper')}\n", runs)
+        assert page.read_text() == f"{page}\n{place('paper')}\n{table}\n"
+    told = capsys.readouterr().out
+    assert "renewed: beyond-search-tiny search, beyond-search-tiny search\n" in told
+    assert "have not run: paper, paper, prediction_and_calibration.png, search_baselines.png" in told
     pages[1].unlink()
     with pytest.raises(DataError, match=r"tables\.md cannot be read"):
         results(config)
@@ -217,8 +251,9 @@ def test_a_policy_is_behind_by_more_than_two_standard_errors():
 def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
     records = searches(tuple(paper.TABLE_II | paper.TABLE_I), lambda policy, scene, _: found.get((policy, scene), 1))
-    write_records(runs["search-published-nano"].out, records)
-    rows = [cells_of(row) for row in fill_line("paper", runs)]
+    for name in page_table("paper", runs).made_of:
+        write_records(runs[name].out, records)
+    rows = [cells_of(row) for row in lines_of("paper", runs)]
     assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
     # The target of one of the three even scenes is found within 5 and 15 gaze shifts, of two within 30.
     assert rows[2][:4] == ["random", "CP@5", "45.20", "33.3 ± 33.3"]
@@ -257,16 +292,19 @@ def test_agreement_compares_policies_episode_by_episode(tmp_path):
 
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     right = {"random-raw": (1, 2), "closer-look-learned": (3, 4)}
-    records = [
-        {"policy": policy, "scene": scene, "right": [counts[scene]] * 21, "object_cells": 4}
-        for policy, counts in right.items()
-        for scene in (0, 1)
-    ]
-    write_records(runs["explore-sensor fovea 50 px, growth 1"].out, records)
-    rows = [cells_of(row) for row in fill_line("explore-sensor", runs)]
+    for name in page_table("explore-sensor", runs).made_of:
+        more = int("200" in name)
+        records = [
+            {"policy": policy, "scene": scene, "right": [counts[scene] + more] * 21, "object_cells": 5}
+            for policy, counts in right.items()
+            for scene in (0, 1)
+        ]
+        write_records(runs[name].out, records)
+    rows = [cells_of(row) for row in lines_of("explore-sensor", runs)]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
-    assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
-    assert rows[3][1:3] == ["closer-look-learned", "87.5 ± 12.5"]
+    assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "30.0 ± 10.0"]
+    assert rows[3][1:3] == ["closer-look-learned", "70.0 ± 10.0"]
+    assert rows[-1][:3] == ["fovea 200 px, growth 2", "closer-look-learned", "90.0 ± 10.0"]
     assert len(rows) == 2 + 6 * 2
 
 

@@ -21,9 +21,9 @@ from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, Protoco
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_eye, published_model
+from semfov.runs.setup import make_eye
 
-BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
+BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 
 
 def write_models(folder):
@@ -59,7 +59,7 @@ def probabilities_along(run, target, path, detections, grid):
     model = FovealObservationModel.from_pretrained("yolov3-tiny")
     observers = {
         "raw": Semantic(81),
-        "published": Semantic(81, model),
+        "calibrated": Semantic(81, model),
         "tempered": Semantic(81, tempering=0.5),
         "learned": Target(run.models.evidence),
         "learned map": LearnedMap(run.models.map),
@@ -160,13 +160,6 @@ def test_scenes_without_a_searchable_class_are_reported(config, tmp_path):
     finish(empty, "believing")
     with pytest.raises(DataError, match="raise target_area"):
         write_belief_report(empty)
-
-
-def test_the_published_belief_uses_the_model_of_its_sensor():
-    known, other = DetectorConfig("yolox-nano"), DetectorConfig("yolov3")
-    assert published_model(known, SensorConfig("published-narrow")) == "yolox-nano-published-narrow"
-    assert published_model(known, SensorConfig("gradual")) is None
-    assert published_model(other, SensorConfig("published")) is None
 
 
 def cells(*pairs):

@@ -25,7 +25,7 @@ from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_eye
 
 AT = Thresholds(0.5, 0.375)
-PUBLISHED = ["published belief", "published belief, a detection at the gaze"]
+FUSED = ["calibrated belief", "calibrated belief, a detection at the gaze"]
 
 
 def write_evidence(path, thresholds, seed=2):
@@ -88,7 +88,7 @@ def test_quarters_cover_every_pixel_once():
 @pytest.mark.weights
 def test_a_run_compares_gaze_and_beliefs_at_the_given_thresholds(config):
     run = DecisionRun(replace(config, confirm=0.6))
-    assert list(run.compared) == ["target-evidence", "random gaze", *PUBLISHED]
+    assert list(run.compared) == ["target-evidence", "random gaze", *FUSED]
     assert run.thresholds == Thresholds(0.6, AT.give_up)
 
 
@@ -112,7 +112,7 @@ def test_records_match_searches_run_step_by_step(run):
         annotation, grid, scene = run.scenes.annotation(index), run.grid(index), run.scenes.ids[index]
         targets = choose_classes(run.scenes, index, annotation, 1, 0.5, 0)
         assert [(r["target"], r["policy"]) for r in records] == [
-            (target, policy) for target in targets for policy in ("target-evidence", "random gaze", *PUBLISHED)
+            (target, policy) for target in targets for policy in ("target-evidence", "random gaze", *FUSED)
         ]
         assert [r["present"] for r in records] == [True] * 4 + [False] * 4
         detections, sharp = run.detections(index), run.eye.detector(run.scenes[index].image[None])
@@ -128,8 +128,8 @@ def test_records_match_searches_run_step_by_step(run):
             start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
             noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
             acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
-            observer, at_the_gaze = Target(evidence), record["policy"] == PUBLISHED[1]
-            if record["policy"] in PUBLISHED:
+            observer, at_the_gaze = Target(evidence), record["policy"] == FUSED[1]
+            if record["policy"] in FUSED:
                 model = run.models.observation
                 observer, acquisition = Semantic(81, model), Predictive(model)(target, grid)
             looks = StoredLooks(detections, grid, torch.tensor([target]))

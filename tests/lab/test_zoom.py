@@ -10,7 +10,10 @@ import torch
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
 from eval.zoom.numbers import number_table
-from eval.zoom.run import ZoomConfig, ZoomRun
+from eval.zoom.report import recall_and_precision, recall_cells
+from eval.zoom.run import ZoomConfig, ZoomRun, right_boxes
+from semfov.data.scene import Annotation
+from semfov.detection.objects import Objects
 from semfov.runs.config import DataConfig
 from semfov.runs.zoom_orders import in_order, quad_tree, shuffled
 from semfov.zoom import GlimpseEvidence
@@ -112,6 +115,7 @@ def test_numbers_of_objects_match_hand_calculations():
 def test_tables_of_decisions_match_hand_calculations():
     """Two searches for a target that is present and two for one that is absent."""
     common = {"measure": "decision", "way": "ours", "count": 17, "overview": 0.1, "slices": 0.2}
+    common |= {"scene": 3, "frequency": 0.3}
     records = [
         common | {"present": there, "outcome": outcome, "probability": p, "passes": passes, "overlap": overlap}
         for there, outcome, p, passes, overlap in (
@@ -124,23 +128,57 @@ def test_tables_of_decisions_match_hand_calculations():
     text = "\n".join(decision_tables(records))
     cells = {
         row[1].strip(): [cell.strip() for cell in row[2:-1]]
-        for row in (line.split("|") for line in text.splitlines())
+        for row in (line.split("|") for line in reversed(text.splitlines()))
         if len(row) > 3
     }
-    assert cells["it is there"] == ["100.0", "50.0", "0.0", "0.0", "4.0", "0.90"]
+    assert cells["it is there"] == ["100.0", "50.0 (50.0 to 50.0)", "0.0", "0.0", "4.0", "0.90"]
     assert cells["it is not"][:5] == ["0.0", "", "50.0", "50.0", "17.0"]
-    assert cells["ours"][:2] == ["10.5", "1.000"]
-    assert cells["all slices, highest score"][:2] == ["17.0", "0.500"]
+    assert cells["ours"][:2] == ["10.5", "1.000 ± 0.000"]
+    assert cells["all slices, highest score"][:2] == ["17.0", "0.500 ± 0.000"]
+    assert cells["class frequency"][:2] == ["-", "0.500 ± 0.000"]
     # With closer looks, one of the finds is absent.
     changed = [record | {"way": "ours, without closer looks"} for record in records]
     records[0] = records[0] | {"outcome": "absent", "overlap": None, "probability": 0.3}
     text = "\n".join(decision_tables([each for pair in zip(records, changed, strict=True) for each in pair]))
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.count("|") > 3]
-    rows = {line[0]: line[1:] for line in lines}
-    assert rows["it is there"] == ["50.0", "0.0", "50.0", "0.0", "4.0", "0.57"]
+    rows = {line[0]: line[1:] for line in reversed(lines)}
+    assert rows["it is there"] == ["50.0", "0.0 (0.0 to 0.0)", "50.0", "0.0", "4.0", "0.57"]
     assert rows["it is there, without closer looks"] == cells["it is there"]
     assert rows["ours, without closer looks"] == cells["ours"]
-    assert float(rows["ours"][1]) == 0.75
+    assert rows["ours"][1] == "0.750 ± 0.000"
+    start = next(number for number, line in enumerate(lines) if line[0] == "difference to ours")
+    name, area, *hits, right = lines[start + 2]
+    assert (name, area) == ("ours, without closer looks", "+0.250 ± 0.000")
+    assert hits == ["+50 (+50 to +50)"] * 3
+    assert right == "+50.0 (+50.0 to +50.0)"
+
+
+def test_recall_and_precision_are_shares_of_all_objects_and_boxes():
+    """Of two pictures, one of them drawn twice."""
+
+    def record(objects, found, boxes, right):
+        return {"objects": objects, "found": found, "boxes": boxes, "right": right}
+
+    finding = {
+        "ours": [record(4, [1, 2, 3], 5, 3), record(2, [0, 1], 1, 1)],
+        "nothing": [record(4, [0], 0, 0), record(2, [0], 0, 0)],
+    }
+    for drawn, expected in (([0, 1], [1 / 6, 4 / 6, 4 / 6]), ([1, 0, 1], [1 / 8, 5 / 8, 5 / 7])):
+        got = recall_and_precision(finding, [1, 3], torch.tensor(drawn))
+        assert got[0].tolist() == pytest.approx(expected)
+        assert got[1, :2].tolist() == [0, 0]
+        assert got[1, 2].isnan()
+    assert recall_cells(got[1], got[0], "+") == (["+0.000 ± 0.125", "+0.000 ± 0.625"], "-")
+
+
+def test_a_right_box_shows_an_object_of_its_class_that_no_better_box_shows():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60], [0, 0, 10, 10], [80, 80, 90, 90]])
+    labels, looks = torch.tensor([1, 1, 1, 2, 1]), torch.zeros(5, dtype=torch.long)
+    objects = Objects(boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), labels, looks)
+    there = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60], [80, 80, 90, 90]])
+    annotation = Annotation(there, torch.tensor([1, 1, 2]), torch.zeros(3, dtype=torch.bool), (100, 100))
+    assert right_boxes(objects, annotation) == 2
+    assert right_boxes(Objects.none(), annotation) == 0
 
 
 def test_orders_look_at_every_slice_once(config):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.errors import InputError
-from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
+from semfov.metrics.calibration import BinarySums, calibration, calibration_error, errors_by_chance, reliability
 
 
 def ece_by_loop(confidence, correct, bins):
@@ -174,3 +174,17 @@ def test_edges_between_bins_are_exact_in_double_precision():
     for p in (edges, torch.nextafter(edges, torch.zeros_like(edges))):
         assert reliability(p, p > 0.5)[0].tolist() == [1] * 14 + [0]
     assert reliability(torch.nextafter(edges, torch.ones_like(edges)), edges > 0.5)[0].tolist() == [0] + [1] * 14
+
+
+def test_errors_by_chance_are_those_of_every_possible_outcome():
+    """The mean over all outcomes of four predictions, each weighted by its probability."""
+    p = torch.tensor([0.1, 0.35, 0.38, 0.9], dtype=torch.float64)
+    expected = 0.0
+    for number in range(16):
+        outcome = torch.tensor([bool(number >> bit & 1) for bit in range(4)])
+        weight = float(torch.where(outcome, p, 1 - p).prod())
+        expected += weight * ece_by_loop(p.tolist(), outcome.tolist(), 5)
+    drawn = errors_by_chance(p, 5, samples=20_000)
+    assert float(drawn.mean()) == pytest.approx(expected, abs=3 * float(drawn.std()) / 20_000**0.5)
+    assert torch.equal(drawn[:9], errors_by_chance(p, 5, samples=20_000)[:9])
+    assert len(errors_by_chance(p, samples=7, seed=1)) == 7

@@ -1,6 +1,7 @@
 """Metrics of deciding whether a target is present, against scipy and against trying every threshold."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -72,16 +73,27 @@ def test_threshold_is_the_smallest_that_keeps_the_allowed_false_alarms(misses, s
     def alarms(threshold):
         return sum(value >= threshold for value in misses)
 
-    assert alarms(got) <= share * len(misses)
+    assert alarms(got) / len(misses) <= share
     # The next smaller number gives too many false alarms.
-    assert alarms(math.nextafter(got, -math.inf)) > int(share * len(misses))
+    assert alarms(math.nextafter(got, -math.inf)) / len(misses) > share
+
+
+def test_the_allowed_false_alarms_are_those_of_exact_fractions():
+    """As many as the decimal share of all cases, also where the product of floats is below a whole number."""
+    assert 0.29 * 100 < 29
+    for count in range(1, 130):
+        misses = torch.arange(count, dtype=torch.float64)
+        for percent in (0, 1, 2, 5, 7, 29, 57, 58, 99):
+            allowed = Fraction(percent, 100) * count // 1
+            assert int((misses >= threshold_for(misses, percent / 100)).sum()) == allowed
+        for alarms in range(count):
+            assert int((misses >= threshold_for(misses, alarms / count)).sum()) == alarms
 
 
 @given(scores, scores, shares)
 def test_hits_equal_trying_every_threshold(hits, misses, share):
-    allowed = int(share * len(misses))
     candidates = [*hits, *misses, 2.0]
-    passing = [t for t in candidates if sum(m >= t for m in misses) <= allowed]
+    passing = [t for t in candidates if sum(m >= t for m in misses) / len(misses) <= share]
     expected = max(sum(h >= t for h in hits) for t in passing) / len(hits)
     assert hits_at(*cases(hits, misses), share) == pytest.approx(expected, abs=1e-12)
 

@@ -1,4 +1,4 @@
-"""Processes: workers end with the process that started them, and ranks wait for each other."""
+"""Processes: workers end with the process that started them."""
 
 import os
 import signal
@@ -9,8 +9,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-
-from semfov.runs.workers import mine, wait_for_others
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -43,7 +41,7 @@ def work(task):
 
 def main(config):
     for _ in run_tasks(
-        work, [0, 1, 2], workers=2, setup=setup, settings=(config.folder,), title="sleeping", unit="nap"
+        work, [0, 1, 2], where=2, setup=setup, settings=(config.folder,), title="sleeping", unit="nap"
     ):
         pass
 
@@ -131,38 +129,6 @@ def test_an_early_interrupt_prints_no_traceback(tmp_path, module, seconds):
     assert process.returncode == 130, error
     assert "Traceback" not in error
     assert "interrupted" in error.splitlines()[-1]
-
-
-RANK = """
-import sys, time
-from pathlib import Path
-from semfov.runs.workers import mine, rank, wait_for_others
-from semfov.io.files import write_text
-
-folder, slow = Path(sys.argv[1]), float(sys.argv[2])
-for task in mine(range(4)):
-    time.sleep(slow * rank())
-    write_text(folder / str(task), "done")
-wait_for_others(range(4), lambda task: (folder / str(task)).exists(), seconds=0.05)
-print(sum((folder / str(task)).exists() for task in range(4)))
-"""
-
-
-@pytest.mark.slow
-def test_a_rank_waits_for_a_slower_rank(tmp_path):
-    call = [sys.executable, "-c", RANK, str(tmp_path), "2"]
-    ranked = [{**ENVIRONMENT, "RANK": str(n), "WORLD_SIZE": "2"} for n in range(2)]
-    ranks = [subprocess.Popen(call, env=own, stdout=subprocess.PIPE, text=True) for own in ranked]
-    assert [process.communicate(timeout=120)[0] for process in ranks] == ["4\n", "4\n"]
-    assert [process.returncode for process in ranks] == [0, 0]
-
-
-def test_a_single_process_does_not_wait_and_ranks_share_tasks(monkeypatch):
-    monkeypatch.delenv("WORLD_SIZE", raising=False)
-    wait_for_others([1], lambda task: False)
-    monkeypatch.setenv("WORLD_SIZE", "3")
-    monkeypatch.setenv("RANK", "1")
-    assert mine(range(7)) == [1, 4]
 
 
 @pytest.mark.slow

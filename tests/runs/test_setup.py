@@ -5,11 +5,11 @@ import json
 import pytest
 from PIL import Image
 
-from semfov import CocoScenes
+from semfov import ActivePerception, CocoScenes
 from semfov.errors import DataError, InputError
 from semfov.runs.command import run_command
-from semfov.runs.config import DataConfig, SensorConfig
-from semfov.runs.setup import make_scenes
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.setup import make_eye, make_observation, make_scenes, observation_name
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,33 @@ def test_a_sensor_is_chosen_by_name_and_may_be_changed(settings, sigma, growth, 
     assert (float(sensor.sigma), sensor.growth, sensor.levels) == pytest.approx((sigma, growth, 5))
     assert config.fovea == pytest.approx(fovea)
     assert SensorConfig(levels=3, convention="opencv").make().convention == "opencv"
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("sensor", ["published", "published-narrow"])
+def test_published_means_the_same_for_sensor_model_and_agent(sensor):
+    """A run with a published sensor that names no model has the eye and the model of the published agent."""
+    eye, agent = make_eye(DetectorConfig(), SensorConfig(sensor)), ActivePerception.published(sensor=sensor)
+    model = make_observation(None, eye)
+    assert observation_name(eye) == f"yolov3-tiny-{sensor}"
+    assert eye.settings() == agent.eye.settings()
+    assert model.digest() == agent.searching.observer.observation.digest()
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({}, "yolov3-tiny"),
+        ({"sigma": 50}, "yolov3-tiny"),
+        ({"name": "published", "sigma": 80}, "yolov3-tiny-sharp"),
+        ({"name": "published", "growth": 2}, "yolov3-tiny"),
+        ({"name": "published", "reference": 320}, "yolov3-tiny-sharp"),
+        ({"growth": 1}, "yolov3-tiny-published"),
+    ],
+)
+def test_a_sensor_that_is_not_published_has_a_model_of_our_own(settings, name):
+    assert observation_name(make_eye(DetectorConfig(), SensorConfig(**settings))) == name
 
 
 def test_an_unknown_sensor_gets_a_suggestion(capsys):

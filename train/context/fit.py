@@ -16,7 +16,6 @@ from semfov.metrics.averages import standard_error
 from semfov.runs.samples import SampleSettings, collect_samples
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
-from semfov.runs.workers import rank
 from train.context.settings import FitContextConfig, ObjectPlaces, read_places
 from train.context.weights import fit_weights, make_cases
 
@@ -29,12 +28,8 @@ def fit_context(config: FitContextConfig) -> None:
     sampler, samples, scenes = None, None, None
     if config.weigh:
         settings = SampleSettings.of(config)
-        sampler, samples = collect_samples(
-            settings, (config.cache or config.out) / "samples", config.workers, "looking"
-        )
+        sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
         scenes = sampler.scenes
-    if rank() > 0:
-        return
     scenes = make_scenes(config.data, COCO_CLASSES) if scenes is None else scenes
     places = read_places(scenes, config)
     held_out = [index % config.holdout == 0 for index in range(len(places))]

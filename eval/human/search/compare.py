@@ -18,7 +18,6 @@ from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
 from semfov.errors import DataError, check
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.workers import rank
 
 _Array = NDArray[np.float64]
 
@@ -51,10 +50,7 @@ def compare(config: PeopleSearchConfig) -> None:
     if config.pictures:
         run = PeopleSearchRun(config)
         finish(run, "searching")
-        if rank() == 0:
-            policies = run.searches(gather(run)[0])
-    if rank() != 0:
-        return
+        policies = run.searches(gather(run)[0])
     every = {"people": people, **searchers, **floors}
     tables = {f"all {len(known)} pictures": _scored(every, people, grid, config)}
     if run is not None:

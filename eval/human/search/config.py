@@ -50,6 +50,7 @@ class PeopleSearchConfig(PoliciesConfig):
         cache: folder for the stored detections from every cell (None: the user's cache).
         store: keep detections on disk.
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     people: Path = Path("human_scanpaths")

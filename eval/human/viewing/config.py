@@ -69,6 +69,7 @@ class ViewingConfig(PoliciesConfig):
         cache: folder for the stored detections from every cell and for maps (None: the user's cache).
         store: keep detections and maps on disk; false computes them anew in each run.
         workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     people: Path = Path("fixations.json")

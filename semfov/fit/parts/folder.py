@@ -90,5 +90,5 @@ class FolderFit:
 
 def _plain(settings: dict[str, Any]) -> Any:
     """Return the settings that a part depends on, as JSON values."""
-    left_out = ("out", "cache", "workers")
+    left_out = ("out", "cache", "workers", "scheduler")
     return json.loads(json.dumps({name: each for name, each in settings.items() if name not in left_out}, default=str))

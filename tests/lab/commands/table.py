@@ -112,7 +112,7 @@ COMMANDS = {
         settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.target_model", "HERE/target.safetensors",
                   "--protocol.shifts", "3"),
         files=("episodes.jsonl", "decisions.md"),
-        others=("roc.png",),
+        others=("manifest.json", "config.yaml", "roc.png"),
         refused=(
             (("--data.max_target_area", "1e-9", "--data.limit", "1", "--belief.columns", "2", "--belief.rows", "2"),
              "raise data.max_target_area"),
@@ -123,7 +123,7 @@ COMMANDS = {
                   "--model", "HERE/observation.safetensors",
                   "--target_model", "HERE/target.safetensors", "--map_model", "HERE/map.safetensors"),
         files=("beliefs.md", "beliefs.csv", "beliefs.json"),
-        others=("calibration.md", "config.yaml", "reliability.png", "beliefs.png"),
+        others=("calibration.md", "config.yaml", "manifest.json", "reliability.png", "beliefs.png"),
     ),
     "eval.words": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
@@ -131,6 +131,14 @@ COMMANDS = {
                   "--counted", "HERE/counted.safetensors", "--tables", "[HERE/noise.safetensors]"),
         files=("episodes.jsonl", "words.md"),
         refused=((("--context", "none"), "context"), (("--tables", "[nothing.safetensors]"), "nothing.safetensors")),
+    ),
+    "eval.figures": Command(
+        refused=(
+            (("--target", "cupp"), "did you mean 'cup'"),
+            (("--picture", "nothing.jpg"), "nothing.jpg"),
+            (("--start", "[10,0]"), "start"),
+        ),
+        workers=False,
     ),
     "eval.head": Command(refused=tuple(
             ((f"--{name}", value), f"{name}: expected")

@@ -1,0 +1,146 @@
+"""How well scores tell whether a target is present, and places where it is, with errors over scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from semfov.data.scene import Scenes
+from semfov.metrics.bootstrap import Bootstrap
+from semfov.metrics.calibration import calibration_error, errors_by_chance
+from semfov.metrics.presence import area_under_roc, hits_at
+from semfov.runs.tables import table
+
+SHARES = (0.01, 0.02, 0.05)
+"""False alarm rates at which the tables give the hit rate."""
+
+TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]
+"""Column headings of `Telling.rows`."""
+
+CALIBRATED = ["ECE", "by chance"]
+"""Column headings of `calibrated`."""
+
+ERRORS_TOLD = (
+    "± is the standard error, and two numbers in brackets are a 95 % interval, both by bootstrap over scenes, since "
+    "the searches of a scene are not independent. `by chance`: the ECE that perfectly calibrated probabilities would "
+    "have in as many searches, its mean and the limit below which 95 % of them are."
+)
+"""Caption of the errors."""
+
+FREQUENCY = "class frequency"
+"""Name of the score that knows only how many of the other scenes hold the class."""
+
+
+def class_frequencies(scenes: Scenes) -> list[Tensor]:
+    """For each scene, the share of the other scenes that hold each class, `(K+1,)`; 0 for background.
+
+    Args:
+        scenes: the scenes.
+
+    Returns:
+        The shares by index of the scene.
+    """
+    held = torch.zeros(len(scenes), len(scenes.classes) + 1, dtype=torch.float64)
+    for index in range(len(scenes)):
+        held[index, scenes.annotation(index).labels] = 1
+    return list((held.sum(0) - held) / max(len(scenes) - 1, 1))
+
+
+class Telling:
+    """Scores of the same searches by several ways to search, with the places that these report.
+
+    Args:
+        told: scores `(M,)` of the searches, by name of the way.
+        there: `(M,)` boolean, whether the target is present.
+        scenes: the scene of each search.
+        right: by name of the way, `(M,)`: 1 where it reports the right place, 0 for a wrong one, NaN for none. Ways
+            that report no places may be left out.
+
+    Attributes:
+        figures: area under the ROC curve, hit rates at the false alarm rates `SHARES`, and the share of right places,
+            for each way, `(ways, 2 + len(SHARES))`.
+    """
+
+    def __init__(
+        self,
+        told: Mapping[str, Tensor],
+        there: Tensor,
+        scenes: Sequence[Hashable],
+        right: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self.names = list(told)
+        self.places = right or {}
+        scores = [score.double() for score in told.values()]
+        nowhere = torch.full((len(there),), torch.nan, dtype=torch.float64)
+        places = torch.stack([self.places.get(name, nowhere).double() for name in told])
+
+        def measure(index: Tensor) -> Tensor:
+            figures = torch.tensor([tells(score[index], there[index]) for score in scores], dtype=torch.float64)
+            return torch.cat([figures, places[:, index].nanmean(1, keepdim=True)], 1)
+
+        self.figures = Bootstrap.of(measure, scenes)
+
+    def rows(self) -> list[list[str]]:
+        """Cells under the headings `TELLING` for each way."""
+        low, high = self.figures.interval()
+        return [
+            [
+                f"{value[0]:.3f} ± {error[0]:.3f}" if value[0].isfinite() else "-",
+                *(spanned(*span) for span in zip(value[1:-1], least[1:-1], most[1:-1], strict=True)),
+            ]
+            for value, error, least, most in zip(self.figures.value, self.figures.error, low, high, strict=True)
+        ]
+
+    def place(self, name: str) -> str:
+        """Share of right places of a way, in percent, with its interval."""
+        way = self.names.index(name)
+        return spanned(self.figures.value[way, -1], *self.figures.interval()[:, way, -1], digits=1)
+
+    def differences(self, name: str) -> list[str]:
+        """Table of the differences of all ways to one of them, paired over the searches.
+
+        Args:
+            name: the way that is subtracted.
+
+        Returns:
+            Lines of Markdown.
+        """
+        apart = self.figures.less(self.names.index(name))
+        heads = [*TELLING, *(["place right"] if self.places else [])]
+        rows = [[f"difference to {name}", *heads]]
+        low, high = apart.interval()
+        for way, other in enumerate(self.names):
+            if other == name:
+                continue
+            value, error = apart.value[way], apart.error[way]
+            area = f"{value[0]:+.3f} ± {error[0]:.3f}" if value[0].isfinite() else "-"
+            spans = zip(value[1:], low[way, 1:], high[way, 1:], [0] * len(SHARES) + [1], strict=True)
+            cells = [spanned(middle, least, most, digits=digits, sign="+") for middle, least, most, digits in spans]
+            rows.append([other, area, *cells[: len(heads) - 1]])
+        return table(rows)
+
+
+def tells(score: Tensor, there: Tensor) -> list[float]:
+    """Area under the ROC curve, and hit rates at the false alarm rates `SHARES`; NaN if all or none are present."""
+    if not there.any() or there.all():
+        return [torch.nan] * (1 + len(SHARES))
+    return [area_under_roc(score, there), *(hits_at(score, there, share) for share in SHARES)]
+
+
+def calibrated(probability: Tensor, there: Tensor) -> list[str]:
+    """Cells under the headings `CALIBRATED` for probabilities `(M,)` and outcomes `(M,)`."""
+    chance = errors_by_chance(probability)
+    return [
+        f"{calibration_error(probability, there):.3f}",
+        f"{chance.mean():.3f}, to {chance.quantile(0.95):.3f}",
+    ]
+
+
+def spanned(value: Tensor, low: Tensor, high: Tensor, *, digits: int = 0, sign: str = "") -> str:
+    """A share in percent with its interval, such as `66 (57 to 73)`; a dash where there is none."""
+    if not value.isfinite():
+        return "-"
+    middle, *ends = (f"{100 * float(each):{sign}.{digits}f}" for each in (value, low, high))
+    return f"{middle} ({' to '.join(ends)})"

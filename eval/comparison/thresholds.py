@@ -1,0 +1,138 @@
+"""Looks at several score thresholds, which share one pass of the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
+from semfov.detection.scores import Candidates
+from semfov.eye import Eye, View
+from semfov.runs.config import ScenesConfig
+from semfov.runs.looking import Looking
+from semfov.runs.looks import one_thread, tight
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import store_folder
+from semfov.runs.store import DetectionStore, cell_store
+
+
+class Proposed(Detector):
+    """A detector that selects at a threshold of its own among boxes that another detector has proposed.
+
+    Args:
+        detector: the other detector.
+        threshold: smallest confidence of a box.
+    """
+
+    def __init__(self, detector: Detector, threshold: float) -> None:
+        super().__init__(
+            detector.name,
+            detector.classes,
+            detector.input_size,
+            background=detector.background,
+            selection=replace(detector.selection, threshold=threshold),
+        )
+        self.candidates: Candidates | None = None
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        """The boxes of the other detector."""
+        assert self.candidates is not None
+        return self.candidates
+
+
+class ThresholdEyes:
+    """Eyes that differ in their score threshold alone, and share every pass of the detector.
+
+    A pass costs far more than the selection of boxes. A look at all thresholds costs little more than one look.
+
+    Args:
+        eye: sensor and detector.
+        thresholds: the thresholds.
+
+    Attributes:
+        settings: `Eye.settings()` of an eye with each threshold.
+    """
+
+    def __init__(self, eye: Eye, thresholds: Sequence[float]) -> None:
+        self._eye = eye
+        self._proposed = [Proposed(eye.detector, threshold) for threshold in thresholds]
+        self._eyes = [Eye(eye.sensor, detector, reference=eye.reference) for detector in self._proposed]
+        self.settings = [_at(eye.settings(), threshold) for threshold in thresholds]
+
+    def open(self, image: Tensor) -> View:
+        """Open an image `(1, 3, H, W)`."""
+        return self._eye.open(image)
+
+    def look(self, view: View, fixation: Tensor) -> list[Detections]:
+        """Look from one fixation; returns the detections at each threshold, batches of one without padding.
+
+        Args:
+            view: the opened image.
+            fixation: `(1, 2)`, in pixels of the image.
+
+        Returns:
+            The detections, in the order of the thresholds.
+        """
+        canvas = self._eye.foveated(view, fixation)
+        candidates = self._eye.detector.propose(canvas)
+        found = []
+        for detector, eye in zip(self._proposed, self._eyes, strict=True):
+            detector.candidates = candidates
+            found.append(tight(eye.detect(view, fixation, canvas)))
+        return found
+
+
+class ThresholdLooking(Looking):
+    """Looks at scenes from every cell, which are stored for each of several thresholds.
+
+    A run with one of these thresholds finds its looks stored, as if it had taken them itself.
+
+    Args:
+        config: the settings; the detector's threshold is not used.
+        thresholds: the thresholds.
+    """
+
+    config: ScenesConfig
+
+    def __init__(self, config: ScenesConfig, thresholds: Sequence[float]) -> None:
+        super().__init__(config)
+        self.thresholds = tuple(thresholds)
+        self.eyes = ThresholdEyes(self.eye, self.thresholds)
+        folder, belief = store_folder(config.cache) / "looks", config.belief
+        size, components = (belief.columns, belief.rows), len(self.scenes.classes) + 1
+        self.stores = [cell_store(folder, settings, *size, components) for settings in self.eyes.settings]
+
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye, the cells and the thresholds."""
+        return {**super().depends_on(), "thresholds": self.thresholds}
+
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
+        """Look at a scene from every cell, and store the looks that are missing; there are no records."""
+        digest, grid = self.digest(index), self.grid(index)
+        missing = [number for number, store in enumerate(self.stores) if not holds(store, digest, len(grid))]
+        if missing:
+            with one_thread(), torch.inference_mode():
+                image = self.scenes[index].image[None]
+                view, centres = self.eyes.open(image), grid.centres.to(image)
+                looks = [self.eyes.look(view, centre[None]) for centre in centres]
+            for number in missing:
+                self.stores[number].save(digest, {cell: seen[number] for cell, seen in enumerate(looks)})
+        return [], {}
+
+
+def holds(store: DetectionStore, digest: str, cells: int) -> bool:
+    """Whether a store holds the looks at a scene from all cells."""
+    looks = store.load(digest)
+    return all(cell in looks for cell in range(cells))
+
+
+def _at(settings: dict[str, Any], threshold: float) -> dict[str, Any]:
+    """Settings of an eye, with another threshold."""
+    detector = settings["detector"]
+    selection = {**detector["selection"], "threshold": threshold}
+    return {**settings, "detector": {**detector, "selection": selection}}

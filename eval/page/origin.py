@@ -1,0 +1,27 @@
+"""Which experiments have run, and of which commit, day and photographs a table is."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from eval.comparison.summary import MANIFEST
+from eval.page.tables import Runs
+
+
+def missing(names: Iterable[str], runs: Runs) -> list[str]:
+    """The experiments among these that have not run."""
+    return [name for name in names if name not in runs or not (runs[name].out / MANIFEST).exists()]
+
+
+def origin(folders: Iterable[Path]) -> str:
+    """Commits, days and numbers of photographs of runs, each only once, as the pages say them."""
+    told = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
+    commits = [_short(each["commit"]) for each in told]
+    days = [each["date"] for each in told]
+    counts = [f"{each['scenes']} photographs" for each in told]
+    return ", ".join(" and ".join(dict.fromkeys(values)) for values in (commits, days, counts))
+
+
+def _short(commit: str | None) -> str:
+    """The seven digits by which a commit is called, and `+` after uncommitted changes."""
+    return "no commit" if commit is None else commit[:7] + commit[40:]

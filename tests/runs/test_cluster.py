@@ -1,0 +1,226 @@
+"""Tasks in executors: results come back wherever they run, also from a cluster that loses workers or its scheduler."""
+
+import operator
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from semfov.detection.weights import fetch
+from semfov.errors import InputError, SemfovError
+from semfov.runs import cluster, workers
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ScenesConfig
+from semfov.runs.looking import Looking
+from semfov.runs.scene_run import finish
+from semfov.runs.workers import run_tasks
+
+ROOT = Path(__file__).parents[2]
+
+TASKS = """
+import os, time
+from pathlib import Path
+
+offset = None
+
+def prepare(value):
+    global offset
+    assert offset is None, "prepared twice"
+    offset = value
+
+def work(task):
+    number, folder, seconds = task
+    Path(folder, f"{os.getpid()}.worker").touch()
+    time.sleep(seconds)
+    return number ** 2 + offset
+"""
+
+
+def results(function, tasks, where, *, setup=id, settings=(0,)):
+    run = run_tasks(function, tasks, where=where, setup=setup, settings=settings, title="testing", unit="task")
+    return dict(run)
+
+
+class Waiting(Executor):
+    """Keeps tasks until it is asked to run one."""
+
+    def __init__(self):
+        self.kept, self.most = [], 0
+
+    def submit(self, function, *arguments):
+        future = Future()
+        self.kept.append((future, function, arguments))
+        self.most = max(self.most, len(self.kept))
+        if len(self.kept) == workers.OUTSTANDING or arguments[0] >= 998:
+            self.run()
+        return future
+
+    def run(self):
+        def finish(kept):
+            for future, function, arguments in kept:
+                future.set_result(function(*arguments))
+
+        threading.Timer(0.01, finish, [self.kept]).start()
+        self.kept = []
+
+
+def test_any_executor_gives_what_one_process_gives():
+    expected = {-n: n for n in range(50)}
+    assert results(operator.neg, [-n for n in range(50)], 1) == expected
+    with ThreadPoolExecutor(4) as pool:
+        assert results(operator.neg, [-n for n in range(50)], pool) == expected
+        assert pool.submit(int).result() == 0, "an executor that was given stays open"
+
+
+def test_threads_of_a_worker_take_turns():
+    busy = []
+
+    def work(task):
+        busy.append(task)
+        time.sleep(0.002)
+        assert busy == [task]
+        return busy.pop()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert results(work, range(20), pool) == {n: n for n in range(20)}
+
+
+def test_an_executor_is_given_a_limited_number_of_tasks_at_once():
+    pool = Waiting()
+    assert results(operator.neg, range(1000), pool) == {n: -n for n in range(1000)}
+    assert pool.most == workers.OUTSTANDING
+
+
+def test_a_process_is_prepared_again_for_other_settings():
+    seen = []
+    with ThreadPoolExecutor(1) as pool:
+        for settings in ((1,), (1,), (2,)):
+            results(operator.neg, [5], pool, setup=seen.append, settings=settings)
+            results(operator.neg, [6], pool, setup=seen.append, settings=settings)
+    assert seen == [1, 2]
+
+
+def test_an_error_of_a_task_is_raised_unchanged_and_the_others_are_cancelled():
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
+        results((1).__truediv__, [0, *range(1, 200)], pool)
+
+
+def test_workers_of_another_version_are_refused(monkeypatch):
+    digests = iter(["here", "there"])
+    monkeypatch.setattr(workers, "package_digest", lambda: next(digests))
+    with ThreadPoolExecutor(1) as pool, pytest.raises(SemfovError, match="another version of semfov"):
+        results(operator.neg, [1, 2], pool)
+
+
+def free_port():
+    with socket.socket() as some:
+        some.bind(("127.0.0.1", 0))
+        return some.getsockname()[1]
+
+
+@contextmanager
+def process(*arguments, path, cache=None):
+    """A command of Dask; it is killed when the block ends."""
+    pytest.importorskip("distributed")
+    environment = {**os.environ, "PYTHONPATH": f"{path}:{ROOT}", "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
+    environment |= {} if cache is None else {"XDG_CACHE_HOME": str(cache)}
+    call = [sys.executable, "-c", "from dask.__main__ import main; main()", *arguments]
+    one = subprocess.Popen(
+        call, env=environment, cwd="/", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        yield one
+    finally:
+        one.send_signal(signal.SIGKILL)
+        one.wait()
+
+
+def scheduler(port, path):
+    return process("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard", path=path)
+
+
+def worker(port, path, cache=None):
+    own = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(path))
+    return process("worker", f"tcp://127.0.0.1:{port}", *own, path=path, cache=cache)
+
+
+@pytest.fixture
+def tasks(tmp_path, monkeypatch):
+    (tmp_path / "cluster_tasks.py").write_text(TASKS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(cluster, "_REACH", 60.0)
+    import cluster_tasks
+
+    yield cluster_tasks
+    del sys.modules["cluster_tasks"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_a_worker_and_its_scheduler_gives_what_one_process_gives(tasks, tmp_path):
+    port = free_port()
+    todo = [(n, str(tmp_path), 0.1) for n in range(40)]
+    got = {}
+    with ExitStack() as stack:
+        first = stack.enter_context(scheduler(port, tmp_path))
+        both = [stack.enter_context(worker(port, tmp_path)) for _ in range(2)]
+        address = f"tcp://127.0.0.1:{port}"
+        run = run_tasks(
+            tasks.work, todo, where=address, setup=tasks.prepare, settings=(7,), title="testing", unit="task"
+        )
+        for task, result in run:
+            assert task not in got
+            got[task] = result
+            if len(got) == 6:
+                both[0].send_signal(signal.SIGKILL)
+            if len(got) == 12:
+                first.send_signal(signal.SIGKILL)
+                first.wait()
+                stack.enter_context(scheduler(port, tmp_path))
+                stack.enter_context(worker(port, tmp_path))
+    assert got == {task: task[0] ** 2 + 7 for task in todo}
+    assert f"{os.getpid()}.worker" not in {path.name for path in tmp_path.glob("*.worker")}
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+@pytest.mark.filterwarnings("ignore")
+def test_looks_of_a_cluster_come_back_and_are_the_same_to_the_bit(tmp_path, monkeypatch):
+    """The worker has another cache, which this process does not read."""
+    port = free_port()
+    weights = fetch("yolov3-tiny")
+    looked = {}
+    with scheduler(port, tmp_path), worker(port, tmp_path, cache=tmp_path / "far"):
+        for name, where in (("alone", {"workers": 1}), ("near", {"scheduler": f"tcp://127.0.0.1:{port}"})):
+            monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / name))
+            config = ScenesConfig(
+                data=DataConfig(limit=2),
+                detector=DetectorConfig(weights=weights),
+                belief=BeliefConfig(columns=2, rows=1),
+                out=tmp_path / name,
+                **where,
+            )
+            run = Looking(config)
+            finish(run, "looking")
+            looked[name] = [run.store.read(run.digest(index)) for index in range(2)]
+    assert (tmp_path / "far").is_dir()
+    for alone, near in zip(looked["alone"], looked["near"], strict=True):
+        assert alone.keys() == near.keys()
+        assert all(torch.equal(alone[name], near[name]) for name in alone)
+
+
+def test_without_a_scheduler_the_error_says_what_to_start(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "_REACH", 0.2)
+    with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):
+        results(operator.neg, [1, 2], f"tcp://127.0.0.1:{free_port()}")
+    with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):
+        results(operator.neg, [1, 2], "nowhere")
