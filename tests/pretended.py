@@ -1,4 +1,4 @@
-"""A pretended accelerator: its tensors say that they are on a GPU, keep their values in main memory, and refuse to be mixed.
+"""A pretended accelerator: its tensors say that they are on a GPU, have their values in main memory, and refuse mixing.
 
 Operations on tensors of two devices, and `numpy()` of a tensor that was not copied to the CPU first, fail as on a GPU.
 Values are those of the CPU, so a module must give the same output there, and errors of values are raised, too.
