@@ -228,7 +228,14 @@ def _places(columns: int, rows: int, dtype: torch.dtype, device: torch.device) -
 
 
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
-    """Largest value of maps `(T, rows, columns)` in the square of `side` cells about each cell, an odd number.
+    """Largest value in the square about each cell of maps.
+
+    Args:
+        values: `(T, rows, columns)`.
+        side: side of the square in cells, an odd number.
+
+    Returns:
+        `(T, rows, columns)`.
 
     >>> neighbourhood_peak(torch.tensor([[[1.0, 0.0, 0.0, 2.0]]]), 3)
     tensor([[[1., 1., 2., 2.]]])

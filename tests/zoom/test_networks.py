@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from semfov.zoom import GlimpseEvidence
 from semfov.belief.evidence import neighbourhood_peak
+from semfov.zoom import GlimpseEvidence
 from semfov.zoom.networks import features, neighbourhood_mean, small_network, through
 
 

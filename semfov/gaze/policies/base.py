@@ -60,6 +60,7 @@ class Policy(nn.Module, ABC):
         table: the table that it needs of every scene; None for most policies.
         needs_model: whether it is made from an observation model.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
+        by_belief: whether its choice depends on the belief.
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
     >>> from semfov import acquisition
@@ -77,6 +78,7 @@ class Policy(nn.Module, ABC):
     table: ClassVar[Table | None] = None
     needs_model: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
+    by_belief: ClassVar[bool] = True
     by_place: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
