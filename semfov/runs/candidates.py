@@ -101,8 +101,8 @@ def by_evidence(policy: PolicyConfig, task: Task) -> bool:
 def belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
     if by_evidence(policy, task):
-        return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None)
-    return replace(policy, policy=Random.name, saliency=None)
+        return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
+    return replace(policy, policy=Random.name, saliency=None, samples=None)
 
 
 def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
@@ -154,14 +154,14 @@ def _strategy(
 ) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
-    means = Means(models.observation, models.map, fovea, belief.prior)
+    calibrated = policy.scores == "calibrated"
+    means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
     chosen = named_policy(policy.policy, task, means)
     if by_evidence(policy, task):
         return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
     misses = _of(policy.misses, belief.misses)
-    calibrated = policy.scores == "calibrated"
     observer = Semantic(
         components,
         _given(models.observation, "scores", "an observation model") if calibrated else None,

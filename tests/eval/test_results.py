@@ -14,7 +14,7 @@ from eval.page.experiments import ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import FINDINGS, gain, overtaken
 from eval.page.origin import missing, origin
-from eval.page.tables import agreement, paired
+from eval.page.tables import agreement, by_samples, paired
 from eval.results import PLACE, WHOLE, fill_page, page_table, results
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, InputError
@@ -241,6 +241,18 @@ def test_differences_are_paired_over_images(searched):
     expected = f"{100 * np.mean(differences):+.1f} ± {100 * np.std(differences, ddof=1) / np.sqrt(6):.1f}"
     assert len(rows) == 3
     assert expected in rows[2]
+
+
+def test_samples_are_compared_with_the_same_policy_without(runs):
+    folder = runs["expected-search"].out
+    drawn, found = "predictive-raw, samples 16", {"predictive-raw": 3, "predictive-raw, samples 16": 9, "random": 30}
+    write_records(folder, searches(tuple(found), lambda policy, scene, _: found[policy] - scene))
+    rows = [cells_of(row) for row in by_samples(folder, (1, 5, 9))]
+    assert rows[0] == ["difference to the expected scores", "1", "5", "9"]
+    # After one shift the plain search has found the targets of scenes 2 and 3, after five of 0 to 3, the other of 4, 5.
+    scenes = {n: [(0 <= 9 - s <= n) - float(0 <= 3 - s <= n) for s in range(6)] for n in (1, 5, 9)}
+    expected = [f"{100 * np.mean(d):+.1f} ± {100 * np.std(d, ddof=1) / 6**0.5:.1f}" for d in scenes.values()]
+    assert rows[2:] == [[drawn, *expected]]
 
 
 def test_a_policy_is_behind_by_more_than_two_standard_errors():
