@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, check_tensor, lookup, values_known
+from semfov.threads import one_thread_if_small
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
 
@@ -201,6 +202,7 @@ def _describe(likelihood: Tensor) -> str:
     return "a negative value" if (likelihood < 0).any() else "a row of zeros"
 
 
+@one_thread_if_small
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
     """Update every cell with the detections that cover it, one after another.
 
