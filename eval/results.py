@@ -21,6 +21,7 @@ from typing import Any
 
 from eval.calibration.config import CalibrationConfig
 from eval.calibration.evaluation import judge_beliefs
+from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
 from eval.decide.config import DecideConfig
 from eval.explore import explore
@@ -155,6 +156,7 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
     ExploreConfig: explore,
     DecideConfig: search_and_decide,
     CalibrationConfig: judge_beliefs,
+    ThresholdLooksConfig: look_at_thresholds,
 }
 """Functions that run an experiment, by the class of its settings."""
 
