@@ -9,7 +9,7 @@ import torch
 import semfov
 from semfov.belief import ContextPrior
 from semfov.io.compatibility import learned_for, recommended_model
-from semfov.presets import PUBLISHED_SENSORS
+from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE, features
@@ -194,6 +194,17 @@ def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(de
     assert not model.log_prior.any()
     assert float(model.tempering) == 1
     torch.testing.assert_close(model.expected_scores(), model.alpha / model.alpha.sum(-1, keepdim=True))
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.25, 0.5])
+@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+def test_published_models_are_fitted_at_other_thresholds_too(detector, threshold):
+    assert published_model(detector, "published", threshold) == f"{detector}-published-{threshold}"
+    model = semfov.FovealObservationModel.from_pretrained(f"{detector}-published-{threshold}")
+    assert model.metadata["detector"]["selection"]["threshold"] == threshold
+    assert model.metadata["sensor"]["sigma"] == 100
+    assert model.metadata["method"] == "newton"
+    assert not model.log_prior.any()
 
 
 @pytest.mark.weights

@@ -261,6 +261,15 @@ def at_threshold(kind: str, threshold: float, name: str) -> str:
     return f"{kind}-threshold-{threshold:g}-{name}"
 
 
+AT_THRESHOLDS = tuple(
+    at_threshold(kind, threshold, name)
+    for kind in ("search", "explore")
+    for threshold in THRESHOLDS
+    for name in DETECTORS
+)
+"""Names of the experiments at all score thresholds."""
+
+
 def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> Iterator[tuple[str, Experiment]]:
     """The paper's searches and explorations at each score threshold, after the looks, which share a pass."""
     sensor = SensorConfig(name="published")

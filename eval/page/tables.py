@@ -140,7 +140,7 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
     curves = {policy: per_image(records_of(folder, policy), last, field) for policy in names}
     if baseline not in curves:
         raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
-    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind by two standard errors at"]]
+    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
     for policy, curve in curves.items():
         if policy == baseline:
             continue
