@@ -35,6 +35,7 @@ from eval.page.tables import (
     Runs,
     agreement,
     beside_paper,
+    by_samples,
     paired,
     paired_maps,
     photographs,
@@ -180,6 +181,9 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "landings": partial(told_table, "decisions.md", 3),
     "by-looks": partial(told_table, "beliefs.md", 0, columns=BELIEVED),
     "by-distance": partial(told_table, "beliefs.md", 1, columns=BELIEVED),
+    "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
+    "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),
+    "samples-objects": partial(by_samples, shifts=(1, 2, 5, 10, 20), field=OBJECTS),
     "paired-map": paired_maps,
     "paired-map-objects": partial(paired_maps, field=OBJECTS),
 }

@@ -31,12 +31,11 @@ class GazeNode(Node):
         """Look at an image, and publish the detections, the box of a found target and the next gaze point."""
         moment = self.live.step(ros.picture(message))
         of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
-        found = ros.detection_array(moment.detections, self.agent.classes[1:], **of)
+        found = ros.detection_array(moment.seen, self.agent.classes[1:], **of)
         self.seen.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
         found = ros.found_array(moment.decision, self.target, **of)
         self.found.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
-        following = moment.grid.centres[moment.next_cell]
-        self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(following, **of)))
+        self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(moment.next_point, **of)))
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ from semfov.head.camera import PanTiltCamera, is_scene, open_scene
 from semfov.head.world import World
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
-from semfov.live import RATE, LivePerception
+from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazeRecord
@@ -348,8 +348,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check_thresholds(confirm, give_up)
-        if closer is not None:
-            check_whole(closer, "closer", 0, 100)
+        check_whole(0 if closer is None else closer, "closer", 0, 100)
         kind = self.kind_of_look(picture, how)
         _only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
         _only_for(kind, "head", "seconds", duration=duration)
@@ -496,56 +495,56 @@ class ActivePerception(nn.Module):
 
     def live(
         self,
-        target: str | int | None = None,
+        target: Targets = None,
         *,
-        rate: float = RATE,
+        how: How = "auto",
+        rate: float | None = None,
         start: int | None = None,
         seed: int = 0,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = MOST_CLOSER,
+        closer: int | None = None,
         color: Color = "rgb",
     ) -> LivePerception:
-        """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
+        """Look at a camera or a video: one pass of the detector for every frame, and evidence that fades between them.
 
         When a place seems to hold the target, the recommended agent spends a frame on a closer look (`search`).
 
         Args:
-            target: class to search for, by name or index 1..K; None explores.
-            rate: rate at which belief fades, per frame; 0 forgets nothing (`semfov.live.LivePerception`).
-            start: first cell; None draws one at random.
+            target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
+            how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
+            rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1 for a fovea and 0.03 for
+                windows (`semfov.live.FovealPerception`, `semfov.live.WindowPerception`).
+            start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
-            give_up: probability below which a cell is not worth a look; None takes that of the belief alone, which a
+            give_up: probability below which a look is not worth a frame; None takes that of the belief alone, which a
                 belief that fades can reach, or with rate 0 that of `search`.
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
-                evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
+                evidence is forgotten (ln 2 / rate frames); None takes 2 for a fovea, and 100 for windows.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
         Returns:
             An object whose `step` takes the frames one by one.
 
         Raises:
-            InputError: the class is unknown, or an argument does not fit.
+            InputError: a class is unknown, or an argument does not fit.
         """
-        index = None if target is None else class_index(target, self.classes[1:], "target")
+        numbers = class_numbers(target, self.classes[1:], "target")
+        one = bool(numbers) and not isinstance(target, list | tuple)
         check_thresholds(confirm, give_up)
-        check_whole(closer, "closer", 0, 100)
-        strategy = self.exploring if index is None else self.searching
-        model = None if index is None else self.fovea.deciding(closer)
-        own = strategy.observer.thresholds
-        chosen = own if model is None else model.thresholds
-        usual = own.give_up if rate and own is not None else None
-        at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
-        parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
+        check_whole(0 if closer is None else closer, "closer", 0, 100)
         return LivePerception(
-            *parts,
-            target=index,
+            self.fovea,
+            self.zoom,
+            numbers[0] if one else None,
+            () if one else numbers,
+            how=lookup(how, get_args(How), "kind of look"),
             rate=rate,
             start=start,
             seed=seed,
-            thresholds=at,
-            verification=model,
+            confirm=confirm,
+            give_up=give_up,
             closer=closer,
             color=color,
         )

@@ -16,7 +16,7 @@ from semfov.detection import Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
-from semfov.live import FrameRate
+from semfov.live import FovealPerception, FrameRate
 from tests.small import Coloured
 
 SIZE = (160, 120)
@@ -212,7 +212,7 @@ def test_each_frame_has_a_decision():
     assert gone[-1].outcome != "found"
     assert gone[-1].probability < 0.5
     assert agent_with(Semantic(3)).live("green").step(scene(8)).decision is None
-    assert agent_with(Deciding(3)).live("green", confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+    assert FovealPerception(agent_with(Deciding(3)).fovea, 2, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
 
 
 def test_frames_may_have_any_type_but_must_have_the_same_size():
@@ -270,9 +270,3 @@ def test_the_rate_leaves_out_the_first_frames():
     few.add()
     assert few.summary() == "1 frame, all of them while the detector got ready"
     assert (few.now, few.mean) == (None, None)
-
-
-def test_frames_that_are_reduced_by_much_are_not_reduced_in_silence():
-    frame = torch.rand(3, 480, 640)
-    with pytest.warns(UserWarning, match=r"frames of 640 × 480 px are reduced to .* by windows"):
-        agent_with(Semantic(3)).live("red").step(frame)

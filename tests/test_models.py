@@ -202,7 +202,7 @@ def test_published_models_are_fitted_at_other_thresholds_too(detector, threshold
     assert published_model(detector, "published", threshold) == f"{detector}-published-{threshold}"
     model = semfov.FovealObservationModel.from_pretrained(f"{detector}-published-{threshold}")
     assert model.metadata["detector"]["selection"]["threshold"] == threshold
-    assert model.metadata["sensor"]["sigma"] == 100
+    assert model.metadata["sensor"]["sigma"] == pytest.approx(100)
     assert model.metadata["method"] == "newton"
     assert not model.log_prior.any()
 

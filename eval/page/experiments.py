@@ -18,6 +18,7 @@ from semfov.runs.config import (
     PolicyConfig,
     ProtocolConfig,
     RunConfig,
+    Scores,
     SensorConfig,
 )
 from semfov.runs.presets import PolicyChoice
@@ -96,6 +97,23 @@ BEYOND_EXPLORATION = (
     "closer-look-learned",
 )
 """Exploration policies with semfov's own models."""
+
+_SCORES: tuple[Scores, ...] = ("raw", "calibrated")
+
+SAMPLES = 16
+"""Number of drawn looks in the policies that take an expectation over them."""
+
+EXPECTED = tuple(
+    PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, SAMPLES)
+)
+"""Predictive searches with the expected scores, and with the expectation over drawn looks."""
+
+EXPECTED_EXPLORATION = tuple(
+    PolicyConfig(policy, "calibrated", samples=samples)
+    for policy in ("kl", "negative-entropy")
+    for samples in (None, SAMPLES)
+)
+"""The same two kinds of explorations."""
 
 Experiment = RunConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
@@ -243,6 +261,10 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield from _thresholds(name, settings, common)
         sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
         yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
+        if name == "nano":
+            few = ProtocolConfig(starts=3, shifts=20)
+            yield "expected-search", seek(sensor=sensor, belief=belief, policies=EXPECTED)
+            yield "expected-explore", tour(sensor=sensor, belief=belief, policies=EXPECTED_EXPLORATION, protocol=few)
         yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)

@@ -155,6 +155,27 @@ def paired_maps(folder: Path, field: str = "right") -> list[str]:
     return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field, ending="-learned")
 
 
+def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:
+    """Differences of policies with an expectation over drawn looks from the same with the expected scores.
+
+    Args:
+        folder: folder of the run.
+        shifts: gaze shifts that the table shows.
+        field: for explorations, the answers that are counted.
+
+    Returns:
+        The table with standard errors, in percentage points, as lines of Markdown.
+    """
+    rows = [["difference to the expected scores", *(str(n) for n in shifts)]]
+    for policy in policies_of(folder):
+        plain, _, drawn = policy.partition(", samples ")
+        if drawn:
+            curves = (per_image(records_of(folder, name), max(shifts), field) for name in (policy, plain))
+            mean, error = difference(*curves)
+            rows.append([policy, *(f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts)])
+    return table(rows)
+
+
 def agreement(folder: Path) -> list[str]:
     """How often predictive and non-predictive search make the same first gaze shift, and need the same number."""
     rows = [["scores", "same first gaze shift", "found after as many shifts"]]

@@ -8,22 +8,21 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
-from semfov.belief.target_evidence import Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
-from semfov.decision import OUTCOMES, Decision, Verifier, check_thresholds, settle
+from semfov.decision import check_thresholds
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
-from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
+from semfov.zoom.closer import look_closely
+from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
-from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -33,16 +32,10 @@ from semfov.zoom.slices import ranked, usual_slices
 USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
 
-CLOSER = 100
-"""Default for the largest number of closer looks: as many as there are passes for."""
-
 NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
 
 _Picture = LargePicture | ImageLike
-
-DEFAULTS = Thresholds(0.9, 0.005)
-"""Thresholds of searches whose evidence has none."""
 
 
 class ZoomAgent(nn.Module):
@@ -159,7 +152,7 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                path = search_slices(glances, self.classes, index, limits, 0.5 if confirm is None else confirm)
+                path = search_slices(glances, self.classes, index, limits, confirm)
             else:
                 path = search_windows(
                     glances,
@@ -319,7 +312,6 @@ def search_windows(
     Returns:
         The looks, the objects of the class, and the decision.
     """
-    thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
     path = _Windows(glances, classes, target, (), evidence)
     seen, values = path.seen, path.values
 
@@ -327,51 +319,26 @@ def search_windows(
         seen.append(look_closely(glances, box))
         return seen[-1].detections
 
-    verifier, model = None, evidence.verification
-    if closer and model is not None and model.thresholds is not None:
-        places, at = CandidateBoxes(target, thresholds.confirm), model.thresholds.changed(confirm, thresholds.give_up)
-        verifier = Verifier(model, places, close_up, at, closer)
-    else:
-        thresholds = thresholds.changed(confirm)
-    facts: SearchFacts | None = None
-    ended, presence = 0, None
+    deciding = WindowDecisions(evidence, target, close_up, confirm=confirm, give_up=give_up, closer=closer)
     ending: Ending | None = None
     for turn in look_for(glances, evidence, target, confirm=float("inf")):
-        glance, ahead = turn.glance, turn.ahead
-        facts = facts or SearchFacts(turn.belief)
-        facts.add(glance)
         path.add(turn)
         ending = limits.reached(len(seen), path.record)
-        presence = None
-        if facts.detected or ahead < thresholds.give_up:  # otherwise no probability ends the search
-            presence = facts.presence(ahead)
-            if verifier is None:
-                state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([ahead])
-                ended = int(settle(*state, thresholds))
-            else:
-                look = WindowLook(glance.detections, len(seen), presence, facts.best, ahead)
-                verifier.see(look, last=ahead == 0 or limits.room(len(seen)) <= 1)
-                while ending is None and verifier.candidate is not None:
-                    values.append(verifier.candidate.probability)
-                    verifier.look()
-                    ending = limits.reached(len(seen), path.record)
-                ended = verifier.outcome()
-        if ended or ending is not None:
+        deciding.see(turn, len(seen), last=turn.ahead == 0 or limits.room(len(seen)) <= 1)
+        while ending is None and deciding.candidate is not None:
+            values.append(deciding.candidate.probability)
+            deciding.look()
+            ending = limits.reached(len(seen), path.record)
+        if deciding.outcome or ending is not None:
             break
-    assert facts is not None
-    if verifier is not None and verifier.looks:
-        decision = verifier.decision(over=ended > 0)
-    else:
-        presence = facts.presence(ahead) if presence is None else presence
-        decision = Decision(OUTCOMES[ended], presence, None, facts.box if OUTCOMES[ended] == "found" else None)
-    if ended > 0 or decision.outcome == "found":
+    decision = deciding.decision(over=deciding.outcome > 0)
+    if deciding.outcome or decision.outcome == "found":
         ending = "decision"
-    closely = () if verifier is None else tuple(verifier.looks)
-    return replace(path.record(ending or "windows"), decision=decision, closer=closely)
+    return replace(path.record(ending or "windows"), decision=decision, closer=tuple(deciding.looks))
 
 
 def search_slices(
-    glances: Glances, classes: tuple[str, ...], target: int, limits: EpisodeLimits, confirm: float
+    glances: Glances, classes: tuple[str, ...], target: int, limits: EpisodeLimits, confirm: float | None = None
 ) -> ZoomPath:
     """Search a picture by slices, in the order of the overview's scores; nothing is learned, so nothing is `absent`.
 
@@ -380,26 +347,22 @@ def search_slices(
         classes: names of the classes, background first.
         target: class 1..K.
         limits: limits of the search.
-        confirm: score from which on a detection whose best class is the target ends the search as `found`.
+        confirm: score from which on a detection whose best class is the target ends the search as `found`; None takes
+            0.5.
 
     Returns:
         The looks, the objects of the class, and the decision: `found` or `undecided`, with the highest score.
     """
-    path, best, box = _Windows(glances, classes, target), 0.0, None
+    path = _Windows(glances, classes, target)
     ending: Ending | None = None
     for turn in look_by_look(glances, ranked(usual_slices(glances.lattice), [target]), None):
         path.add(turn)
-        seen = turn.glance.detections
-        scores = seen.confidence[0].masked_fill(~seen.mask[0] | (seen.labels[0] != target), 0)
-        if len(scores) and float(scores.max()) > best:
-            best, box = float(scores.max()), seen.boxes[0, scores.argmax()]
         ending = limits.reached(len(path.seen), path.record)
-        if best >= confirm:
+        decision = decide_by_score(path.seen, target, confirm)
+        if decision.outcome == "found":
             ending = "detection"
         if ending is not None:
             break
-    found = best >= confirm
-    decision = Decision("found" if found else "undecided", best, None, box if found else None)
     return replace(path.record(ending or "windows"), decision=decision)
 
 

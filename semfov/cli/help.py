@@ -106,18 +106,20 @@ semfov live: one look at each frame of a video, a camera or a network stream
   semfov live rtsp://192.168.1.20/stream --target person
   semfov live holiday.mp4                             explore, without a target
 
-usage: semfov live [VIDEO | URL | --camera N] [--target CLASS] [options]
+usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] [options]
 
   VIDEO, URL           a video file, or an address such as rtsp://… that OpenCV can open
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
+  --find CLASSES       classes of which all objects are to be found, with commas between them
+  --how KIND           fovea, windows (of large frames), or auto (default)
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
   --rate R             rate at which belief fades from frame to frame (0: never)
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
   --closer N           most closer looks in the time until half of the belief has faded (0: none)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
-  --out FILE           video to write, with gaze, belief and detections drawn into each frame
+  --out FILE           video to write, with gaze and belief, or windows and objects
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
 """

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
 from semfov.agents.fovea import cell_at
-from semfov.cli.agent import known_classes, make_agent, one_class
+from semfov.cli.agent import known_classes, make_agent, one_class, several_classes
 from semfov.cli.options import LiveOptions, start_of
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.live import FrameRate, LivePerception
-from semfov.paths import Moment, detections_in_words
+from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import draw_moment, video, video_suffix
 
@@ -34,17 +35,23 @@ def look_live(options: LiveOptions) -> int:
     check(options.source is None or options.camera is None, "camera", "a video or a camera, not both", options.camera)
     if options.source is None and options.camera is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
+    check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
     start = start_of(options.start)
-    one_class(options.target, known_classes(options))
+    _sought(options, known_classes(options))
     stream = open_live(options)
     agent = make_agent(options)
-    target = one_class(options.target, agent.classes[1:])
-    given = {name: getattr(options, name) for name in ("rate", "seed", "confirm", "give_up", "closer")}
-    running = agent.live(target, start=cell_at(start, (agent.columns, agent.rows)), **given)
+    given = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
+    first = cell_at(start, (agent.columns, agent.rows))
+    running = agent.live(_sought(options, agent.classes[1:]), start=first, **given)
     written = watch(running, stream, options.out)
     if written is not None:
         print(f"written:\n  {written}")
     return 0
+
+
+def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:
+    """The class that is searched for, or the list of those whose objects are all to be found."""
+    return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
 
 
 def open_live(options: LiveOptions) -> Stream:
@@ -68,7 +75,7 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
     if path is not None:
         path = (path / "live" if path.is_dir() or not path.suffix else path).with_suffix(video_suffix())
     rate = FrameRate()
-    print(f"{stream.name}: {'exploring' if live.target is None else f'searching for “{live.classes[live.target]}”'}")
+    print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or UNKNOWN_RATE) as add:
         try:
             for picture in stream.frames:
@@ -92,6 +99,15 @@ def moment_line(moment: Moment) -> str:
     Returns:
         The line.
     """
+    if isinstance(moment, WindowMoment):
+        x, y, magnification = moment.window.fixation
+        look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {magnification:.2f}: "
+        if moment.examined is None:
+            look += detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)
+        else:
+            look += f"closely, p {moment.examined.place:.2f} there"
+        return f"{look:60s}  {moment.describe()}"
+    assert isinstance(moment, FoveaMoment)
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)
     seen = detections_in_words(moment.detections, moment.classes, 2, CONFIDENT)

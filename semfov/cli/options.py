@@ -6,9 +6,7 @@ from typing import Annotated, Literal
 
 from semfov.agent import How
 from semfov.agents.limits import MOST_PASSES
-from semfov.decision import MOST_CLOSER
 from semfov.errors import InputError
-from semfov.live import RATE
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.sensor.named import SensorName
 
@@ -136,22 +134,27 @@ class LiveOptions(AgentOptions):
         source: video file, or address of a stream.
         camera: number of a camera.
         target: class to search for (none: explore).
+        find: class of which all objects are to be found, or several with commas, in place of a target.
+        how: kind of look: `fovea`, `windows`, or `auto` by the size of the frames.
         frames: number of frames to look at (none: all of them; a camera until Ctrl-C).
-        rate: rate at which belief fades from frame to frame; 0: never.
+        rate: rate at which belief fades from frame to frame; 0: never (none: 0.1 for a fovea, 0.03 for windows).
         confirm: the target counts as found when its probability reaches this value (none: that of the model).
         give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
-        closer: largest number of closer looks in the time until half of the belief has faded; 0: none.
-        out: video to write, with gaze, belief and detections drawn into each frame.
+        closer: largest number of closer looks in the time until half of the belief has faded (none: 2 for a fovea, as
+            many as there are frames for windows); 0: none.
+        out: video to write, with gaze and belief, or windows and objects, drawn into each frame.
     """
 
     source: str | None = None
     camera: Whole | None = None
     target: str | None = None
+    find: str | None = None
+    how: How = "auto"
     frames: Count | None = None
-    rate: Annotated[float, Range(0, 100)] = RATE
+    rate: Annotated[float, Range(0, 100)] | None = None
     confirm: Share | None = None
     give_up: Share | None = None
-    closer: MostCloserLooks = MOST_CLOSER
+    closer: MostCloserLooks | None = None
     out: Path | None = None
 
 

@@ -28,7 +28,7 @@ class Picture:
 
     Attributes:
         name: its name in messages and file names.
-        image: `(3, H, W)`, RGB in [0, 1].
+        image: `(3, H, W)`, RGB in [0, 1], or bytes, as streams give them.
         boxes: ground-truth boxes of the target, `(M, 4)`; None where they are not known.
     """
 
@@ -193,7 +193,7 @@ def _recorder(cv2: Any, source: str | Path | int) -> Any:
 
 
 def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
-    """Frames of a stream, RGB in [0, 1]."""
+    """Frames of a stream, RGB bytes."""
     try:
         for number in count():
             if number == most:
@@ -203,7 +203,6 @@ def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
                 if not number:
                     raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
                 return
-            rgb = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
-            yield Picture(f"{name}, frame {number}", rgb.float() / 255)
+            yield Picture(f"{name}, frame {number}", torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     finally:
         recorder.release()

@@ -113,7 +113,7 @@ def found_array(decision: Found | None, name: str, *, stamp: Any, frame: str) ->
     """Make a `vision_msgs/Detection2DArray` of a decision: the box of the target if it was found, otherwise none.
 
     Args:
-        decision: `semfov.live.Moment.decision`, or the decision of a search; None counts as not found.
+        decision: `semfov.paths.Moment.decision`, or the decision of a search; None counts as not found.
         name: name of the target's class.
         stamp: time of the image, as for `header`.
         frame: frame of reference of the image.

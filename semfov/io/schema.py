@@ -171,15 +171,16 @@ class Text(Json):
     """Requirement of a JSON value: a string without control characters.
 
     Attributes:
-        options: the strings allowed; any string where there are none.
+        options: the strings allowed; None allows any string.
     """
 
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] | None = None
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """Check a value, see `Json.check`."""
-        fits = isinstance(value, str) and (value in self.options or not self.options)
-        check(fits, name, f"one of {', '.join(self.options)}" if self.options else "text", excerpt(value))
+        fits = isinstance(value, str) and (self.options is None or value in self.options)
+        named = f"one of {', '.join(self.options)}" if self.options else "no text"
+        check(fits, name, "text" if self.options is None else named, excerpt(value))
         check(is_plain(value), name, "text without control characters", excerpt(value))
 
 

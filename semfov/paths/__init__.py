@@ -3,7 +3,7 @@
 from semfov.paths.base import GazeRecord, Record, RecordedLook, detections_in_words
 from semfov.paths.endings import Ending
 from semfov.paths.head import HeadPath
-from semfov.paths.moment import Moment
+from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
 from semfov.paths.scanpath import Scanpath
 from semfov.paths.stimulus import Stimulus, reduced_copy, sensor_in_words
 from semfov.paths.trace import Trace, trace
@@ -11,6 +11,7 @@ from semfov.paths.windows import ZoomPath
 
 __all__ = [
     "Ending",
+    "FoveaMoment",
     "GazeRecord",
     "HeadPath",
     "RecordedLook",
@@ -19,6 +20,7 @@ __all__ = [
     "Scanpath",
     "Stimulus",
     "Trace",
+    "WindowMoment",
     "ZoomPath",
     "detections_in_words",
     "sensor_in_words",

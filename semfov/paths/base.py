@@ -95,6 +95,8 @@ class Record(Conversion):
     photograph: Tensor | None = None
     source: str | None = None
 
+    _format: ClassVar[Format]
+
     @property
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
@@ -319,6 +321,65 @@ class Record(Conversion):
             )
         ]
 
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the record to a safetensors file, atomically.
+
+        Args:
+            path: the file.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        self._format.write(path, self._base(), *self._parts())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Load a record that `save` wrote; nothing in the file is executed.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The record.
+
+        Raises:
+            DataError: the file is missing or damaged, or holds no record of this kind.
+        """
+        try:
+            tensors, record, shared = cls._format.read(path)
+            fields = {**shared, **cls._fields(tensors, record, shared)}
+        except InputError as error:
+            raise cls._format.refused(path, error) from None
+        made = {each.name for each in fields_of(cls) if each.init}
+        return cls(**{name: value for name, value in fields.items() if name in made})
+
+    def _base(self) -> Mapping[str, Any]:
+        """The attributes that the files of all records keep."""
+        return vars(self)
+
+    @abstractmethod
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and JSON values of a file, beside those of the base."""
+
+    @classmethod
+    @abstractmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Make the other attributes from the tensors and JSON values of a file.
+
+        Args:
+            tensors: all tensors.
+            record: all JSON values.
+            shared: attributes of the base.
+
+        Returns:
+            The attributes by name.
+
+        Raises:
+            InputError: they do not fit each other.
+        """
+
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
         """A table of the record as a pandas data frame.
 
@@ -382,7 +443,6 @@ class GazeRecord(Record):
     how: ClassVar[Literal["fovea", "windows", "head"]]
     """Kind of look: of a fovea, at windows, or of a head that turns."""
 
-    _format: ClassVar[Format]
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
     def __len__(self) -> int:
@@ -489,61 +549,6 @@ class GazeRecord(Record):
     @abstractmethod
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         """Fixated points `(n, 2)` in pixels of the picture, and its `(width, height)`."""
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the record to a safetensors file, atomically.
-
-        Args:
-            path: the file.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
-        self._format.write(path, vars(self), *self._parts())
-
-    @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Load a record that `save` wrote; nothing in the file is executed.
-
-        Args:
-            path: the file.
-
-        Returns:
-            The record.
-
-        Raises:
-            DataError: the file is missing or damaged, or holds no record of this kind.
-        """
-        try:
-            tensors, record, shared = cls._format.read(path)
-            fields = {**shared, **cls._fields(tensors, record, shared)}
-        except InputError as error:
-            raise cls._format.refused(path, error) from None
-        made = {each.name for each in fields_of(cls) if each.init}
-        return cls(**{name: value for name, value in fields.items() if name in made})
-
-    @abstractmethod
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and JSON values of a file, beside those of the base."""
-
-    @classmethod
-    @abstractmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """Make the other attributes from the tensors and JSON values of a file.
-
-        Args:
-            tensors: all tensors.
-            record: all JSON values.
-            shared: attributes of the base.
-
-        Returns:
-            The attributes by name.
-
-        Raises:
-            InputError: they do not fit each other.
-        """
 
 
 def detections_in_words(detections: Detections, classes: Sequence[str], most: int = 3, score: float = 0.0) -> str:

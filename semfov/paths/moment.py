@@ -1,12 +1,14 @@
-"""The record of one frame of a camera or a video."""
+"""The records of one frame of a camera or a video."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief
@@ -14,30 +16,96 @@ from semfov.belief.grid import Grid
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
+from semfov.errors import check
+from semfov.io.schema import Field, Number, Object
 from semfov.paths.base import Record, RecordedLook
+from semfov.paths.files import POSITIVE, WHOLE, Format, pair
 from semfov.paths.merging import distances_to, merge_fixations
+from semfov.paths.windows import CLOSER_VALUES, TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
+from semfov.zoom.glances import Window
+
+_SIDE = Number(low=1, high=10_000, whole=True)
+
+_FOVEA = Format.of(
+    "moment",
+    {
+        "fixation": Field((2,), mixed=True),
+        "probability": Field(("cells",), mixed=True, low=0, high=1 + 1e-3),
+        "visited": Field(("cells",), dtype=torch.bool),
+    },
+    {
+        "number": WHOLE,
+        "grid": pair(_SIDE),
+        "size": pair(POSITIVE),
+        "cell": WHOLE,
+        "next_cell": WHOLE,
+        "seconds": Object({}, Number(low=0)),
+    },
+    endings=(),
+    closer=("fixation", "target", "cell", "place", "presence"),
+)
+"""Format of the files of moments of a fovea."""
+
+_WINDOWS = Format.of(
+    "window moment", TENSORS, {**VALUES, "number": WHOLE, "next_window": WINDOW}, endings=(), closer=CLOSER_VALUES
+)
+"""Format of the files of moments of windows."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Moment(Record):
-    """Look, belief and decision at one frame.
-
-    Beside the attributes of `semfov.paths.Record` it has those of its look.
+    """Base of the records of one frame of a stream.
 
     Attributes:
         number: number of the frame, from 0.
+        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None where nothing
+            is decided.
+
+    Example::
+
+        moment = live.step(frame)
+        print(moment.describe(), moment.objects.boxes)
+    """
+
+    number: int
+
+    @property
+    @abstractmethod
+    def seen(self) -> Detections:
+        """Detections of the look at this frame, a batch of one."""
+
+    @property
+    @abstractmethod
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the point that the next look is at."""
+
+    def _decided(self) -> str | None:
+        """The decision in words; None without one."""
+        if self.decision is None:
+            return None
+        there = "" if self.decision.place is None else f" (there {self.decision.place:.2f})"
+        return f"{self.target_name}: {self.decision.outcome}, p {self.decision.probability:.2f}{there}"
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class FoveaMoment(Moment):
+    """Look, belief and decision at one frame that a fovea looks at.
+
+    Beside the attributes of `Moment` it has those of its look.
+
+    Attributes:
         grid: the cells.
         cell: the fixated cell, or the one that was looked at closely.
         fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
         detections: detections of the look, a batch of one.
-        belief: belief of one episode after the last look that was not a closer one.
-        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None for
-            exploration and for a belief without thresholds.
+        probability: `(X·Y,)`, probability that each cell holds the target, or any object in an exploration, after the
+            last look that was not a closer one.
         visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
         next_cell: the cell to look at in the next frame.
         seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input. A closer look
             has the stage `detect` alone.
         closer: the closer look, if this frame was spent on one; otherwise None.
+        belief: belief of one episode that gave the probability; None in a moment from a file.
 
     Example::
 
@@ -45,16 +113,29 @@ class Moment(Record):
         print(moment.decision.outcome, moment.probability.max())
     """
 
-    number: int
     grid: Grid
     cell: int
     fixation: Tensor
     detections: Detections
-    belief: Belief
+    probability: Tensor
     visited: Tensor
     next_cell: int
-    seconds: dict[str, float]
+    seconds: Mapping[str, float]
     closer: CloseUp | None = None
+    belief: Belief | None = field(default=None, compare=False)
+
+    _format = _FOVEA
+
+    @property
+    def seen(self) -> Detections:
+        """Detections of the look at this frame, a batch of one."""
+        return self.detections
+
+    @property
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the centre of the next cell."""
+        x, y = self.grid.centres[self.next_cell].tolist()
+        return x, y
 
     @property
     def size(self) -> tuple[int, int]:
@@ -80,13 +161,6 @@ class Moment(Record):
         distances = distances_to(self.detections.boxes[0], self.fixation)
         return merge_fixations([self.detections], [distances], self.closer_looks)
 
-    @property
-    def probability(self) -> Tensor:
-        """Probability that each cell holds the target, or any object in an exploration, `(X·Y,)`."""
-        if self.target is None:
-            return 1 - self.belief.class_probabilities()[0, :, 0]
-        return self.belief.probability(self.target)[0]
-
     def describe(self) -> str:
         """Describe belief and decision at the frame in a few words.
 
@@ -96,10 +170,7 @@ class Moment(Record):
         highest = float(self.probability.max())
         if self.target is None:
             return f"p(object) up to {highest:.2f}"
-        if self.decision is None:
-            return f"p({self.target_name}) up to {highest:.2f}"
-        there = "" if self.decision.place is None else f" (there {self.decision.place:.2f})"
-        return f"{self.target_name}: {self.decision.outcome}, p {self.decision.probability:.2f}{there}"
+        return self._decided() or f"p({self.target_name}) up to {highest:.2f}"
 
     def _lines(self) -> list[str]:
         row, column = divmod(self.cell, self.grid.columns)
@@ -137,3 +208,102 @@ class Moment(Record):
                 "seconds": sum(self.seconds.values()),
             }
         ]
+
+    def _base(self) -> Mapping[str, Any]:
+        parts = {"detections": (self.detections,), "closer": self.closer_looks, "ending": None}
+        found = self.decision is not None and self.decision.outcome == "found"
+        return {**vars(self), **parts, "found": found}
+
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
+        record = {name: getattr(self, name) for name in ("number", "cell", "next_cell")}
+        record |= {"grid": [self.grid.columns, self.grid.rows], "size": size, "seconds": dict(self.seconds)}
+        return {name: getattr(self, name) for name in ("fixation", "probability", "visited")}, record
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        grid, looks = Grid(record["grid"][0], record["grid"][1], tuple(record["size"])), shared["detections"]
+        check(len(looks) == 1, "lengths", "one look", len(looks))
+        check(len(tensors["visited"]) == len(grid), "visited", f"{len(grid)} cells", len(tensors["visited"]))
+        for name in ("cell", "next_cell"):
+            check(record[name] < len(grid), name, f"a cell number below {len(grid)}", record[name])
+        return {
+            **{name: tensors[name] for name in ("fixation", "probability", "visited")},
+            **{name: record[name] for name in ("number", "cell", "next_cell", "seconds")},
+            "grid": grid,
+            "detections": looks[0],
+            "closer": next(iter(shared["closer"]), None),
+        }
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class WindowMoment(ZoomPath, Moment):
+    """The looks that count at one frame whose windows are looked at, and what they show.
+
+    It is the record of these looks, the last of which is at this frame. Its objects are merged from them. Those of
+    earlier frames are where they were then.
+
+    Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
+
+    Attributes:
+        next_window: the window to look at in the next frame.
+
+    Example::
+
+        moment = agent.live("person", how="windows").step(frame)
+        print(moment.window.fixation, moment.describe())
+    """
+
+    next_window: Window
+
+    _format = _WINDOWS
+
+    @property
+    def seen(self) -> Detections:
+        """Detections of the look at this frame, a batch of one."""
+        return self.detections[-1]
+
+    @property
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the centre of the next window."""
+        return self.next_window.fixation[:2]
+
+    @property
+    def window(self) -> Window:
+        """The window that was looked at in this frame."""
+        return self.glances[-1].window
+
+    @property
+    def examined(self) -> CloseUp | None:
+        """The closer look, if this frame was spent on one; otherwise None."""
+        last = self.closer[-1] if self.closer else None
+        return last if last is not None and last.number == len(self.glances) - 1 else None
+
+    def describe(self) -> str:
+        """Describe objects or decision at the frame in a few words.
+
+        Returns:
+            The words.
+        """
+        return self._decided() or self.objects_in_words()
+
+    def _lines(self) -> list[str]:
+        """The frame, the windows and the objects."""
+        return [f"frame {self.number}", *super()._lines()]
+
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors, record = super()._parts()
+        return tensors, {**record, "number": self.number, "next_window": window_values(self.next_window)}
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        fields = super()._fields(tensors, record, shared)
+        return {
+            **fields,
+            "number": record["number"],
+            "next_window": window_from(record["next_window"], fields["lattice"]),
+        }

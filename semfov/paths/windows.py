@@ -12,7 +12,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import check
-from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair
+from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
@@ -26,6 +26,9 @@ _WINDOW = {
     "cells": Array(Number(whole=True), 4),
     "within": Maybe(Array(Number(), 4)),
 }
+WINDOW = Object(_WINDOW, None, tuple(_WINDOW))
+"""A window in a file."""
+
 _LATTICE = {
     "size": pair(Number(low=1, whole=True)),
     "canvas": pair(Number(low=1, whole=True)),
@@ -33,25 +36,34 @@ _LATTICE = {
 }
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
+TENSORS = {
+    "values": Field(("n",), mixed=True, finite=False),
+    "cut": Field(("M",), dtype=torch.bool),
+    "show": Field(("n", "C-1"), mixed=True),
+    "object_boxes": Field(("P", 4), mixed=True),
+    "object_scores": Field(("P",), mixed=True),
+    "object_labels": Field(("P",), dtype=torch.int64, low=1),
+    "object_passes": Field(("P",), dtype=torch.int64, low=0),
+}
+"""Tensors of the files of looks at windows."""
+
+VALUES: dict[str, Json] = {
+    "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
+    "windows": Array(WINDOW, "n"),
+    # Files of earlier versions have no certainty.
+    "certainty": Maybe(pair(Number())),
+}
+"""JSON values of the files of looks at windows."""
+
+CLOSER_VALUES = "number", "target", "place", "presence"
+"""What these files keep of closer looks, beside their boxes."""
+
 _FORMAT = Format.of(
     "zoom path",
-    {
-        "values": Field(("n",), mixed=True, finite=False),
-        "cut": Field(("M",), dtype=torch.bool),
-        "show": Field(("n", "C-1"), mixed=True),
-        "object_boxes": Field(("P", 4), mixed=True),
-        "object_scores": Field(("P",), mixed=True),
-        "object_labels": Field(("P",), dtype=torch.int64, low=1),
-        "object_passes": Field(("P",), dtype=torch.int64, low=0),
-    },
-    {
-        "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
-        "windows": Array(Object(_WINDOW, None, tuple(_WINDOW)), "n"),
-        # Files of earlier versions have no certainty.
-        "certainty": Maybe(pair(Number())),
-    },
+    TENSORS,
+    VALUES,
     endings=("decision", "detection", "worth", "passes", "windows", "seconds", "stopped"),
-    closer=("number", "target", "place", "presence"),
+    closer=CLOSER_VALUES,
 )
 """Format of the files of paths through large pictures."""
 
@@ -159,13 +171,7 @@ class ZoomPath(GazeRecord):
         Returns:
             `(x1, y1, x2, y2)` in picture pixels.
         """
-        window, (width, height) = self.glances[number].window, self.lattice.size
-        if window.within is not None:
-            return window.within
-        (x, y, magnification), (wide, high) = window.fixation, self.lattice.canvas
-        across, down = wide / magnification / 2, high / magnification / 2
-        x, y = x + 0.5, y + 0.5
-        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
+        return self.glances[number].window.region(self.lattice)
 
     def _lines(self) -> list[str]:
         """The windows and the objects."""
@@ -217,7 +223,7 @@ class ZoomPath(GazeRecord):
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
-        windows = [{name: getattr(glance.window, name) for name in _WINDOW} for glance in self.glances]
+        windows = [window_values(glance.window) for glance in self.glances]
         certainty = None if self.certainty is None else list(self.certainty)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
         return tensors, {"lattice": lattice, "windows": windows, "certainty": certainty}
@@ -232,14 +238,7 @@ class ZoomPath(GazeRecord):
         for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
             fits = not len(values) or int(values.max()) < most
             check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
-        windows = [
-            Window(
-                tuple(each["fixation"]), each["level"], tuple(each["cells"]), each["within"] and tuple(each["within"])
-            )
-            for each in record["windows"]
-        ]
-        for window in windows:
-            check(window.level < lattice.levels, "windows", f"levels below {lattice.levels}", window.level)
+        windows = [window_from(each, lattice) for each in record["windows"]]
         cuts = tensors["cut"].split(record["lengths"])
         return {
             "lattice": lattice,
@@ -251,3 +250,15 @@ class ZoomPath(GazeRecord):
             "candidates": objects,
             "certainty": record.get("certainty") and Certainty(*record["certainty"]),
         }
+
+
+def window_values(window: Window) -> dict[str, Any]:
+    """The JSON values of a window."""
+    return {name: getattr(window, name) for name in _WINDOW}
+
+
+def window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:
+    """The window with these JSON values; raises `InputError` where the picture has no such level."""
+    check(values["level"] < lattice.levels, "windows", f"levels below {lattice.levels}", values["level"])
+    within = values["within"] and tuple(values["within"])
+    return Window(tuple(values["fixation"]), values["level"], tuple(values["cells"]), within)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from html import escape
 
 from semfov.metrics.scanpath.beside import compare_scanpath
-from semfov.paths import GazeRecord, HeadPath, Moment, Record, Scanpath, ZoomPath
+from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
 from semfov.report.drawing import record_html
 from semfov.report.episode import Pool, episode_data
@@ -84,7 +84,7 @@ draws("report", Scanpath, write_scanpath)
 draws("plot", Scanpath, plot_scanpath)
 draws("plot", ZoomPath, plot_zoom_path)
 draws("plot", HeadPath, plot_head_path)
-draws("plot", Moment, plot_moment)
+draws("plot", FoveaMoment, plot_moment)
 draws("animate", Record, animate_looks)
 draws("animate", Scanpath, animate)
 draws("animate", HeadPath, animate_head)

@@ -147,14 +147,14 @@ def _strategy(
 ) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
-    means = Means(models.observation, models.map, fovea, belief.prior)
+    calibrated = policy.scores == "calibrated"
+    means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
     chosen = named_policy(policy.policy, task, means)
     if by_evidence(policy, task):
         return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
     misses = _of(policy.misses, belief.misses)
-    calibrated = policy.scores == "calibrated"
     observer = Semantic(
         components,
         _given(models.observation, "scores", "an observation model") if calibrated else None,

@@ -215,6 +215,9 @@ class PolicyConfig(Settings):
             `itti-koch`.
         context: context that is added to the log odds of the target: `none`, `place`, `cooccurrence` or `both`.
         context_model: fitted context, by name or file.
+        samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
+            `negative-entropy`, `surprise` and `two-peaks` take the expectation; null takes the look with the expected
+            scores, as published. The observation model must be one of the densities of scores (`...-published`).
     """
 
     policy: str
@@ -226,6 +229,7 @@ class PolicyConfig(Settings):
     saliency: SaliencyModel | None = None
     context: ContextKind | None = None
     context_model: str | None = None
+    samples: Annotated[int, Range(1, 100_000)] | None = None
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,9 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
         check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
+    if choice.samples is not None and not (choice.policy in POLICIES and POLICIES[choice.policy].by_samples):
+        names = ", ".join(name for name in policy_names(task) if POLICIES[name].by_samples)
+        raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
     scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))

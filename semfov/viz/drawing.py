@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.detection.detections import Detections
 from semfov.errors import InputError, check, check_shape
 from semfov.paths import Record, Scanpath
 from semfov.viz.labels import LabelBox, place_labels
@@ -150,41 +151,54 @@ def draw_cross(axes: Axes, point: Tensor) -> list[Artist]:
     ]
 
 
-def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, list[int], list[float]]:
-    """The most confident detections of a look: boxes `(M, 4)`, classes and scores."""
-    detections = scanpath.detections[fixation]
-    sure = detections.confidence[0] >= CONFIDENT
-    labels = detections.labels[0][sure][:most].tolist()
-    return detections.boxes[0][sure][:most].cpu(), labels, detections.confidence[0][sure][:most].tolist()
-
-
 def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6) -> list[Artist]:
-    """Draw the most confident detections of a look, each labelled with its best class other than background.
+    """Draw the most confident detections of a look (`draw_seen`); labels do not cover the point of gaze."""
+    width, height = scanpath.grid.extent.tolist()
+    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
+    reach = 8 * per_point(axes)
+    gaze = (x - reach, y - reach, x + reach, y + reach)
+    seen = seen_well(scanpath.detections[fixation], most)
+    return draw_seen(axes, seen, scanpath.classes, (width, height), target=scanpath.target, kept_free=[gaze])
 
-    Labels do not cover the point of gaze. The figure must be laid out, because the positions of labels depend on the
-    layout.
+
+def seen_well(detections: Detections, most: int) -> Detections:
+    """The most confident detections of a look, a batch of one, without padding."""
+    count = min(most, int((detections.confidence[0] >= CONFIDENT).sum()))
+    return Detections(detections.boxes[:, :count], detections.scores[:, :count], detections.mask[:, :count]).to("cpu")
+
+
+def draw_seen(
+    axes: Axes,
+    seen: Detections,
+    classes: Sequence[str],
+    frame: tuple[float, float],
+    *,
+    target: int | None = None,
+    kept_free: Sequence[LabelBox] = (),
+) -> list[Artist]:
+    """Draw detections, each labelled with its best class other than background.
+
+    The figure must be laid out, because the positions of labels depend on the layout.
 
     Args:
         axes: to draw in.
-        scanpath: the episode.
-        fixation: number of the look.
-        most: largest number of detections.
+        seen: the detections, a batch of one.
+        classes: names of the classes, background first.
+        frame: `(width, height)` of the picture.
+        target: class whose detections have a colour of their own.
+        kept_free: rectangles that labels must not cover.
 
     Returns:
         The artists drawn.
     """
-    boxes, labels, scores = seen_well(scanpath, fixation, most)
     tags: list[Tag] = []
     drawn: list[Artist] = []
-    for box, label, score in zip(boxes, labels, scores, strict=True):
-        colour = TARGET if label == scanpath.target else OTHER
+    for box, label, score in zip(seen.boxes[0], seen.labels[0].tolist(), seen.confidence[0].tolist(), strict=True):
+        colour = TARGET if label == target else OTHER
         x1, y1, x2, y2 = box.tolist()
-        tags.append(Tag((x1, y1, x2, y2), f"{scanpath.classes[label]} {score:.2f}", colour))
+        tags.append(Tag((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
         drawn += draw_boxes(axes, box[None], colour)
-    reach = 8 * per_point(axes)
-    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
-    width, height = scanpath.grid.extent.tolist()
-    return [*drawn, *draw_tags(axes, tags, (width, height), [(x - reach, y - reach, x + reach, y + reach)])]
+    return [*drawn, *draw_tags(axes, tags, frame, kept_free)]
 
 
 class Tag(NamedTuple):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.paths import Moment, Record
+from semfov.paths import FoveaMoment, Record
 from semfov.viz.animation import Film, render
 from semfov.viz.drawing import CONFIDENT, Tag, draw_boxes, draw_cross, draw_image, draw_tags, photograph_of
 from semfov.viz.labels import LabelBox
@@ -113,7 +113,7 @@ def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float
 
 
 @styled
-def plot_moment(moment: Moment, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
+def plot_moment(moment: FoveaMoment, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
     """Plot the point of gaze in a frame, and the objects.
 
     Args:

@@ -67,8 +67,12 @@ class ZoomBelief:
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
-        shape = lattice.rows, lattice.columns
-        self._rate = np.zeros((lattice.levels, *shape), np.float32)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all looks."""
+        shape = self.lattice.rows, self.lattice.columns
+        self._rate = np.zeros((self.lattice.levels, *shape), np.float32)
         # The level that the rates of a cell are from. Rates are predicted when they are asked for.
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.detection.detections import Detections
+from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.gist import FOUND
@@ -68,6 +69,14 @@ class WindowLook(NamedTuple):
     left: float
 
 
+class _Dated(NamedTuple):
+    """Boxes `(M, 4)` of a frame, and scores `(M,)` of the target in them."""
+
+    frame: int
+    boxes: Tensor
+    scores: Tensor
+
+
 class CandidateBoxes(CandidatePlaces[WindowLook]):
     r"""Boxes that seem to hold the target of one search.
 
@@ -79,18 +88,22 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     It is due if this probability is at least `likely`, or when no other look follows.
 
+    In a stream the scores of earlier frames count less, and detections and examined places are forgotten when half of
+    the evidence is left (`semfov.episode.Forgetting`).
+
     Args:
         target: class 1..K.
         likely: probability from which on a place is examined at once: without closer looks the search would end with
             `found`.
+        forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
-    def __init__(self, target: int, likely: float) -> None:
-        super().__init__()
+    def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
+        super().__init__(forgetting)
         self._target, self.likely = target, likely
-        self._boxes, self._scores = torch.zeros(0, 4), torch.zeros(0)
-        self._examined: list[Tensor] = []
-        self._number = 0
+        self._shown: list[_Dated] = []
+        self._examined: list[tuple[int, Tensor]] = []  # with their frames
+        self._frame = self._number = 0
 
     _look: WindowLook
 
@@ -99,8 +112,8 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         self._look, self._number = look, look.number
         scores = look.detections.scores[0, :, self._target]
         shown = look.detections.mask[0] & (scores >= FOUND)
-        self._boxes = torch.cat([self._boxes, look.detections.boxes[0][shown]])
-        self._scores = torch.cat([self._scores, scores[shown]])
+        if bool(shown.any()):
+            self._shown.append(_Dated(self._frame, look.detections.boxes[0][shown], scores[shown]))
 
     @property
     def detections(self) -> Detections:
@@ -124,25 +137,51 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """The most evident box, if it is likely enough, or at the end probable enough."""
-        scores = self._scores
+        boxes, scores = self._boxes()
         if self._examined:
-            again = (box_iou(self._boxes, torch.stack(self._examined)) >= SAME).any(-1)
+            again = (box_iou(boxes, torch.stack([box for _, box in self._examined])) >= SAME).any(-1)
             scores = scores.masked_fill(again, 0)
         if not len(scores) or float(scores.max()) <= 0:
             return None
         number = int(scores.argmax())
         score = float(scores[number])
-        picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
-        probability = float((picture + place - top).sigmoid())
+        probability = self._chance(score)
         if probability < (least if last else self.likely):
             return None
-        return CandidatePlace(self._boxes[number], score, probability)
+        return CandidatePlace(boxes[number], score, probability)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Leave out the detections of both boxes."""
-        self._examined += [candidate.box, box]
+        self._examined += [(self._frame, candidate.box), (self._frame, box)]
         self._number += 1
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look, which is the last look of the path."""
         return CloseUp(None, self._target, None, box, place, presence, number=self._number - 1)
+
+    def wait(self) -> None:
+        """Let a frame pass: forget boxes of which less than half the evidence is left."""
+        self._frame += 1
+        oldest = self._frame - self.forgetting.span
+        self._shown = [each for each in self._shown if each.frame >= oldest]
+        self._examined = [(frame, box) for frame, box in self._examined if frame >= oldest]
+
+    def probability(self, look: CloseUp) -> float:
+        """Present probability that the target is at the place of a closer look, by the detections that overlap it."""
+        boxes, scores = self._boxes()
+        if not len(scores):
+            return self._chance(0.0)
+        return self._chance(float((scores * (box_iou(boxes, look.box[None])[:, 0] >= SAME)).max()))
+
+    def _boxes(self) -> tuple[Tensor, Tensor]:
+        """Boxes `(M, 4)` of the target that count, and their scores `(M,)`, faded."""
+        if not self._shown:
+            return torch.zeros(0, 4), torch.zeros(0)
+        keep = self.forgetting.keep
+        faded = [each.scores * keep ** (self._frame - each.frame) for each in self._shown]
+        return torch.cat([each.boxes for each in self._shown]), torch.cat(faded)
+
+    def _chance(self, score: float) -> float:
+        """Probability that the target is where the highest score is this one."""
+        picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
+        return float((picture + place - top).sigmoid())

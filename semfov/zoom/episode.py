@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Generic, TypeVar
 
+from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Glances, Window, overview
 from semfov.zoom.policy import Choice
@@ -11,7 +12,8 @@ from semfov.zoom.policy import Choice
 _Belief = TypeVar("_Belief", ZoomBelief, None)
 
 Order = Callable[[Sequence[Glance], set[Window]], Sequence[Choice]]
-"""Maps the looks so far, and their windows, to the windows to look at next with their values; none ends the episode."""
+"""Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
+none ends the episode."""
 
 
 class Turn(Generic[_Belief]):
@@ -21,10 +23,18 @@ class Turn(Generic[_Belief]):
         glance: result of the look.
         worth: value of the look when it was chosen.
         belief: belief after it; None in episodes without one.
+        looks: the looks that count after it, the overview first.
     """
 
-    def __init__(self, glance: Glance, worth: float, belief: _Belief, choose: Callable[[], Sequence[Choice]]) -> None:
-        self.glance, self.worth, self._choose = glance, worth, choose
+    def __init__(
+        self,
+        glance: Glance,
+        worth: float,
+        belief: _Belief,
+        looks: Sequence[Glance],
+        choose: Callable[[], Sequence[Choice]],
+    ) -> None:
+        self.glance, self.worth, self.looks, self._choose = glance, worth, looks, choose
         self.belief: _Belief = belief
 
     @cached_property
@@ -38,6 +48,61 @@ class Turn(Generic[_Belief]):
         return self.choices[0][1] if self.choices else 0.0
 
 
+class _Recent(Generic[_Belief]):
+    """The looks of an episode that count, and the belief of them.
+
+    Attributes:
+        looks: the looks, the overview first.
+        windows: their windows.
+        renewed: whether the overview is to be renewed.
+    """
+
+    def __init__(self, belief: _Belief, forgetting: Forgetting | None) -> None:
+        self.belief, self.forgetting = belief, forgetting
+        self.looks: list[Glance] = []
+        self.windows: set[Window] = set()
+        self.renewed = False
+        self._frames: list[int] = []
+
+    def add(self, glance: Glance, frame: int) -> None:
+        """Add a look at a frame, and forget those that it replaces and those that are too old."""
+        self.looks.append(glance)
+        self._frames.append(frame)
+        if self.forgetting is not None and self._forgets(glance, frame):
+            self.windows = {look.window for look in self.looks}
+            if self.belief is not None:
+                self.belief.clear()
+                for look in self.looks:
+                    self.belief.add(look)
+            return
+        self.windows.add(glance.window)
+        if self.belief is not None:
+            self.belief.add(glance)
+
+    @property
+    def oldest(self) -> Window:
+        """The window that was looked at longest ago."""
+        return min(zip(self._frames, self.looks, strict=True), key=lambda dated: dated[0])[1].window
+
+    def _forgets(self, glance: Glance, frame: int) -> bool:
+        """Forget looks; tells whether there were any."""
+        assert self.forgetting is not None
+        first, span = self.looks[0].window, self.forgetting.span
+        again = glance.window in self.windows
+        dated: list[tuple[int, Glance]] = list(zip(self._frames, self.looks, strict=True))
+        if again and glance.window == first:
+            dated = [dated[-1], *dated[1:-1]]
+        # An old overview is kept until there is a new one, as all other looks are predicted from it.
+        kept = [
+            (when, look)
+            for when, look in dated
+            if look is glance or (look.window != glance.window and (look.window == first or frame - when <= span))
+        ]
+        self._frames, self.looks = [when for when, _ in kept], [look for _, look in kept]
+        self.renewed = frame + 1 - self._frames[0] > span
+        return len(kept) < len(dated) or again
+
+
 def look_by_look(
     glances: Glances,
     order: Order,
@@ -45,10 +110,16 @@ def look_by_look(
     *,
     ends: Callable[[Glance], bool] = lambda glance: False,
     hints: bool = True,
+    forgetting: Forgetting | None = None,
 ) -> Iterator[Turn[_Belief]]:
-    """Look at the whole picture, and then at the windows of an order, until it has none left.
+    r"""Look at the whole picture, and then at the windows of an order, until it has none left.
 
     The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it.
+
+    In a stream (`LiveGlances.show`) looks are forgotten. A look counts for :math:`\ln 2 / r` frames, in which half of
+    its evidence would fade at the rate r, or until the next look at its window. The window is then free again. The
+    overview is renewed after as many frames. The episode has no end: where the order has no window left, the window
+    that was looked at longest ago is looked at again.
 
     Args:
         glances: source of looks at the picture.
@@ -56,6 +127,7 @@ def look_by_look(
         belief: belief that every look updates; None keeps none.
         ends: tells whether a look ends the episode.
         hints: whether hints are needed in windows of the last level, too (`Glances.see`).
+        forgetting: forgetting between the frames of a stream; None for a picture, of which all looks count.
 
     Yields:
         Each turn.
@@ -68,16 +140,20 @@ def look_by_look(
         for turn in look_by_look(glances, row_by_row, None):
             print(turn.glance.window)
     """
-    seen, done = list[Glance](), set[Window]()
-    choices: Sequence[Choice] = [(overview(glances.lattice), float("inf"))]
+    recent, first = _Recent(belief, forgetting), overview(glances.lattice)
+
+    def choose() -> Sequence[Choice]:
+        choices = order(recent.looks, recent.windows)
+        if forgetting is not None and (recent.renewed or not choices):
+            return [(first, choices[0][1])] if choices else [(recent.oldest, 0.0)]
+        return choices
+
+    choices: Sequence[Choice] = [(first, float("inf"))]
     while choices:
         looks = glances.see([window for window, _ in choices], hints=hints)
         for glance, (_, worth) in zip(looks, choices, strict=True):
-            seen.append(glance)
-            done.add(glance.window)
-            if belief is not None:
-                belief.add(glance)
-            turn = Turn(glance, worth, belief, lambda: order(seen, done))
+            recent.add(glance, glances.frame)
+            turn = Turn(glance, worth, belief, tuple(recent.looks), choose)
             yield turn
             if ends(glance):
                 return

@@ -1,6 +1,7 @@
 """Facts about the looks of a search, from which the presence of the target in the picture is predicted."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import torch
@@ -57,6 +58,13 @@ class SearchFacts:
     def __init__(self, belief: ZoomBelief) -> None:
         self.belief = belief
         self.looks: list[LookFacts] = []
+
+    def see(self, looks: Sequence[Glance]) -> None:
+        """Take the looks that count after another look; those of earlier ones that are missing were forgotten."""
+        if len(looks) != len(self.looks) + 1:
+            self.looks = []
+        for glance in looks[len(self.looks) :]:
+            self.add(glance)
 
     def add(self, glance: Glance) -> None:
         """Add the facts of a look."""

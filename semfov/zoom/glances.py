@@ -31,6 +31,22 @@ class Window:
     cells: tuple[int, int, int, int]
     within: tuple[float, float, float, float] | None = None
 
+    def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
+        """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels.
+
+        Args:
+            lattice: lattice of the picture.
+
+        Returns:
+            The part.
+        """
+        if self.within is not None:
+            return self.within
+        (x, y, magnification), (wide, high), (width, height) = self.fixation, lattice.canvas, lattice.size
+        across, down = wide / magnification / 2, high / magnification / 2
+        x, y = x + 0.5, y + 0.5
+        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
+
 
 @dataclass(frozen=True)
 class Glance:
@@ -91,9 +107,11 @@ class Glances(ABC):
 
     Attributes:
         lattice: the lattice of the picture.
+        frame: number of the frame of a stream that looks show; 0 for a picture.
     """
 
     lattice: Lattice
+    frame: int = 0
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
@@ -119,6 +137,15 @@ class LiveGlances(Glances):
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
+
+    def show(self, view: WindowView, frame: int) -> None:
+        """Take the next frame of a stream, which has the size of the first.
+
+        Args:
+            view: the frame, from `WindowEye.open`.
+            frame: its number.
+        """
+        self.view, self.frame = view, frame
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Resample the windows and detect in them."""

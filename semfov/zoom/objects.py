@@ -1,12 +1,40 @@
 """Objects of a large picture, merged from the detections of several windows."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
 from semfov.zoom.glances import Glance
+from semfov.zoom.lattice import Lattice
+
+
+def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
+    """The looks at a stream, without the detections whose place a later look has shown as closely.
+
+    What moves would otherwise be shown at every place where a look saw it.
+
+    Args:
+        glances: looks at frames, in their order.
+        lattice: lattice of the frames.
+
+    Returns:
+        The looks with the detections that lie in no later window of at least the same magnification.
+    """
+    kept = []
+    for number, glance in enumerate(glances):
+        seen, left = glance.detections, glance.detections.mask[0]
+        for later in (each.window for each in glances[number + 1 :]):
+            if later.fixation[2] >= glance.window.fixation[2]:
+                x1, y1, x2, y2 = later.region(lattice)
+                low, high = seen.boxes.new_tensor([x1, y1]), seen.boxes.new_tensor([x2, y2])
+                inside = (seen.boxes[0, :, :2] >= low) & (seen.boxes[0, :, 2:] <= high)
+                left = left & ~inside.all(-1)
+        parts = (part[:, left] for part in (seen.boxes, seen.scores, seen.mask))
+        kept.append(replace(glance, detections=Detections(*parts), cut=glance.cut[left]))
+    return kept
 
 
 def merge(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
@@ -17,6 +18,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
+    forgetting: Forgetting | None = None,
 ) -> Iterator[Turn[ZoomBelief]]:
     """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
 
@@ -27,6 +29,7 @@ def look_for(
         confirm: score from which on a look confirms the target.
         slices: windows that can confirm the target; None lets windows of all magnifications confirm it.
         closest: whether only windows of the last level can confirm it.
+        forgetting: forgetting between the frames of a stream, which never end (`look_by_look`).
 
     Yields:
         Each turn.
@@ -43,11 +46,17 @@ def look_for(
         confirms = window in allowed if allowed is not None else window.level == last or not closest
         return confirms and float(glance.show[target - 1]) >= confirm
 
-    yield from look_by_look(glances, best, belief, ends=ends)
+    yield from look_by_look(glances, best, belief, ends=ends, forgetting=forgetting)
 
 
 def find_everything(
-    glances: Glances, evidence: Rates, target: int | None = None, *, batch: int = 1, worth: float = 0.0
+    glances: Glances,
+    evidence: Rates,
+    target: int | None = None,
+    *,
+    batch: int = 1,
+    worth: float = 0.0,
+    forgetting: Forgetting | None = None,
 ) -> Iterator[Turn[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
 
@@ -57,6 +66,7 @@ def find_everything(
         target: class 1..K; None for all classes.
         batch: number of windows that are chosen jointly and looked at together.
         worth: the exploration ends when no look is expected to find more new objects than this.
+        forgetting: forgetting between the frames of a stream, which never end (`look_by_look`).
 
     Yields:
         Each turn; the value of a look is the number of new objects that it is expected to find.
@@ -67,4 +77,4 @@ def find_everything(
         chosen = jointly(lambda taken: best_find(belief, taken, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
-    yield from look_by_look(glances, best, belief, hints=False)
+    yield from look_by_look(glances, best, belief, hints=False, forgetting=forgetting)

@@ -71,13 +71,16 @@ def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool
         The order.
     """
     ranking: list[Choice] = []
+    ranked_by: Glance | None = None
 
     def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
-        if len(looks) == 1:
-            values = torch.tensor([raw(looks[0], window, targets, most=most) for window in windows])
+        nonlocal ranked_by
+        if looks[0] is not ranked_by:
+            ranked_by = looks[0]
+            values = torch.tensor([raw(ranked_by, window, targets, most=most) for window in windows])
             places = values.argsort(descending=True, stable=True).tolist()
-            ranking.extend((windows[place], float(values[place])) for place in places)
-        return ranking[len(looks) - 1 : len(looks)]
+            ranking[:] = [(windows[place], float(values[place])) for place in places]
+        return next(([choice] for choice in ranking if choice[0] not in done), [])
 
     return order
 

@@ -13,7 +13,7 @@ from semfov.cli import live
 from semfov.cli.main import main
 from semfov.data.sources import Picture, Stream, embedded_picture
 from semfov.decision import CloseUp, Decision
-from semfov.paths import Moment
+from semfov.paths import FoveaMoment
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
 
@@ -146,9 +146,10 @@ def moment(**changes):
     made = {
         "classes": ("background", "cup"),
         "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": seen,
-        "belief": belief, "decision": None, "visited": torch.zeros(8, dtype=torch.bool), "next_cell": 3, "seconds": {},
+        "probability": belief.probability(1)[0], "decision": None, "visited": torch.zeros(8, dtype=torch.bool),
+        "next_cell": 3, "seconds": {},
     }  # fmt: skip
-    return Moment(**{**made, **changes})
+    return FoveaMoment(**{**made, **changes})
 
 
 def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():

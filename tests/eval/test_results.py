@@ -16,7 +16,7 @@ from eval.page.experiments import AT_THRESHOLDS, THRESHOLDS, ResultsConfig, expe
 from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import BASELINES, FINDINGS, MEASURES, TESTED, Finding, Gain, Overtaken
 from eval.page.origin import missing, origin
-from eval.page.tables import agreement, paired
+from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
 from eval.page.verdicts import VERDICTS
 from eval.results import PLACE, WHOLE, fill_page, page_table, results
@@ -268,6 +268,18 @@ def test_signs_are_corrected_as_closed_testing_corrects_them(seed):
 def test_differences_without_any_error_have_signs():
     np.testing.assert_array_equal(corrected_signs(np.array([0.0, 0.1, -0.1]), np.zeros(3)), [0, 1, -1])
     assert behind(np.array([0.0, -0.1, -0.3, -0.2, 0.4]), np.array([0.0, 0.06, 0.1, 0.1, 0.1])) == [2]
+
+
+def test_samples_are_compared_with_the_same_policy_without(runs):
+    folder = runs["expected-search"].out
+    drawn, found = "predictive-raw, samples 16", {"predictive-raw": 3, "predictive-raw, samples 16": 9, "random": 30}
+    write_records(folder, searches(tuple(found), lambda policy, scene, _: found[policy] - scene))
+    rows = [cells_of(row) for row in by_samples(folder, (1, 5, 9))]
+    assert rows[0] == ["difference to the expected scores", "1", "5", "9"]
+    # After one shift the plain search has found the targets of scenes 2 and 3, after five of 0 to 3, the other of 4, 5.
+    scenes = {n: [(0 <= 9 - s <= n) - float(0 <= 3 - s <= n) for s in range(6)] for n in (1, 5, 9)}
+    expected = [f"{100 * np.mean(d):+.1f} ± {100 * np.std(d, ddof=1) / 6**0.5:.1f}" for d in scenes.values()]
+    assert rows[2:] == [[drawn, *expected]]
 
 
 def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):

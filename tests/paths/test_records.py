@@ -18,7 +18,7 @@ from semfov.detection import Objects, Placement
 from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write_file
-from semfov.paths import GazeRecord, HeadPath, Moment, Record, Stimulus, ZoomPath, reduced_copy
+from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Stimulus, WindowMoment, ZoomPath, reduced_copy
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice
@@ -104,7 +104,7 @@ def head_path(world=None):
 def moment():
     grid = Grid(4, 2, (40, 20))
     belief = DirichletBelief(torch.rand(1, 8, 3, generator=torch.Generator().manual_seed(3)) + 1)
-    return Moment(
+    return FoveaMoment(
         classes=CLASSES,
         target=1,
         decision=Decision("undecided", 0.25),
@@ -113,15 +113,21 @@ def moment():
         cell=5,
         fixation=grid.centres[5],
         detections=looks(3)[2],
-        belief=belief,
+        probability=belief.probability(1)[0],
         visited=torch.zeros(8, dtype=torch.bool),
         next_cell=3,
         seconds={"open": 0.25, "detect": 0.5},
     )
 
 
-RECORDS = [scanpath, zoom_path, head_path, moment]
-WHOLE = RECORDS[:3]
+def window_moment():
+    path = zoom_path()
+    made = {each.name: getattr(path, each.name) for each in dataclasses.fields(path) if each.init}
+    return WindowMoment(**{**made, "number": 7, "ending": None, "next_window": path.glances[1].window})
+
+
+RECORDS = [scanpath, zoom_path, head_path, moment, window_moment]
+PATHS = RECORDS[:3]
 WORDS = {
     "scanpath": (
         "“cup” found after 2 gaze shifts and 1 closer look (probability 0.90, 0.80 at this place)",
@@ -130,6 +136,7 @@ WORDS = {
     "zoom_path": ("cup: found (0.90) in 3 passes", "A closer look confirmed the target."),
     "head_path": ("3 × cat from score 0.3 in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
     "moment": ("cup: undecided, p 0.25", None),
+    "window_moment": ("cup: found, p 0.90 (there 0.80)", "A closer look confirmed the target."),
 }
 
 
@@ -171,8 +178,8 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     assert "cup" in shown or "cat" in shown
 
 
-@pytest.mark.parametrize("make", WHOLE)
-def test_every_path_is_saved_and_loaded(make, tmp_path):
+@pytest.mark.parametrize("make", RECORDS)
+def test_every_record_is_saved_and_loaded(make, tmp_path):
     record = make()
     file = tmp_path / "a.safetensors"
     record.save(file)
@@ -183,12 +190,15 @@ def test_every_path_is_saved_and_loaded(make, tmp_path):
     assert loaded.rows() == record.rows()
     loaded.save(tmp_path / "b.safetensors")
     assert (tmp_path / "b.safetensors").read_bytes() == file.read_bytes()
-    bare = replace(record, target=None, decision=None, closer=(), ending=None)
+    changes = {"closer": CloseUp(0, 1, 5, BOX, 0.8, 0.9)} if make is moment else {"closer": (), "ending": None}
+    bare = replace(record, target=None, decision=None, **changes)
     bare.save(file)
-    assert type(record).load(file).summary() == bare.summary()
+    again = type(record).load(file)
+    assert again.summary() == bare.summary()
+    assert same(again.closer, bare.closer)
 
 
-@pytest.mark.parametrize("make", WHOLE)
+@pytest.mark.parametrize("make", PATHS)
 def test_rows_and_fixations_match_the_looks(make):
     record = make()
     rows = record.rows()
@@ -253,7 +263,7 @@ def test_a_record_without_its_picture_is_drawn_on_a_given_one(make):
         record.plot()
 
 
-@pytest.mark.parametrize("make", WHOLE)
+@pytest.mark.parametrize("make", RECORDS)
 def test_a_file_keeps_the_picture_and_files_of_earlier_versions_load(make, tmp_path):
     record = replace(with_picture(make), targets=(1, 2), least=0.4, source="a.jpg")
     file = tmp_path / "a.safetensors"
@@ -272,12 +282,12 @@ def test_a_file_keeps_the_picture_and_files_of_earlier_versions_load(make, tmp_p
         type(bare).load(file)
 
 
-@pytest.mark.parametrize("make", WHOLE)
+@pytest.mark.parametrize("make", RECORDS)
 def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path):
     record = make()
     file, other = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     record.save(file)
-    for wrong in {Scanpath, ZoomPath, HeadPath} - {type(record)}:
+    for wrong in {Scanpath, ZoomPath, HeadPath, FoveaMoment, WindowMoment} - {type(record)}:
         with pytest.raises(DataError, match="expected a file of kind"):
             wrong.load(file)
     kind = json.loads(json.dumps(record._format.kind))
@@ -285,7 +295,7 @@ def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path)
     for name, changed in {
         "target": 3,
         "ending": "boredom",
-        "lengths": [0, 1, 1],
+        "lengths": [9] * len(values["lengths"]),
         "more": 1,
         "classes": ["cup"],
     }.items():
@@ -312,6 +322,16 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         write_file(file, parts, record)
         with pytest.raises(DataError, match=message):
             ZoomPath.load(file)
+    moment().save(file)
+    tensors, values = read(file, "moment")
+    for name, wrong, message in (
+        ("cell", 8, "cell: expected a cell number below 8"),
+        ("grid", [4, 3], "visited: expected 12 cells"),
+        ("lengths", [1, 1], "lengths: expected one look"),
+    ):
+        write_file(file, tensors, {**values, name: wrong})
+        with pytest.raises(DataError, match=message):
+            FoveaMoment.load(file)
     head_path().save(file)
     tensors, values = read(file, "head path")
     world = {name: value for name, value in values["world"].items() if name != "reach"}

@@ -35,6 +35,7 @@ CHANGES = [
     {"tempering": 1.0},
     {"misses": True},
     {"misses": False},
+    {"samples": 4},
     *({name: word} for name, words in WORDS.items() if name != "scores" for word in get_args(words)),
 ]
 
@@ -87,11 +88,11 @@ def test_labels_are_unique(task):
 def test_labels_list_the_differences_from_a_preset():
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
-    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine")
-    assert len(fields(PolicyConfig)) == 9
+    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine", 9)
+    assert len(fields(PolicyConfig)) == 10
     expected = (
         "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, "
-        "context none, context_model mine"
+        "context none, context_model mine, samples 9"
     )
     assert label(everything, "search") == expected
     assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"

@@ -15,6 +15,11 @@ def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     expected = network(values)
     torch.testing.assert_close(through(network, values), expected)
     torch.testing.assert_close(through(network, values, slice(1, 2)), expected[..., 1:2])
+
+
+def test_a_network_called_layer_by_layer_has_the_gradient_of_the_module():
+    torch.manual_seed(0)
+    network, values = small_network(5, 16, 3), torch.randn(40, 5)
     (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)

@@ -53,11 +53,10 @@ def test_windows_come_in_the_order_of_the_summed_scores(agent):
                         total += float(max(scores[[t - 1 for t in targets]] if targets else scores))
             sums.append(total)
         assert [raw(overview, window, targets) for window in windows] == pytest.approx(sums, abs=1e-5)
-        order, looks = ranked(windows, targets), [overview]
-        chosen = []
-        while choice := order(looks, set()):
+        order, done, chosen = ranked(windows, targets), set(), []
+        while choice := order([overview], done):
+            done.add(choice[0][0])
             chosen.append(choice[0][1])
-            looks.append(overview)
         assert chosen == pytest.approx(sorted(sums, reverse=True), abs=1e-5)
 
 

@@ -1,8 +1,12 @@
 """Acquisition functions of scene exploration that simulate one look at every cell.
 
-The value of a look is the change that it is expected to cause in the map, summed over the cells x
+The value of a look is the change that a simulated update causes in the map, summed over the cells x
 (`semfov.gaze.acquisition.lookahead`); `TwoPeaks` takes the largest change instead. p is the mean and T the sum of a
-cell's Dirichlet parameters. A prime or a bar marks their values after the simulated update.
+cell's Dirichlet parameters. A prime or a bar marks their values after the update.
+
+The update is the one with the expected scores E[S], as published. The value F of the updated map is therefore the
+plug-in F(β'(E[S])), and not its expectation E[F(β'(S))]. With `likelihoods` of drawn looks, `KLDivergence`,
+`BayesianSurprise`, `NegativeEntropy` and `TwoPeaks` take the expectation in each cell.
 """
 
 import torch
@@ -29,6 +33,8 @@ class KLDivergence(Lookahead):
         model: the observation model.
         grid: the cells.
         prior: β⁰, positive.
+        likelihoods: likelihoods of drawn looks, for the expectation over them (`Lookahead`); None is the published
+            plug-in of the expected scores.
 
     Raises:
         InputError: `prior` is not positive.
@@ -43,8 +49,10 @@ class KLDivergence(Lookahead):
     tensor(1)
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, prior: float = 0.5) -> None:
-        super().__init__(model, grid)
+    def __init__(
+        self, model: LevelledModel, grid: Grid, *, prior: float = 0.5, likelihoods: Tensor | None = None
+    ) -> None:
+        super().__init__(model, grid, likelihoods=likelihoods)
         check(prior > 0, "prior", "a positive number", prior)
         self.prior = prior
 
@@ -67,6 +75,7 @@ class BayesianSurprise(Lookahead):
     Args:
         model: the observation model.
         grid: the cells.
+        likelihoods: likelihoods of drawn looks, for the expectation over them, as for `KLDivergence`.
 
     >>> from semfov import DirichletBelief, FovealObservationModel
     >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
@@ -93,6 +102,7 @@ class NegativeEntropy(Lookahead):
     Args:
         model: the observation model.
         grid: the cells.
+        likelihoods: likelihoods of drawn looks, for the expectation over them, as for `KLDivergence`.
 
     >>> from semfov import DirichletBelief, FovealObservationModel
     >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
@@ -119,6 +129,7 @@ class TwoPeaks(Lookahead):
     Args:
         model: the observation model.
         grid: the cells.
+        likelihoods: likelihoods of drawn looks, for the expectation over them, as for `KLDivergence`.
 
     >>> from semfov import DirichletBelief, FovealObservationModel
     >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])

@@ -1,4 +1,4 @@
-"""One-step lookahead: the belief about the whole map that a fixation is expected to lead to."""
+"""One-step lookahead: the belief about the whole map after the scores that are expected of a fixation."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
+
+_GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, however many there are
 
 
 class LevelledModel(Protocol):
@@ -27,7 +29,10 @@ class LevelledModel(Protocol):
 
 @dataclass(frozen=True)
 class Outlook:
-    """The present belief, and the belief expected after one more look from each level of distance.
+    """The present belief, and the belief after one more look from each level of distance.
+
+    The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
+    and N M in place of N below.
 
     Attributes:
         beta: β, `(..., X·Y, K+1)`, Dirichlet parameters.
@@ -71,7 +76,9 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
               r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
 
     The expected scores enter Kaplan's rule without calibration (Luzio, Bernardino and Moreno, 2024, the equation of
-    :math:`\bar S^x`, "which can then be applied with Kaplan's rule").
+    :math:`\bar S^x`, "which can then be applied with Kaplan's rule"). A measure F of the result is the plug-in
+    :math:`F(\beta'(E[S]))`, which the paper calls expected. It is not the expectation :math:`E[F(\beta'(S))]`, because
+    neither the update nor F is linear in the scores; `look_ahead_by_samples` computes that.
 
     Args:
         beta: `(..., X·Y, K+1)`, Dirichlet parameters.
@@ -94,6 +101,52 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     return Outlook(beta, total, mean, scores / (scores * mean[..., None, :]).sum(-1, keepdim=True))
 
 
+def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) -> Outlook:
+    r"""Simulate Kaplan's update of every cell with M looks drawn from the belief, at every level of distance.
+
+    .. math:: k_m \sim p, \qquad \lambda_m = \lambda_{k_m n m}, \qquad E[F] \approx \frac1M \sum_m F(\beta'(\lambda_m))
+
+    The classes are drawn at M equally spaced points of their cumulative distribution. These points move with the number
+    of visited cells, and are the same in all cells, so that cells with the same belief have the same value.
+
+    Args:
+        beta: `(..., X·Y, K+1)`, Dirichlet parameters.
+        likelihoods: `(K+1, N, M, K+1)`, from `semfov.gaze.acquisition.samples.sampled_likelihoods`.
+        visited: `(..., X·Y)` boolean, cells that were fixated.
+
+    Returns:
+        The present belief, and N M beliefs in place of N expected ones, the M of a level side by side.
+
+    Raises:
+        InputError: belief and likelihoods have different numbers of classes.
+    """
+    components = beta.shape[-1]
+    check_shape(likelihoods, "likelihoods", components, None, None, components)
+    total = beta.sum(-1)
+    mean = beta / total[..., None]
+    number = torch.arange(likelihoods.shape[2], device=beta.device)
+    start = (visited.sum(-1).to(beta) * _GOLDEN).frac()[..., None, None]
+    point = (number + start) / len(number)
+    above = point[..., None] >= mean.cumsum(-1)[..., None, :]
+    drawn = above.sum(-1).clamp(max=components - 1)
+    likelihood = likelihoods.to(beta)[drawn, :, number].transpose(-2, -3).flatten(-3, -2)
+    evidence = likelihood / (likelihood * mean[..., None, :]).sum(-1, keepdim=True)
+    return Outlook(beta, total, mean, evidence)
+
+
+def mean_over_samples(values: Tensor, likelihoods: Tensor) -> Tensor:
+    """Mean over the looks of each level.
+
+    Args:
+        values: `(..., N M)`, a value for each belief of `look_ahead_by_samples`.
+        likelihoods: `(K+1, N, M, K+1)`, the likelihoods that were given to it.
+
+    Returns:
+        `(..., N)`.
+    """
+    return values.unflatten(-1, likelihoods.shape[1:3]).mean(-1)
+
+
 class Lookahead(AcquisitionFunction):
     """Base of the acquisition functions of exploration that look one step ahead.
 
@@ -103,28 +156,40 @@ class Lookahead(AcquisitionFunction):
     Args:
         model: the observation model (`semfov.FovealObservationModel`).
         grid: the cells, of one image or of a batch.
+        likelihoods: `(K+1, N, M, K+1)`, likelihoods of drawn looks
+            (`semfov.gaze.acquisition.samples.sampled_likelihoods`); the value of a cell is then
+            its mean over them. None takes the value after the expected scores, as published.
     """
 
     levels: Tensor
+    likelihoods: Tensor | None
 
-    def __init__(self, model: LevelledModel, grid: Grid) -> None:
+    def __init__(self, model: LevelledModel, grid: Grid, *, likelihoods: Tensor | None = None) -> None:
         super().__init__()
         self.model = model
         self.register_buffer("levels", model.level(grid.cell_distance))
+        self.register_buffer("likelihoods", likelihoods, persistent=False)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
-        expected = self.model.expected_scores()
+        drawn = self.likelihoods
+        expected = self.model.expected_scores() if drawn is None else None
 
-        def values(maps: Tensor) -> Tensor:
-            return self.pool(seen_from(self.cell_values(look_ahead(maps, expected)), self.levels))
+        def values(maps: Tensor, visited: Tensor) -> Tensor:
+            if expected is not None:
+                seen = self.cell_values(look_ahead(maps, expected))
+            else:
+                assert drawn is not None
+                seen = mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
+            return self.pool(seen_from(seen, self.levels))
 
         if beta.ndim == 2 or self.levels.ndim > 2:
-            return values(beta)
+            return values(beta, visited)
         # One map at a time stays in the processor's cache; a batch at once takes four times as long.
-        return one_by_one(values, beta.flatten(0, -3)).view(beta.shape[:-1])
+        turns = visited.expand(beta.shape[:-1]).flatten(0, -2)
+        return one_by_one(values, beta.flatten(0, -3), turns).view(beta.shape[:-1])
 
     @abstractmethod
     def cell_values(self, outlook: Outlook) -> Tensor:

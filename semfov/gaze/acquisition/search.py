@@ -9,7 +9,7 @@ from semfov.belief.belief import Belief, dirichlet_belief, pick
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.lookahead import LevelledModel, look_ahead, seen_from
+from semfov.gaze.acquisition.lookahead import LevelledModel, look_ahead, look_ahead_by_samples, seen_from
 
 
 class ExpectingModel(Protocol):
@@ -49,7 +49,7 @@ class TargetPosterior(AcquisitionFunction):
 
 
 class PredictedTargetPosterior(AcquisitionFunction):
-    r"""Expected probability of the target in a cell after one more look at the cell: predictive search.
+    r"""Probability of the target in a cell after one more look at the cell, with expected scores: predictive search.
 
     The scores expected of this foveal look enter one simulated update by Kaplan's rule:
 
@@ -57,11 +57,20 @@ class PredictedTargetPosterior(AcquisitionFunction):
               a(x) = \frac{\bar\beta_t}{\sum_k \bar\beta_k} = p_t \frac{T + r_t}{T + 1}, \quad
               r_t = \frac{\bar S_{0,t}}{\sum_j p_j \bar S_{0,j}}, \quad T = \sum_j \beta_j
 
-    (Luzio, Bernardino and Moreno, 2024, Predictive Visual Search.) The expected scores are not calibrated again.
+    (Luzio, Bernardino and Moreno, 2024, Predictive Visual Search.) The expected scores are not calibrated again. This
+    is the plug-in :math:`\beta'(E[S])`, and not the expectation over S. With `likelihoods` of drawn looks it is the
+    expectation, which equals :math:`p_t` if they are the true likelihoods:
+
+    .. math:: E[p'_t] = \frac{T p_t + E[p_t \lambda_t / \sum_j p_j \lambda_j]}{T + 1} = p_t, \qquad
+              E\Bigl[\frac{p_t \lambda_t}{\sum_j p_j \lambda_j}\Bigr] =
+              \int \frac{p_t \lambda_t(S)}{\sum_j p_j \lambda_j(S)} \sum_j p_j \lambda_j(S) \, dS = p_t
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
+        likelihoods: `(K+1, N, M, K+1)`, likelihoods of drawn looks
+            (`semfov.gaze.acquisition.samples.sampled_likelihoods`), of which those at level 0 count; None is the
+            published plug-in.
 
     >>> from semfov import DirichletBelief, FovealObservationModel
     >>> model = FovealObservationModel(torch.tensor([[[9.0, 1.0]], [[1.0, 9.0]]]), [], ["cup"]).requires_grad_(False)
@@ -71,16 +80,22 @@ class PredictedTargetPosterior(AcquisitionFunction):
     """
 
     target: Tensor
+    likelihoods: Tensor | None
 
-    def __init__(self, target: int | Tensor, model: ExpectingModel) -> None:
+    def __init__(self, target: int | Tensor, model: ExpectingModel, *, likelihoods: Tensor | None = None) -> None:
         super().__init__()
         self.model = model
         self.register_buffer("target", torch.as_tensor(target))
+        self.register_buffer("likelihoods", likelihoods, persistent=False)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        outlook = look_ahead(dirichlet_belief(belief).beta, self.model.expected_scores()[:, :1])
-        return pick(outlook.next_mean[..., 0, :], self.target)
+        beta = dirichlet_belief(belief).beta
+        if self.likelihoods is None:
+            outlook = look_ahead(beta, self.model.expected_scores()[:, :1])
+        else:
+            outlook = look_ahead_by_samples(beta, self.likelihoods[:, :1], visited)
+        return pick(outlook.next_mean, self.target).mean(-1)
 
 
 class NeighbourhoodPosterior(AcquisitionFunction):

@@ -14,6 +14,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.ideal import SignalModel
 from semfov.gaze.acquisition.lookahead import LevelledModel
 from semfov.gaze.acquisition.place import MissModel
+from semfov.gaze.acquisition.samples import DrawnModel, sampled_likelihoods
 
 Task = Literal["search", "exploration"]
 
@@ -21,7 +22,7 @@ Table = Literal["saliency", "attention"]
 """What a policy can need of every scene: the saliency of its cells, or attention to every class in its cells."""
 
 
-class GazeModel(LevelledModel, MissModel, SightedModel, SignalModel, Protocol):
+class GazeModel(DrawnModel, LevelledModel, MissModel, SightedModel, SignalModel, Protocol):
     """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
 
 
@@ -34,6 +35,9 @@ class Means:
         map: learned map.
         fovea: width σ of the fovea in units of the image's longer side.
         prior: Dirichlet parameter of every class before the first look.
+        samples: number of drawn looks over which policies that predict looks take the expectation; None takes the look
+            with the expected scores.
+        calibrated: whether scores are calibrated before they update the belief; it matters for drawn looks.
 
     >>> named_policy("kl", "exploration", Means(prior=1.0))
     Traceback (most recent call last):
@@ -45,6 +49,8 @@ class Means:
     map: MapEvidence | None = None
     fovea: float = 100 / 640
     prior: float = 0.5
+    samples: int | None = None
+    calibrated: bool = True
 
 
 class Policy(nn.Module, ABC):
@@ -60,6 +66,7 @@ class Policy(nn.Module, ABC):
         table: the table that it needs of every scene; None for most policies.
         needs_model: whether it is made from an observation model.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
+        by_samples: whether it can take an expectation over drawn looks (`SamplingPolicy`).
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
     >>> from semfov import acquisition
@@ -77,6 +84,7 @@ class Policy(nn.Module, ABC):
     table: ClassVar[Table | None] = None
     needs_model: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
+    by_samples: ClassVar[bool] = False
     by_place: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -154,6 +162,36 @@ class ModelPolicy(Policy):
         """Make the policy with the observation model."""
         assert means.model is not None
         return cls(means.model)
+
+
+class SamplingPolicy(ModelPolicy):
+    """Base of the policies that can take the expectation over drawn looks, in place of the look with expected scores.
+
+    Args:
+        model: observation model; for samples its Dirichlets must be densities of the scores.
+        samples: number of looks that are drawn for each class and level; None takes the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+
+    Raises:
+        InputError: `samples` is less than 1, or the model's Dirichlets are not densities of the scores.
+
+    >>> issubclass(POLICIES["kl"], SamplingPolicy), issubclass(POLICIES["neighbourhood"], SamplingPolicy)
+    (True, False)
+    """
+
+    by_samples = True
+    likelihoods: Tensor | None
+
+    def __init__(self, model: GazeModel, samples: int | None = None, calibrated: bool = True) -> None:
+        super().__init__(model)
+        drawn = None if samples is None else sampled_likelihoods(model, samples, calibrated=calibrated)
+        self.register_buffer("likelihoods", drawn, persistent=False)
+
+    @classmethod
+    def make(cls, means: Means) -> Self:
+        """Make the policy with the observation model and the number of samples."""
+        assert means.model is not None
+        return cls(means.model, means.samples, means.calibrated)
 
 
 POLICIES: dict[str, type[Policy]] = {}

@@ -22,15 +22,18 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.objects import ObjectEvidence
-from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy
+from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy, SamplingPolicy
 
 
-class KL(ModelPolicy):
+class KL(SamplingPolicy):
     """Look where the divergence of the map from its prior is expected to grow most (`semfov.acquisition.KLDivergence`).
 
     Args:
         model: observation model.
         prior: Dirichlet parameter of every class before the first look.
+        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
+            look with the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -42,26 +45,31 @@ class KL(ModelPolicy):
     name = "kl"
     tasks = ("exploration",)
 
-    def __init__(self, model: GazeModel, prior: float = 0.5) -> None:
-        super().__init__(model)
+    def __init__(
+        self, model: GazeModel, prior: float = 0.5, samples: int | None = None, calibrated: bool = True
+    ) -> None:
+        super().__init__(model, samples, calibrated)
         self.prior = prior
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """Make the policy with the observation model and the prior."""
+        """Make the policy with the observation model, the prior and the number of samples."""
         assert means.model is not None
-        return cls(means.model, means.prior)
+        return cls(means.model, means.prior, means.samples, means.calibrated)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The divergence from the prior."""
-        return KLDivergence(self.model, grid, prior=self.prior)
+        return KLDivergence(self.model, grid, prior=self.prior, likelihoods=self.likelihoods)
 
 
-class Surprise(ModelPolicy):
+class Surprise(SamplingPolicy):
     """Look where the map is expected to change most (`semfov.acquisition.BayesianSurprise`).
 
     Args:
         model: observation model.
+        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
+            look with the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -75,14 +83,17 @@ class Surprise(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The divergence from the present map."""
-        return BayesianSurprise(self.model, grid)
+        return BayesianSurprise(self.model, grid, likelihoods=self.likelihoods)
 
 
-class Negentropy(ModelPolicy):
+class Negentropy(SamplingPolicy):
     """Look where the entropy of the map is expected to fall most (`semfov.acquisition.NegativeEntropy`).
 
     Args:
         model: observation model.
+        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
+            look with the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -96,14 +107,17 @@ class Negentropy(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The decrease of the entropy."""
-        return NegativeEntropy(self.model, grid)
+        return NegativeEntropy(self.model, grid, likelihoods=self.likelihoods)
 
 
-class Peaks(ModelPolicy):
+class Peaks(SamplingPolicy):
     """Look where the margin of a most probable class is expected to change most (`semfov.acquisition.TwoPeaks`).
 
     Args:
         model: observation model.
+        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
+            look with the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -117,7 +131,7 @@ class Peaks(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The change of the margin."""
-        return TwoPeaks(self.model, grid)
+        return TwoPeaks(self.model, grid, likelihoods=self.likelihoods)
 
 
 class ConfidenceBound(ModelPolicy):

@@ -15,7 +15,7 @@ from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
-from semfov.gaze.policies.base import ModelPolicy, Policy, Task, required_target
+from semfov.gaze.policies.base import ModelPolicy, Policy, SamplingPolicy, Task, required_target
 
 
 class Random(Policy):
@@ -50,11 +50,14 @@ class NonPredictive(Policy):
         return TargetPosterior(required_target(target, self.name))
 
 
-class Predictive(ModelPolicy):
+class Predictive(SamplingPolicy):
     """Look where the target will be most probable after the look (`semfov.acquisition.PredictedTargetPosterior`).
 
     Args:
         model: observation model.
+        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
+            look with the expected scores, as published.
+        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -68,7 +71,7 @@ class Predictive(ModelPolicy):
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The predicted posterior of the target."""
-        return PredictedTargetPosterior(required_target(target, self.name), self.model)
+        return PredictedTargetPosterior(required_target(target, self.name), self.model, likelihoods=self.likelihoods)
 
 
 class Neighbourhood(ModelPolicy):

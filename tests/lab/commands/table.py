@@ -132,6 +132,14 @@ COMMANDS = {
         files=("episodes.jsonl", "words.md"),
         refused=((("--context", "none"), "context"), (("--tables", "[nothing.safetensors]"), "nothing.safetensors")),
     ),
+    "eval.figures": Command(
+        refused=(
+            (("--target", "cupp"), "did you mean 'cup'"),
+            (("--picture", "nothing.jpg"), "nothing.jpg"),
+            (("--start", "[10,0]"), "start"),
+        ),
+        workers=False,
+    ),
     "eval.head": Command(refused=tuple(
             ((f"--{name}", value), f"{name}: expected")
             for name, value in (("width", "3"), ("dwell", "0"), ("passes", "0"), ("seconds", "0"))

@@ -1,0 +1,162 @@
+"""Decisions of a search by windows: after each look, and after closer looks."""
+
+from collections.abc import Sequence
+
+import torch
+
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision.candidates import LookAt
+from semfov.episode import Forgetting
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.closer import CandidateBoxes, WindowLook
+from semfov.zoom.episode import Turn
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.facts import SearchFacts
+from semfov.zoom.glances import Glance
+
+CLOSER = 100
+"""Default for the largest number of closer looks: as many as there are passes for."""
+
+SCORE = 0.5
+"""Default for the score from which on a detection alone counts as found."""
+
+DEFAULTS = Thresholds(0.9, 0.005)
+"""Thresholds of searches whose evidence has none."""
+
+
+class WindowDecisions:
+    """Decides one search by windows, turn by turn, with closer looks where the evidence has fitted verification.
+
+    Args:
+        evidence: learned evidence by magnification.
+        target: class 1..K.
+        close_up: looks closely at a box `(4,)`; gives the detections, a batch of one.
+        confirm: probability from which on the target is found; None takes the threshold of the evidence.
+        give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
+            of the evidence.
+        closer: largest number of closer looks; 0 decides without them.
+        forgetting: forgetting between the frames of a stream; None forgets nothing.
+
+    Attributes:
+        outcome: 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+
+    Example::
+
+        deciding = WindowDecisions(evidence, target, lambda box: look_closely(glances, box).detections)
+        for number, turn in enumerate(look_for(glances, evidence, target, confirm=math.inf), 1):
+            deciding.see(turn, number, last=turn.ahead == 0)
+            while deciding.candidate is not None:
+                deciding.look()
+        print(deciding.decision(over=True))
+    """
+
+    def __init__(
+        self,
+        evidence: GlimpseEvidence,
+        target: int,
+        close_up: LookAt,
+        *,
+        confirm: float | None = None,
+        give_up: float | None = None,
+        closer: int = CLOSER,
+        forgetting: Forgetting | None = None,
+    ) -> None:
+        self.thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
+        self.verifier: Verifier[WindowLook] | None = None
+        model = evidence.verification
+        if closer and model is not None and model.thresholds is not None:
+            places = CandidateBoxes(target, self.thresholds.confirm, forgetting)
+            at = model.thresholds.changed(confirm, self.thresholds.give_up)
+            self.verifier = Verifier(model, places, close_up, at, closer)
+        else:
+            self.thresholds = self.thresholds.changed(confirm)
+        self.outcome = 0
+        self._facts: SearchFacts | None = None
+        self._ahead = 0.0
+        self._presence: float | None = None
+
+    def wait(self) -> None:
+        """Let the time of a frame pass. In a stream, call it before every frame."""
+        if self.verifier is not None:
+            self.verifier.wait()
+
+    def see(self, turn: Turn[ZoomBelief], number: int, *, last: bool) -> None:
+        """Take in a look, and choose the place that is to be looked at closely.
+
+        Args:
+            turn: the look.
+            number: number of looks so far, closer ones included.
+            last: whether no other look can follow.
+        """
+        self._facts = self._facts or SearchFacts(turn.belief)
+        self._facts.see(turn.looks)
+        self._ahead, self._presence = turn.ahead, None
+        facts, self.outcome = self._facts, 0
+        if not facts.detected and self._ahead >= self.thresholds.give_up and not self.looks:
+            return  # no probability ends the search
+        self._presence = facts.presence(self._ahead)
+        if self.verifier is None:
+            state = torch.tensor([self._presence]), torch.tensor([facts.detected]), torch.tensor([self._ahead])
+            self.outcome = int(settle(*state, self.thresholds))
+            return
+        look = WindowLook(turn.glance.detections, number, self._presence, facts.best, self._ahead)
+        self.verifier.see(look, last=last)
+        self.outcome = self.verifier.outcome()
+
+    @property
+    def candidate(self) -> CandidatePlace | None:
+        """The place that is to be looked at closely now; None if there is none."""
+        return None if self.verifier is None else self.verifier.candidate
+
+    @property
+    def looks(self) -> list[CloseUp]:
+        """The closer looks, in order."""
+        return [] if self.verifier is None else self.verifier.looks
+
+    def look(self) -> CloseUp:
+        """Look closely at the candidate, and choose the next one.
+
+        Returns:
+            The closer look.
+        """
+        assert self.verifier is not None
+        look = self.verifier.look()
+        self.outcome = self.verifier.outcome()
+        return look
+
+    def decision(self, *, over: bool | None = None) -> Decision:
+        """The decision as it stands.
+
+        Args:
+            over: whether the search is over; None: it is if no look is worth a pass, and no place is left to examine.
+
+        Returns:
+            `found`, `absent` or `undecided`.
+        """
+        assert self._facts is not None
+        if self.verifier is not None and self.verifier.looks:
+            return self.verifier.decision(over=over)
+        presence = self._facts.presence(self._ahead) if self._presence is None else self._presence
+        outcome = OUTCOMES[self.outcome]
+        return Decision(outcome, presence, None, self._facts.box if outcome == "found" else None)
+
+
+def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None = None) -> Decision:
+    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them.
+
+    Args:
+        looks: the looks.
+        target: class 1..K.
+        confirm: score from which on a detection whose best class is the target counts as `found`; None takes 0.5.
+
+    Returns:
+        The decision: `found` or `undecided`, with the highest score.
+    """
+    best, box = 0.0, None
+    for seen in (look.detections for look in looks):
+        scores = seen.confidence[0].masked_fill(~seen.mask[0] | (seen.labels[0] != target), 0)
+        if len(scores) and float(scores.max()) > best:
+            best, box = float(scores.max()), seen.boxes[0, scores.argmax()]
+    found = best >= (SCORE if confirm is None else confirm)
+    return Decision("found" if found else "undecided", best, None, box if found else None)

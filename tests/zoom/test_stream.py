@@ -1,0 +1,207 @@
+"""Windows of the frames of a stream: a still picture gives the looks of a search, and a new one is looked at anew."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from semfov import ActivePerception
+from semfov.agents import ZoomAgent
+from semfov.detection.detections import Detections
+from semfov.errors import InputError
+from semfov.live import WindowPerception
+from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
+from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.objects import without_replaced
+from tests.zoom.test_closer import Fickle, evidence
+
+
+def same_looks(moments, path):
+    """Whether moments hold the looks of a path, to the bit."""
+    last = moments[-1]
+    assert [moment.window for moment in moments] == [glance.window for glance in path.glances]
+    assert [moment.next_window for moment in moments[:-1]] == [moment.window for moment in moments[1:]]
+    assert last.values == path.values
+    for look, glance in zip(last.glances, path.glances, strict=True):
+        assert torch.equal(look.detections.boxes, glance.detections.boxes)
+        assert torch.equal(look.detections.scores, glance.detections.scores)
+    assert torch.equal(last.candidates.boxes, path.candidates.boxes)
+    assert last.object_rows() == path.object_rows()
+
+
+@pytest.fixture
+def agent(detector):
+    torch.manual_seed(0)
+    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
+
+
+@pytest.mark.parametrize("target", [None, 3, [1, 3]])
+def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, picture, target, one_thread):
+    path = agent.find_all(picture, target, passes=9)
+    targets = {None: (), 3: (3,)}.get(target) if not isinstance(target, list) else tuple(target)
+    live = WindowPerception(agent, None, targets, rate=0)
+    moments = [live.step(picture) for _ in path.glances]
+    same_looks(moments, path)
+    assert moments[-1].decision is None
+    assert (moments[-1].target, moments[-1].targets) == (path.target, path.targets)
+    assert moments[-1].describe() == moments[-1].objects_in_words() == path.objects_in_words()
+
+
+@pytest.mark.parametrize("kind", ["closely", "plain", "slices"])
+def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, picture, kind, one_thread):
+    """With closer looks, each of which takes a frame, without them, and without learned evidence."""
+    model = {"closely": evidence(), "plain": GlimpseEvidence(3, 8), "slices": None}[kind]
+    agent = ZoomAgent(WindowEye(detector), model).eval()
+    path = agent.search(picture, "red")
+    live = WindowPerception(agent, 1, rate=0)
+    moments = [live.step(picture) for _ in path.glances]
+    same_looks(moments, path)
+    last = moments[-1]
+    assert last.decision.outcome == path.decision.outcome == "found"
+    assert last.decision.probability == path.decision.probability
+    assert last.decision.box.tolist() == path.decision.box.tolist()
+    assert [look.number for look in last.closer] == [look.number for look in path.closer]
+    assert (last.examined is not None) == (kind == "closely")
+    # The stream goes on after the end of the search.
+    assert live.step(picture).number == len(moments)
+
+
+def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one_thread):
+    image = torch.zeros_like(picture)
+    image[1, 320:344, 640:664] = 1
+    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
+    path = agent.search(image, "red", closer=2)
+    live = WindowPerception(agent, 1, rate=0, closer=2)
+    moments = [live.step(image) for _ in path.glances]
+    same_looks(moments, path)
+    assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
+    assert len(path.closer) == len(moments[-1].closer) == 2
+
+
+def test_windows_are_looked_at_again_after_the_half_life_of_evidence(agent, picture):
+    live, last = WindowPerception(agent, rate=math.log(2) / 4.5), {}
+    overviews = []
+    for number in range(30):
+        moment = live.step(picture)
+        window = moment.window
+        # Neither an older look nor a repeated one is among those that count; the overview is looked at in time.
+        assert len({look.window for look in moment.glances}) == len(moment.glances) <= 6
+        if window.level == 0:
+            overviews.append(number)
+        elif window in last:
+            assert number - last[window] > 4.5
+        last[window] = number
+    assert overviews == [*range(0, 30, 5)]
+    assert len(last) < 30 - len(overviews) + 1
+
+
+def test_objects_that_move_or_leave_are_forgotten(agent):
+    """A square jumps to another place: soon it is shown there, and nowhere else."""
+
+    def frame(x):
+        image = torch.zeros(3, 768, 1024)
+        image[0, 320:352, x : x + 32] = 1
+        return image
+
+    live = WindowPerception(agent, rate=0.04)
+    kept = WindowPerception(agent, rate=0)
+    for x in [160] * 24 + [800] * 20:
+        moment, old = live.step(frame(x)), kept.step(frame(x))
+        if x == 160:
+            before = moment.objects
+    assert ((before.boxes[:, 0] - 160).abs() < 17).all()
+    assert ((moment.objects.boxes[:, 0] - 800).abs() < 17).all()
+    assert len(before) > 0
+    assert len(moment.objects) > 0
+    assert (old.objects.boxes[:, 0] < 500).any(), "at rate 0 nothing is forgotten"
+
+
+def test_a_found_target_is_lost_when_it_leaves(detector, picture):
+    agent = ZoomAgent(WindowEye(detector), evidence())
+    live = WindowPerception(agent, 1, rate=0.1)
+    found = [live.step(picture).decision.outcome for _ in range(12)]
+    gone = [live.step(torch.zeros_like(picture)).decision for _ in range(20)]
+    assert "found" in found
+    assert [decision.outcome for decision in gone[-5:]] != ["found"] * 5
+    assert gone[-1].outcome != "found"
+
+
+def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
+    """Brute force over every pair of a box and a later window."""
+    lattice, generator = Lattice.over((1024, 768), (128, 128)), torch.Generator().manual_seed(0)
+    windows = [(0, 0, 0), (1, 4, 4), (2, 8, 8), (1, 0, 0), (2, 20, 20), (0, 0, 0), (2, 10, 9)]
+    glances = []
+    for action in windows:
+        low = torch.rand(6, 2, generator=generator) * 600
+        boxes = torch.cat([low, low + 60], -1)[None]
+        detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
+        glances.append(Glance(on_lattice(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
+    kept = without_replaced(glances, lattice)
+    for number, (glance, left) in enumerate(zip(glances, kept, strict=True)):
+        expected = []
+        for place, (x1, y1, x2, y2) in enumerate(glance.detections.boxes[0].tolist()):
+            hidden = False
+            for later in glances[number + 1 :]:
+                a, b, c, d = later.window.region(lattice)
+                inside = a <= x1 and b <= y1 and x2 <= c and y2 <= d
+                hidden |= inside and later.window.level >= glance.window.level
+            if not hidden:
+                expected.append(place)
+        assert torch.equal(left.detections.boxes[0], glance.detections.boxes[0, expected])
+        assert torch.equal(left.cut, glance.cut[expected])
+    assert sum(len(look.cut) for look in kept) < sum(len(look.cut) for look in glances)
+
+
+@pytest.fixture
+def whole(detector):
+    agent = ActivePerception.raw(detector)
+    return agent
+
+
+def test_the_first_frame_decides_how_a_stream_is_looked_at(whole, picture):
+    for size, how, kind in ((128, "fovea", "FoveaMoment"), (1024, "windows", "WindowMoment")):
+        live = whole.live("red")
+        assert live.how == "auto"
+        moment = live.step(picture[:, :size, :size])
+        assert (live.how, type(moment).__name__) == (how, kind)
+        assert moment.describe().startswith("red: ") or "p(red)" in moment.describe()
+    assert type(whole.live("red", how="fovea").step(picture)).__name__ == "FoveaMoment"
+    small = whole.live(["red", "blue"]).step(picture[:, :128, :128])
+    assert (type(small).__name__, small.targets) == ("WindowMoment", (1, 3))
+    assert whole.live(["red"]).describe() == "finding all “red”"
+
+
+def test_frames_of_opencv_and_other_kinds_give_the_same_moments(whole, picture):
+    pixels = (picture * 255).byte().permute(1, 2, 0).numpy()
+    given = [
+        ("rgb", picture),
+        ("rgb", pixels),
+        ("bgr", pixels[..., ::-1]),
+        ("bgr", np.ascontiguousarray(pixels[..., ::-1])),
+    ]
+    lives = [(whole.live(how="windows", color=color), frame) for color, frame in given]
+    for _ in range(4):
+        first, *others = [live.step(frame) for live, frame in lives]
+        for other in others:
+            assert other.window == first.window
+            assert other.object_rows() == first.object_rows()
+            assert torch.equal(other.photograph, first.photograph)
+
+
+def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(whole, picture):
+    with pytest.raises(InputError, match=r"how: expected 'fovea', 'windows' or 'auto' for a stream; .* got head"):
+        whole.live("red", how="head")
+    with pytest.raises(InputError, match=r"target: expected one class, or None; .* how='windows'"):
+        whole.live(["red", "blue"], how="fovea")
+    with pytest.raises(InputError, match=r"start: expected None for frames that are looked at by windows"):
+        whole.live("red", how="windows", start=3)
+    live = whole.live("red", start=3)
+    with pytest.raises(InputError, match="start: expected None"):
+        live.step(picture)
+    running = whole.live(how="windows")
+    running.step(picture)
+    with pytest.raises(
+        InputError, match=r"frame: expected 1024 × 768 pixels, the size of the first frame, got 1024 × 700"
+    ):
+        running.step(picture[:, :700])
