@@ -372,7 +372,7 @@ class ActivePerception(nn.Module):
             given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
             _only_for(kind, "fovea", "confirm", closer=closer)
             return self.head.search(_scene(picture, color), index, seed=seed, **given)
-        _only_for(kind, "fovea", "passes", start=start)
+        _only_for(kind, "fovea", "none", start=start)
         given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
         return self.zoom.search(_large(picture, color), index, **given)
 
@@ -490,7 +490,7 @@ class ActivePerception(nn.Module):
         if kind == "head":
             given = _given(start=start, duration=duration, worth=worth, **limits)
             return self.head.explore(_scene(picture, color), seed=seed, **given)
-        _only_for(kind, "fovea", "passes", start=start)
+        _only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(_large(picture, color), **_given(worth=worth, **limits))
 
     def live(
