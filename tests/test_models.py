@@ -169,7 +169,8 @@ def test_every_detector_has_all_kinds_of_models():
     names = {"yolov3-tiny", "yolox-nano"}
     learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)}
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
-    kinds = ("", "-sharp", "-published", "-published-narrow")
+    at_thresholds = (f"-published-{threshold}" for threshold in (0.1, 0.25, 0.5))
+    kinds = ("", "-sharp", "-published", "-published-narrow", *at_thresholds)
     every = {name + kind for name in names for kind in kinds}
     assert {path.stem for path in OBSERVATION} == every | {f"{name}-zoom" for name in names}
 

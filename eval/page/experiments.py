@@ -61,7 +61,7 @@ PUBLISHED_EXPLORATION = (
 )
 """Exploration policies of the paper."""
 
-THRESHOLDS = (0.02, 0.1, 0.25, 0.5)
+SCORE_THRESHOLDS = (0.02, 0.1, 0.25, 0.5)
 """Score thresholds of the detector at which the page tests the findings of the paper, which gives none."""
 
 PROPOSED = (
@@ -286,7 +286,7 @@ def at_threshold(kind: str, threshold: float, name: str) -> str:
 AT_THRESHOLDS = tuple(
     at_threshold(kind, threshold, name)
     for kind in ("search", "explore")
-    for threshold in THRESHOLDS
+    for threshold in SCORE_THRESHOLDS
     for name in DETECTORS
 )
 """Names of the experiments at all score thresholds."""
@@ -295,8 +295,8 @@ AT_THRESHOLDS = tuple(
 def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> Iterator[tuple[str, Experiment]]:
     """The paper's searches and explorations at each score threshold, after the looks, which share a pass."""
     sensor = SensorConfig(name="published")
-    yield f"looks-threshold-{name}", ThresholdLooksConfig(**common, sensor=sensor, thresholds=THRESHOLDS)
-    for threshold in THRESHOLDS:
+    yield f"looks-threshold-{name}", ThresholdLooksConfig(**common, sensor=sensor, thresholds=SCORE_THRESHOLDS)
+    for threshold in SCORE_THRESHOLDS:
         # Without a name, the observation model is the one that was fitted at the threshold.
         own = {**common, "detector": replace(settings, threshold=threshold), "sensor": sensor}
         seek = SearchConfig(**own, scanpaths=0, policies=tuple(p for p in PUBLISHED if p != "vocus2"))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eval.page.curves import per_image, records_of, repetition_error
-from eval.page.experiments import AT_THRESHOLDS, DETECTORS, THRESHOLDS
+from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
 from eval.page.findings import LAST
 from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
@@ -86,5 +86,5 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
 
 def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
-    told = {f"threshold {threshold:g}": contrast.difference(threshold, name, runs) for threshold in THRESHOLDS}
+    told = {f"threshold {threshold:g}": contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS}
     return {label: mean for label, (mean, _) in told.items()}, {label: error for label, (_, error) in told.items()}

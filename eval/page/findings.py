@@ -34,7 +34,7 @@ class Measure:
     field: str = "right"
 
 
-MEASURES = {
+COUNTED = {
     "search": (Measure("one target", commonest=True), Measure("all targets")),
     "explore": (Measure("with background"), Measure("without", field=OBJECTS)),
 }
@@ -42,7 +42,7 @@ MEASURES = {
 
 
 @dataclass(frozen=True)
-class Gain:
+class Advantage:
     """The finding that one policy is better than another by so much, or no better.
 
     Attributes:
@@ -114,7 +114,7 @@ class Finding:
     text: str
     kind: str
     shown: str
-    test: Gain | Overtaken
+    test: Advantage | Overtaken
 
     def answer(self, folder: Path, measure: Measure) -> Answer:
         """The answer of a run, by a measure."""
@@ -138,25 +138,25 @@ TESTED = (
         "Calibration is considerably beneficial for non-predictive search.",
         "search",
         "calibrated less raw at 5 / 15 / 30 shifts",
-        Gain("non-predictive-calibrated", "non-predictive-raw", SEARCH),
+        Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH),
     ),
     Finding(
         "Calibration does not influence predictive search.",
         "search",
         "calibrated less raw at 5 / 15 / 30 shifts",
-        Gain("predictive-calibrated", "predictive-raw", SEARCH, expected=0),
+        Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0),
     ),
     Finding(
         "Predictive search comfortably outperforms non-predictive search on raw scores",
         "search",
         "predictive less non-predictive at 5 / 15 / 30 shifts",
-        Gain("predictive-raw", "non-predictive-raw", SEARCH),
+        Advantage("predictive-raw", "non-predictive-raw", SEARCH),
     ),
     Finding(
         "… and on calibrated scores.",
         "search",
         "the same",
-        Gain("predictive-calibrated", "non-predictive-calibrated", SEARCH),
+        Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH),
     ),
     Finding(
         "Calibrated predictive search leads random gaze at first and is overtaken",
@@ -192,7 +192,7 @@ TESTED = (
         "Exploration has no particular advantage from calibration.",
         "explore",
         "KL, calibrated less raw at 1 / 5 / 15 shifts",
-        Gain("kl-calibrated", "kl-raw", EXPLORE, expected=0),
+        Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0),
     ),
 )
 """Findings that are tested at every score threshold."""
@@ -202,25 +202,25 @@ BASELINES = (
         "VOCUS2 is far below random gaze in search.",
         "search",
         "random less VOCUS2 at 5 / 15 / 30 shifts",
-        Gain("random", "vocus2", SEARCH),
+        Advantage("random", "vocus2", SEARCH),
     ),
     Finding(
         "KL divergence consistently outperforms negative entropy (calibrated).",
         "explore",
         "KL less negative entropy at 1 / 5 / 15 shifts",
-        Gain("kl-calibrated", "negative-entropy-calibrated", EXPLORE),
+        Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE),
     ),
     Finding(
         "KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
         "explore",
         "KL less two-peak at 1 / 2 / 4 shifts",
-        Gain("kl-calibrated", "two-peaks-calibrated", (1, 2, 4)),
+        Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4)),
     ),
     Finding(
         "KL divergence outperforms VOCUS2 in exploration (calibrated).",
         "explore",
         "KL less VOCUS2 at 1 / 5 / 15 shifts",
-        Gain("kl-calibrated", "vocus2-calibrated", EXPLORE),
+        Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE),
     ),
 )
 """Findings that are tested at the default threshold alone."""
@@ -234,7 +234,7 @@ def findings(runs: Runs) -> list[str]:
     folders = {kind: published_columns(kind, runs) for kind in LAST}
     rows = [["the paper finds", "shown", "in the paper", *folders["search"]]]
     for finding in FINDINGS:
-        measure = MEASURES[finding.kind][-1 if finding.kind == "search" else 0]
+        measure = COUNTED[finding.kind][-1 if finding.kind == "search" else 0]
         answers: dict[str, str] = {}
         for heading, folder in folders[finding.kind].items():
             first = heading.startswith(next(iter(DETECTORS.values())))

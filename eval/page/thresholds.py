@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from eval.page.curves import difference, per_image, records_of
-from eval.page.experiments import DETECTORS, THRESHOLDS, at_threshold
-from eval.page.findings import LAST, MEASURES, SEARCH, TESTED, Finding, Measure
+from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
+from eval.page.findings import COUNTED, LAST, SEARCH, TESTED, Finding, Measure
 from eval.page.tables import Runs
 from eval.page.verdicts import VERDICTS, Answer, legend
 from semfov.metrics.averages import FloatArray
@@ -15,7 +15,7 @@ def verdicts(runs: Runs) -> list[str]:
     """The table of verdicts by detector and measure: each verdict with the score thresholds at which it is reached."""
     rows = [["the paper finds", "in the paper", "counted", *DETECTORS.values()]]
     for finding in TESTED:
-        for number, measure in enumerate(MEASURES[finding.kind]):
+        for number, measure in enumerate(COUNTED[finding.kind]):
             head = [finding.text, finding.test.published()] if number == 0 else ["", ""]
             cells = (told_by_verdict(answers_at(finding, measure, name, runs)) for name in DETECTORS)
             rows.append([*head, measure.text, *cells])
@@ -24,7 +24,7 @@ def verdicts(runs: Runs) -> list[str]:
 
 def answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> dict[float, Answer]:
     """The answers to a finding at each score threshold, with one of `DETECTORS`."""
-    return {t: finding.answer(runs[at_threshold(finding.kind, t, name)].out, measure) for t in THRESHOLDS}
+    return {t: finding.answer(runs[at_threshold(finding.kind, t, name)].out, measure) for t in SCORE_THRESHOLDS}
 
 
 def told_by_verdict(answers: dict[float, Answer]) -> str:
@@ -87,7 +87,7 @@ CONTRASTS = (
             measure,
             SEARCH,
         )
-        for measure in MEASURES["search"]
+        for measure in COUNTED["search"]
     ),
     *(
         Contrast(
@@ -99,7 +99,7 @@ CONTRASTS = (
             (1, 5, 10, 20),
         )
         for scores in ("calibrated", "raw")
-        for measure in MEASURES["explore"]
+        for measure in COUNTED["explore"]
     ),
 )
 """Differences on which the two headlines of the paper rest."""
@@ -107,10 +107,10 @@ CONTRASTS = (
 
 def by_threshold(runs: Runs) -> list[str]:
     """The table of the differences at each score threshold, in percentage points, for both detectors."""
-    rows = [["detector", "difference", "shifts", *(f"{threshold:g}" for threshold in THRESHOLDS)]]
+    rows = [["detector", "difference", "shifts", *(f"{threshold:g}" for threshold in SCORE_THRESHOLDS)]]
     for name, title in DETECTORS.items():
         for place, contrast in enumerate(CONTRASTS):
-            told = [contrast.difference(threshold, name, runs) for threshold in THRESHOLDS]
+            told = [contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS]
             for number, n in enumerate(contrast.shifts):
                 head = [title if place == number == 0 else "", contrast.text if number == 0 else "", str(n)]
                 rows.append([*head, *(f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for mean, error in told)])

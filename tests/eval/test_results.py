@@ -12,9 +12,9 @@ from scipy.stats import norm
 from eval.explore.config import ExploreConfig
 from eval.page import paper
 from eval.page.curves import behind, corrected_signs
-from eval.page.experiments import AT_THRESHOLDS, THRESHOLDS, ResultsConfig, experiments
+from eval.page.experiments import AT_THRESHOLDS, SCORE_THRESHOLDS, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
-from eval.page.findings import BASELINES, FINDINGS, MEASURES, TESTED, Finding, Gain, Overtaken
+from eval.page.findings import BASELINES, COUNTED, FINDINGS, TESTED, Advantage, Finding, Overtaken
 from eval.page.origin import missing, origin
 from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
@@ -299,16 +299,18 @@ def test_findings_have_sizes_and_verdicts(tmp_path):
     """VOCUS2 finds every target one shift after random gaze."""
     found = {"random": 9, "vocus2": 10}
     write_records(tmp_path, searches(found, lambda policy, scene, _: found[policy] + 5 * (scene % 2)))
-    every, few = MEASURES["search"][1], MEASURES["search"][0]
-    finding = Finding("", "search", "", Gain("random", "vocus2", (5, 9, 15)))
+    every, few = COUNTED["search"][1], COUNTED["search"][0]
+    finding = Finding("", "search", "", Advantage("random", "vocus2", (5, 9, 15)))
     assert str(finding.answer(tmp_path, few)) == "+0.0 ± 0.0 / +100.0 ± 0.0 / +0.0 ± 0.0: holds in part"
     assert str(finding.answer(tmp_path, every)) == "+0.0 ± 0.0 / +50.0 ± 22.4 / +0.0 ± 0.0: open"
-    assert Finding("", "search", "", Gain("random", "vocus2", (5, 30), 0)).answer(tmp_path, every).verdict == "holds"
+    assert (
+        Finding("", "search", "", Advantage("random", "vocus2", (5, 30), 0)).answer(tmp_path, every).verdict == "holds"
+    )
     first = Finding("", "search", "", Overtaken("random", "vocus2", "")).answer(tmp_path, few)
     assert str(first) == "ahead at 9, behind at no shift: not overtaken"
     assert not finding.detects
     assert finding.test.published() == "-"
-    assert Gain("random", "vocus2", (5, 15, 30)).published() == "+29.7 / +43.0 / +28.0"
+    assert Advantage("random", "vocus2", (5, 15, 30)).published() == "+29.7 / +43.0 / +28.0"
     assert len({finding.text for finding in FINDINGS}) == len(FINDINGS) == len(TESTED) + len(BASELINES)
 
 
@@ -349,7 +351,7 @@ def test_every_threshold_has_a_model_of_its_own_and_the_same_sensor(runs):
         assert run.detector.threshold == float(name.split("-")[2])
     for name in ("nano", "tiny"):
         looks = runs[f"looks-threshold-{name}"]
-        assert looks.thresholds == THRESHOLDS
+        assert looks.thresholds == SCORE_THRESHOLDS
         assert list(runs).index(f"looks-threshold-{name}") < list(runs).index(f"search-threshold-0.02-{name}")
 
 
