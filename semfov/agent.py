@@ -585,7 +585,7 @@ def _given(**values: Any) -> dict[str, Any]:
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     """Number of the only class of a target."""
     wanted = [target] if isinstance(target, str | int) else list(target)
-    check(len(wanted) == 1, "target", "one class for a search by windows or a head, or find_all", target)
+    check(len(wanted) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
     return class_index(wanted[0], classes[1:], "target")
 
 

@@ -11,6 +11,7 @@ its paragraph which row and column it means.
 import re
 from dataclasses import dataclass
 from functools import cache
+from math import log
 from pathlib import Path
 
 import pytest
@@ -19,20 +20,35 @@ import torch
 from semfov import FovealObservationModel
 from semfov.agents.head import CONFIRM
 from semfov.belief import Verification
+from semfov.decision import MOST_CLOSER
 from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
+from semfov.live.fovea import RATE
+from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
+from semfov.sensor.log_polar import Retina
 from semfov.zoom.export import OPSET
 from semfov.zoom.hints import FAINT
+from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
 
-PAGES = [
+STRICT = [
     "README.md",
     *(f"docs/{name}.md" for name in ("results", "tables", "zoom", "head", "human", "detectors", "words")),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/decisions/*.md")),
 ]
 """Pages whose sentences repeat what tables say."""
+
+OTHERS = [
+    *(f"docs/{name}.md" for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/measurements/*.md")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md")),
+]
+"""Pages on which a number may also be the output of a command that its section names (`COMMAND`)."""
+
+COMMAND = re.compile(r"python -m|`(?:eval|train|benchmarks)\.|`semfov fit|commit [0-9a-f]{7}")
 
 COMPANIONS = {
     "README.md": ["docs/results.md", "docs/tables.md", "docs/measurements/zoom.md"],
@@ -56,10 +72,10 @@ CONDITIONS = re.compile(
     r"\d[\d,]* ?× ?\d[\d,]*"  # sizes
     r"|\d[\d,.]* ?(?:px|million pixels|pixels|degrees|°)|of 640\b"  # lengths in pixels, and angles
     r"|\b(?:1[89]|20)\d\d(?=[),;.])"  # years of publications
-    r"|\d+e-\d+|10⁻⁶"  # tolerances
+    r"|\d+e-\d+|10⁻⁶|ln 2 / r"  # tolerances, and half-lives
     rf"|(?:[Aa]fter|[Ww]ithin) \d+(?:, \d+)*(?: and \d+)*(?: of \d+)? {_COUNTED}\b"
     rf"|(?:[Ii]n|[Oo]n|[Aa]t|[Ff]or|[Oo]f|[Ww]ith|[Oo]ver|to|the) (?:the |all |both |first )*\d[\d,]* {_COUNTED}\b"
-    r"|(?:[Gg]rowth|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
+    r"|(?:[Gg]rowth|[Rr]ate(?: is| of)?|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
 )
 """What a sentence is about, as opposed to what was measured: sizes, numbers of looks, years, settings by name."""
 
@@ -72,6 +88,7 @@ LINK = re.compile(r"\]\(([^)#\s]+\.md)?(#[\w-]+)?\)")
 _DATA, _DETECTOR, _SPEEDS = DataConfig(), DetectorConfig(), Speeds()
 _COUNTS = torch.tensor(FovealObservationModel.from_pretrained("yolox-nano-published-narrow").metadata["counts"])
 _VERIFICATION = Verification.from_pretrained("yolox-nano")
+_RINGS, _WEDGES = Retina(60.0).receptors((640, 480))
 _OBJECTS, _DETECTIONS = _COUNTS[1:].sum(0).tolist(), _COUNTS.sum(0).tolist()
 
 KNOWN = {
@@ -133,6 +150,42 @@ KNOWN = {
         "between 86 and 88 % where 60 %": "tried on photographs of the fit, without a command",
         "commit 11e960c": "a commit",
     },
+    "docs/measurements/head.md": {"the 300 of": "photographs of the results"},
+    "docs/measurements/human.md": {"(612 searches of 10 people": "the files of the data set"},
+    "docs/measurements/zoom.md": {"at score 0.1 and IoU 0.5": "what recall means"},
+    "docs/sensors.md": {
+        "δ (1 + r / a)": "a formula",
+        f"has {_RINGS} rings of {_WEDGES} receptors, which is {_RINGS * _WEDGES:,} receptors for 307,200": "code",
+        "79 s of processor time, and 220 s by the clock": "a measurement of which the sentence has the machine",
+        "a load of 9, PyTorch 2.15": "its machine",
+    },
+    "docs/pan-tilt.md": {
+        "from -1 to 1": "a range",
+        "(40 by default)": "code, tested with the agent",
+        "0.4 frames": "an example",
+    },
+    "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
+    "docs/command.md": {f"from score {LEAST}": "code"},
+    "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
+    "docs/guides/environments.md": {
+        "version 1.0": "of Gymnasium",
+        "is 0.05 in searches and 0.01 in explorations, and is 1": "signatures in the reference",
+        "is 1 once": "a rule",
+        "whole picture (0) to native pixels (1)": "a range",
+        "score of 0.1 and overlaps": "what found means",
+        f"score of {LEAST}, and an": "code",
+    },
+    "docs/guides/live.md": {
+        f"{MOST_CLOSER} by default": "code",
+        f"at most {MOST_CLOSER} of {log(2) / RATE:.0f} frames": "code",
+        f"{log(2) / WINDOW_RATE:.0f} by default": "code",
+        f"rate, {RATE}": "code",
+        "40 of the fitting": "videos of the table",
+        "20 frames": "videos of the table",
+    },
+    "docs/guides/records.md": {f"which is {LEAST} unless": "code", f"begin at {FAINTEST}": "code"},
+    "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
+    "docs/guides/index.md": {"ROS 2": "a name"},
     "docs/decisions/tempering.md": {f"{len(COCO_CLASSES) + 1} components": "code"},
 }
 """Numbers that no table has, each with the reason; those that are settings are written here by the code."""
@@ -269,10 +322,20 @@ def sources(page, paragraph):
     return [*own, *COMPANIONS.get(page, []), *(path.relative_to(ROOT).as_posix() for path in beside if path.exists())]
 
 
+@cache
+def with_command(page):
+    """Paragraphs of the sections of a page that name a command."""
+    sections = re.split(r"\n(?=#+ )", text_of(page))
+    named = [" ".join(section.split()) for section in sections if COMMAND.search(section)]
+    return [each for each in paragraphs(page) if any(" ".join(each.split()) in section for section in named)]
+
+
 def numbers_without_a_table(page):
     """Sentences of a page with the numbers that no table carries."""
     found = []
     for paragraph in paragraphs(page):
+        if page in OTHERS and paragraph in with_command(page):
+            continue
         known = [cell for name in sources(page, paragraph) for cell in cells(name)]
         said = words(paragraph)
         for sentence in sentences(paragraph):
@@ -293,7 +356,7 @@ def is_difference(number, others):
     return any(abs(abs(value(a) - value(b)) - gap) < 0.051 for a in others for b in others) and "." in number
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", STRICT + OTHERS)
 def test_every_number_of_a_sentence_is_in_a_table_or_has_a_reason(page):
     lost = numbers_without_a_table(page)
     told = "\n".join(f"  {numbers}: {sentence}" for numbers, sentence in lost)
@@ -309,7 +372,7 @@ def test_every_number_with_a_reason_is_still_on_its_page(page):
 def test_most_changes_of_a_number_are_noticed():
     """Of the decimals that tables carry, each changed by up to three units of its last digit."""
     changed = noticed = 0
-    for page in PAGES:
+    for page in STRICT:
         for paragraph in paragraphs(page):
             known = [cell for name in sources(page, paragraph) for cell in cells(name)]
             said = words(paragraph)
