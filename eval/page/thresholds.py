@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from eval.page.curves import difference, per_image, records_of
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
-from eval.page.findings import COUNTED, LAST, SEARCH, TESTED, Finding, Measure
+from eval.page.findings import COUNTED, EXPLORE, LAST, SEARCH, TESTED, Finding, Measure
 from eval.page.tables import Runs
 from eval.page.verdicts import VERDICTS, Answer, legend
 from semfov.metrics.averages import FloatArray
@@ -99,6 +99,17 @@ CONTRASTS = (
             (1, 5, 10, 20),
         )
         for scores in ("calibrated", "raw")
+        for measure in COUNTED["explore"]
+    ),
+    *(
+        Contrast(
+            f"exploration by KL, {measure.text}: calibrated less raw",
+            "explore",
+            "kl-calibrated",
+            "kl-raw",
+            measure,
+            EXPLORE,
+        )
         for measure in COUNTED["explore"]
     ),
 )
