@@ -96,18 +96,13 @@ BEYOND_EXPLORATION = (
 
 _SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
-SAMPLES = 16
-"""Number of drawn looks in the policies that take an expectation over them."""
-
-EXPECTED = tuple(
-    PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, SAMPLES)
-)
+EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
 """Predictive searches with the expected scores, and with the expectation over drawn looks."""
 
 EXPECTED_EXPLORATION = tuple(
     PolicyConfig(policy, "calibrated", samples=samples)
     for policy in ("kl", "negative-entropy")
-    for samples in (None, SAMPLES)
+    for samples in (None, 16)
 )
 """The same two kinds of explorations."""
 
@@ -257,9 +252,11 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
         yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
         if name == "nano":
-            few = ProtocolConfig(starts=3, shifts=20)
-            yield "expected-search", seek(sensor=sensor, belief=belief, policies=EXPECTED)
-            yield "expected-explore", tour(sensor=sensor, belief=belief, policies=EXPECTED_EXPLORATION, protocol=few)
+            # An expectation takes ten times as long as the published decision.
+            slow = {"sensor": sensor, "belief": belief, "protocol": ProtocolConfig(starts=3)}
+            yield "expected-search", seek(**slow, policies=EXPECTED)
+            slow["protocol"] = ProtocolConfig(starts=1, shifts=20)
+            yield "expected-explore", tour(**slow, policies=EXPECTED_EXPLORATION)
         yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
