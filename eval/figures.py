@@ -34,7 +34,7 @@ from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import seen_by
 from semfov.runs.settings import Settings, Shifts, Side
-from semfov.runs.setup import make_eye, make_observation, published_model
+from semfov.runs.setup import make_eye, make_observation
 from semfov.sensor.named import SensorName, named_sensor
 from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
 from semfov.viz.drawing import (
@@ -147,7 +147,7 @@ def search_example(config: FiguresConfig) -> Example:
     """Search the photograph as published: calibrated scores, and predictive search."""
     sensor = SensorConfig(name="published")
     eye = make_eye(config.detector, sensor)
-    model = make_observation(config.model or published_model(config.detector, sensor), eye)
+    model = make_observation(config.model, eye)
     observer = Semantic(len(eye.detector.classes) + 1, model)
     agent = ActivePerception(eye, (observer, Predictive(model)), (observer, KL(model)), grid=config.grid)
     image = EmbeddedScenes(eye.detector.classes[1:])[0].image if config.picture is None else as_image(config.picture)

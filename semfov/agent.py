@@ -372,7 +372,7 @@ class ActivePerception(nn.Module):
             given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
             _only_for(kind, "fovea", "confirm", closer=closer)
             return self.head.search(_scene(picture, color), index, seed=seed, **given)
-        _only_for(kind, "fovea", "passes", start=start)
+        _only_for(kind, "fovea", "none", start=start)
         given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
         return self.zoom.search(_large(picture, color), index, **given)
 
@@ -490,7 +490,7 @@ class ActivePerception(nn.Module):
         if kind == "head":
             given = _given(start=start, duration=duration, worth=worth, **limits)
             return self.head.explore(_scene(picture, color), seed=seed, **given)
-        _only_for(kind, "fovea", "passes", start=start)
+        _only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(_large(picture, color), **_given(worth=worth, **limits))
 
     def live(
@@ -585,7 +585,7 @@ def _given(**values: Any) -> dict[str, Any]:
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     """Number of the only class of a target."""
     wanted = [target] if isinstance(target, str | int) else list(target)
-    check(len(wanted) == 1, "target", "one class for a search by windows or a head, or find_all", target)
+    check(len(wanted) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
     return class_index(wanted[0], classes[1:], "target")
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from semfov.data.scenes import EmbeddedScenes
+from tests.pretended import PretendedGpu
 
 pytest.register_assert_rewrite("tests.base_tester")
 settings.register_profile("semfov", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -44,12 +46,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.lab)
 
 
-@pytest.fixture(
-    params=["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
-)
-def device(request: pytest.FixtureRequest) -> torch.device:
-    """Each device of this machine."""
-    return torch.device(request.param)
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """The CPU and a GPU, which is pretended on a machine without one (`tests.pretended`)."""
+    pretended = request.param == "cuda" and not torch.cuda.is_available()
+    with PretendedGpu() if pretended else nullcontext():
+        yield torch.device(request.param)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import re
 import runpy
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import semfov
+from semfov.cli.main import SUBCOMMANDS
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -73,7 +75,9 @@ def test_checks_before_a_commit_are_part_of_make_test():
 
 def test_the_commands_of_the_workflows_exist():
     jobs = {
-        name: job for path in ("test", "docs") for name, job in read(f".github/workflows/{path}.yml")["jobs"].items()
+        name: job
+        for path in ("test", "docs", "release")
+        for name, job in read(f".github/workflows/{path}.yml")["jobs"].items()
     }
     steps = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     assert ".ci/run" in steps
@@ -85,9 +89,20 @@ def test_the_commands_of_the_workflows_exist():
 def test_the_workflows_test_the_oldest_python_and_a_newer_one():
     supported = SpecifierSet(PROJECT["requires-python"])
     text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
-    versions = re.findall(r'python-version: "([\d.]+)"', text)
+    versions = re.findall(r'"(3\.\d+)"', text)
     assert all(version in supported for version in versions)
     assert f">={min(versions)}" == PROJECT["requires-python"] != f">={max(versions)}"
+    tried = read(".github/workflows/release.yml")["jobs"]["try"]["strategy"]["matrix"]["python"]
+    assert set(versions) == set(tried)
+
+
+def test_the_commands_that_try_a_release_exist():
+    steps = [step["run"] for step in read(".github/workflows/release.yml")["jobs"]["try"]["steps"] if "run" in step]
+    (commands,) = (step.split(" && ") for step in steps if step.startswith("semfov"))
+    for command in commands:
+        name, *options = command.split()[1:]
+        known = {f"--{each.name}".replace("_", "-") for each in fields(SUBCOMMANDS[name].options())}
+        assert {option for option in options if option.startswith("--")} <= known
 
 
 def test_issue_templates_are_valid():

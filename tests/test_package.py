@@ -62,6 +62,7 @@ SURFACE = {
 SUBPACKAGES = [
     "version",
     "errors",
+    "threads",
     "io",
     "data",
     "sensor",

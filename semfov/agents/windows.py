@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Self
 
 import torch
@@ -152,19 +153,10 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             glances = self._open(picture)
             if self.evidence is None:
-                path = search_slices(glances, self.classes, index, limits, confirm)
-            else:
-                path = search_windows(
-                    glances,
-                    self.evidence,
-                    self.classes,
-                    index,
-                    limits,
-                    confirm=confirm,
-                    give_up=give_up,
-                    closer=closer,
-                )
-        return _with_picture(path, glances)
+                return search_slices(glances, self.classes, index, limits, confirm)
+            return search_windows(
+                glances, self.evidence, self.classes, index, limits, confirm=confirm, give_up=give_up, closer=closer
+            )
 
     def find_all(
         self,
@@ -214,8 +206,7 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.seen), path.record)
                 if ending is not None:
                     break
-        record = path.record(ending or ("windows" if self.evidence is None else "worth"))
-        return _with_picture(record, glances)
+        return path.record(ending or ("windows" if self.evidence is None else "worth"))
 
     def explore(
         self,
@@ -266,13 +257,6 @@ def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     (True, False)
     """
     return Lattice.over(size, canvas).levels >= 3
-
-
-def _with_picture(path: ZoomPath, glances: LiveGlances) -> ZoomPath:
-    """The record with a reduced copy of its picture, and with its file."""
-    picture = glances.view.picture
-    source = None if picture.path is None else str(picture.path)
-    return replace(path, photograph=reduced_copy(picture), source=source)
 
 
 def search_windows(
@@ -386,6 +370,13 @@ class _Windows:
         self.certainty = None if evidence is None else evidence.certainty
         self.seen: list[Glance] = []
         self.values: list[float] = []
+        self.picture = glances.view.picture if isinstance(glances, LiveGlances) else None
+        self.source = None if self.picture is None or self.picture.path is None else str(self.picture.path)
+
+    @cached_property
+    def photograph(self) -> Tensor | None:
+        """A reduced copy of the picture; None for stored looks."""
+        return None if self.picture is None else reduced_copy(self.picture)
 
     def add(self, turn: Turn[Any]) -> None:
         """Keep a look."""
@@ -404,4 +395,6 @@ class _Windows:
             candidates=merge(self.seen, self.targets or self.target),
             certainty=self.certainty,
             ending=ending,
+            photograph=self.photograph,
+            source=self.source,
         )

@@ -6,6 +6,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_shape
+from semfov.threads import one_thread_if_small
 
 LOOK_FEATURES = 10
 _FLOOR = 1e-6
@@ -65,6 +66,7 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
     return class_features(detections, fixation, grid, wanted)[:, 0]
 
 
+@one_thread_if_small
 def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
     """`look_features` for several classes `(T,)`: `(B, T, X·Y, 10)`."""
     batch = detections.mask.shape[0]

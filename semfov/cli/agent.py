@@ -22,9 +22,10 @@ def known_classes(options: AgentOptions) -> tuple[str, ...] | None:
 
 def make_agent(options: AgentOptions) -> ActivePerception:
     """The agent that the options name."""
+    loaded: dict[str, Any] = {} if options.weights is None else {"weights": options.weights}
     if options.models is not None:
         check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
-        moved: dict[str, Any] = {} if options.detector == AgentOptions.detector else {"detector": options.detector}
+        moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}
         own = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
         return own(options.models, **moved)
     if options.agent == "recommended":
@@ -32,9 +33,9 @@ def make_agent(options: AgentOptions) -> ActivePerception:
         kind = sensor.make.__name__
         check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
         shape: dict[str, Any] = {name: sensor.settings[name] for name in ("sigma", "growth")}
-        return ActivePerception.recommended(options.detector, **shape)
+        return ActivePerception.recommended(options.detector, **shape, **loaded)
     make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
-    return make(options.detector, sensor=options.sensor or "published")
+    return make(options.detector, sensor=options.sensor or "published", **loaded)
 
 
 def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:

@@ -23,7 +23,7 @@ Without a picture, search, find and explore take an embedded scene, so `semfov s
 """
 
 _AGENT = """\
-  --detector NAME      yolov3-tiny (default), another name (semfov detectors), or a file such as mine.onnx
+  --detector NAME      yolov3-tiny (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
   --models FOLDER      models of your own detector, which semfov fit made
   --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
 

@@ -6,13 +6,15 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli import help as texts
 from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
+from semfov.cli.words import in_command_words
 from semfov.runs.command import GOES_ON, make_parser, run_command
 from semfov.version import __version__
 
@@ -126,9 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         usage = command.text.partition("\nusage:")[0]
         make_parser(options, usage, command.positional, program).print_help()
         return 0
+    words = partial(in_command_words, options=[field.name for field in fields(options)])
     names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
-    with _plain_warnings():
-        return run_command(command.run, options, command.text, rest, **names)
+    with _plain_warnings(words):
+        return run_command(command.run, options, command.text, rest, words=words, **names)
 
 
 def _unknown(name: str, rest: Sequence[str]) -> str:
@@ -143,8 +146,8 @@ def _unknown(name: str, rest: Sequence[str]) -> str:
 
 
 @contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Print each warning as one line, without the place in the code."""
+def _plain_warnings(words: Callable[[str], str]) -> Iterator[None]:
+    """Print each warning as one line in the words of the command, without the place in the code."""
 
     def show(
         message: Warning | str,
@@ -154,7 +157,7 @@ def _plain_warnings() -> Iterator[None]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        print(f"warning: {message}", file=sys.stderr)
+        print(f"warning: {words(str(message))}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.showwarning = show

@@ -29,6 +29,7 @@ class AgentOptions(Settings):
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
+        weights: file of the weights of a detector that is a `.cfg` file.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
@@ -37,6 +38,7 @@ class AgentOptions(Settings):
 
     agent: Literal["recommended", "published", "raw"] = "recommended"
     detector: str = "yolov3-tiny"
+    weights: Path | None = None
     models: Path | None = None
     sensor: SensorName | None = None
     start: str | None = None

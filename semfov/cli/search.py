@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from semfov.agent import PictureLike
@@ -117,13 +118,22 @@ def meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
         return {classes[class_index(target, classes, "target") - 1]: 1.0}
     except InputError as error:
         if options.embeddings is None:
-            raise InputError(f"{error}; a description needs --embeddings, a file of word vectors") from None
+            raise InputError(f"{error}{_other_ways(target, classes, str(error))}") from None
     vectors = WordVectors.read(options.embeddings, [target, *classes])
     found = spread(target, classes, vectors)
     print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in found.items())}")
     if vectors.missing:
         print(f"  words without a vector in {options.embeddings}: {', '.join(vectors.missing)}")
     return found
+
+
+def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
+    """What else a target that is no class can be, after the message that refuses it."""
+    names = target.split(",")
+    with suppress(InputError):
+        if len([class_index(name.strip(), classes) for name in names]) > 1:
+            return "; a search is for one class, and `semfov find` takes several"
+    return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"
 
 
 def only_likeliest(wanted: dict[str, float]) -> None:

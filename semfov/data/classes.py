@@ -20,6 +20,9 @@ ALIASES = {
     "tvmonitor": "tv",
 }
 _SPELT = {"".join(new.split()): [old for old in ALIASES if ALIASES[old] == new] for new in ALIASES.values()}
+MOST_NAMED = 12
+"""Largest number of classes that a message names."""
+
 _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "scissor"}
 
 
@@ -138,8 +141,15 @@ def _index(value: object, classes: int, argument: str) -> int:
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:
     """The message for an unknown class, with the classes that may be meant."""
     names = list(dict.fromkeys(meant))
-    hint = f"did you mean {' or '.join(map(repr, names))}?" if names else f"known: {', '.join(classes)}"
+    hint = f"did you mean {' or '.join(map(repr, names))}?" if names else f"known: {_few(classes)}"
     return f"{argument}: unknown class {name!r}; {hint}"
+
+
+def _few(classes: Sequence[str]) -> str:
+    """The classes, or of many the first ones and where the others are listed."""
+    if len(classes) <= MOST_NAMED:
+        return ", ".join(classes)
+    return f"{', '.join(classes[:5])} and {len(classes) - 5} more; agent.classes lists them"
 
 
 def plain_key(name: str) -> str:

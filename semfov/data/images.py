@@ -72,9 +72,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         except DataError:
             raise
         except FileNotFoundError:
-            raise DataError(
-                f"{name}: no such file; check its path, or data.root and the file names in the annotations"
-            ) from None
+            raise DataError(f"{name}: no such file; check its path") from None
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:

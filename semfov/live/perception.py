@@ -8,6 +8,7 @@ from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import picture_size
 from semfov.decision import MOST_CLOSER
 from semfov.errors import check
+from semfov.head.camera import is_scene
 from semfov.live.base import FramePerception
 from semfov.live.fovea import RATE, FovealPerception
 from semfov.live.windows import WINDOW_RATE, WindowPerception
@@ -96,6 +97,7 @@ class LivePerception(FramePerception):
             InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
             DataError: the file of the frame cannot be read.
         """
+        check(not is_scene(frame), "frame", "a picture; search and find_all take scenes", type(frame).__name__)
         if self.how == "auto":
             self.how = "windows" if pays(picture_size(frame), self._canvas) else "fovea"
             self._check_start()

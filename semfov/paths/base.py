@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _Table = Literal["looks", "objects"]
 """Tables of a record."""
 
+_COLUMNS = ["object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look"]
 _NAMED = 5  # largest number of objects that the text form names
 
 
@@ -399,7 +400,11 @@ class Record(Conversion):
             raise InputError(
                 "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
             ) from None
-        return pandas.DataFrame(self.rows() if table == "looks" else self.object_rows())
+        return (
+            pandas.DataFrame(self.rows())
+            if table == "looks"
+            else pandas.DataFrame(self.object_rows(), columns=_COLUMNS)
+        )
 
     def _detected(self, look: Detections) -> dict[str, Any]:
         """Columns of a table on the detections of a look: their number, and the most confident one."""

@@ -98,6 +98,7 @@ def run_command(
     positional: tuple[str, str] | None = None,
     program: str | None = None,
     goes_on: str = GOES_ON,
+    words: Callable[[str], str] = str,
 ) -> int:
     """Parse `arguments` into a `config` and call `main` with it.
 
@@ -109,6 +110,7 @@ def run_command(
         positional: name and help of a field that becomes an optional positional argument (`make_parser`).
         program: name of the program in the usage; None for that of the process.
         goes_on: what is said after an interruption.
+        words: puts the message of an error into the words of the command.
 
     Returns:
         The exit code: 0 or that of `main`; 1 after a `SemfovError` or for a package that is missing (printed in one
@@ -136,7 +138,7 @@ def run_command(
         print(f"error: this command needs {missing}, which is not installed: {install}", file=sys.stderr)
         return 1
     except SemfovError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {words(str(error))}", file=sys.stderr)
         return 1
     except BrokenPipeError:
         # The reader of the output, such as `head`, has closed its end: discard what is still in the buffer.

@@ -12,8 +12,10 @@ from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions
+from semfov.threads import one_thread_if_small
 
 
+@one_thread_if_small
 def foveate(
     image: ImageLike | Bands,
     gaze: PointLike,

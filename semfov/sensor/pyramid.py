@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup, values_known
 from semfov.sensor.lines import Lines, Taps, banded, constant, separable
+from semfov.threads import one_thread_if_small
 
 Convention = Literal["kornia", "opencv"]
 
@@ -161,6 +162,7 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     return tuple(found)
 
 
+@one_thread_if_small
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
     r"""Split an image into bands of decreasing frequency (Burt and Adelson, 1983).
 

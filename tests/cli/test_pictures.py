@@ -188,6 +188,14 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     assert "1 pass in" in printed.out
 
 
+def test_remedies_are_in_the_words_of_the_command(run, large):
+    for words, remedy in ((("--start", "5,5"), "use none, or --how fovea"), (("--shifts", 3), "or --how fovea")):
+        code, printed = run("search", large, "--target", "red", *words)
+        assert code == 1
+        assert remedy in printed.err
+        assert "how=" not in printed.err
+
+
 def test_a_folder_may_have_small_and_large_pictures(run, photo, large, agent, evidence, tmp_path):
     agent.windows = evidence
     photo.rename(large.with_name(photo.name))

@@ -16,6 +16,8 @@ from semfov.runs.command import make_parser
 REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
+    "search --target qqq": "airplane and 75 more; `semfov detectors NAME` lists them",
+    "search --target cup,fork": "; a search is for one class, and `semfov find` takes several",
     "search": "target: expected a class, --target cup, got none; `semfov detectors yolov3-tiny` lists them",
     "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "find --start 5,5": "start: expected none for find",

@@ -130,8 +130,10 @@ class TableTester(PolicyTester):
 
     @staticmethod
     def call(module, beta, closest):
-        table = rand(12, 12) if module.table == "saliency" else rand(12, 3, 12)
-        return module.in_scene(2, GRID, table, torch.tensor([3, 5]))(DirichletBelief(beta, closest), closest == 0)
+        table = (rand(12, 12) if module.table == "saliency" else rand(12, 3, 12)).to(closest)
+        return module.in_scene(2, GRID, table, torch.tensor([3, 5], device=closest.device))(
+            DirichletBelief(beta, closest), closest == 0
+        )
 
 
 globals().update(

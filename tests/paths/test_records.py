@@ -173,9 +173,15 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     assert all({"x", "y", "detections", "seen", "score"} <= row.keys() for row in rows)
     assert record.to_frame().to_dict("records")[0].keys() == rows[0].keys()
     assert isinstance(record.to_frame(), pd.DataFrame)
+    assert all(row.keys() == set(record.to_frame("objects").columns) for row in record.object_rows())
     shown = record._repr_html_()
     assert shown.startswith("<")
     assert "cup" in shown or "cat" in shown
+
+
+def test_a_table_without_objects_has_its_columns():
+    table = replace(head_path(), least=1.5).to_frame("objects")
+    assert (len(table), table.columns.tolist()) == (0, list(head_path().object_rows()[0]))
 
 
 @pytest.mark.parametrize("make", RECORDS)

@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch.nn import functional
 
+from semfov.belief.evidence import neighbourhood_peak
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, neighbourhood_mean, neighbourhood_peak, small_network, through
+from semfov.zoom.networks import features, neighbourhood_mean, small_network, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
@@ -15,6 +16,11 @@ def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     expected = network(values)
     torch.testing.assert_close(through(network, values), expected)
     torch.testing.assert_close(through(network, values, slice(1, 2)), expected[..., 1:2])
+
+
+def test_a_network_called_layer_by_layer_has_the_gradient_of_the_module():
+    torch.manual_seed(0)
+    network, values = small_network(5, 16, 3), torch.randn(40, 5)
     (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)

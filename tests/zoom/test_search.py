@@ -1,6 +1,7 @@
 """Searches and explorations of large pictures, and merging."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -43,6 +44,16 @@ def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_pat
         assert path.image.shape == (3, 492, 1280)
         assert path.plot().axes[0].images
     assert agent.search(picture, "red", passes=2).source is None
+
+
+def test_the_records_of_each_look_have_the_picture(agent, picture):
+    """So that they can be drawn while the episode runs."""
+    for look in (partial(agent.search, picture, "green"), partial(agent.explore, picture)):
+        seen = []
+        whole = look(passes=2, on_look=seen.append)
+        assert len(seen) == 2
+        assert all(torch.equal(record.photograph, whole.photograph) for record in seen)
+        assert seen[1].plot().axes[0].images
 
 
 def test_search_for_an_absent_target_ends(agent, picture):

@@ -11,6 +11,7 @@ from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.threads import one_thread_if_small
 
 _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, however many there are
 
@@ -170,6 +171,7 @@ class Lookahead(AcquisitionFunction):
         self.register_buffer("levels", model.level(grid.cell_distance))
         self.register_buffer("likelihoods", likelihoods, persistent=False)
 
+    @one_thread_if_small
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta

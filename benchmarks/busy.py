@@ -1,0 +1,114 @@
+"""Hot paths beside a program that takes a core: `python -m benchmarks.busy`.
+
+PyTorch divides work among as many threads as there are cores. If another program uses one of them, the others wait at
+every operation. Here each path runs with all threads and with one, in turn, first on the machine as it is and then
+while a loop takes one core. Times are of the clock; run it on a machine that is otherwise quiet.
+"""
+
+import argparse
+import multiprocessing
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from benchmarks.beliefs import make_belief, make_look, make_model, unvisited
+from benchmarks.images import GAZE, SIGMA, photograph
+from benchmarks.machine import describe
+from benchmarks.tables import RESULTS, number, spread, table, write
+from benchmarks.timing import Run, Spread, interleaved
+from semfov import Grid, acquisition, foveate
+from semfov.belief import fuse
+
+
+def paths() -> dict[str, Run]:
+    """The hot paths by name."""
+    image, gaze = photograph(), torch.tensor(GAZE)
+    grid = Grid(10, 10, (640, 480))
+    belief, (likelihood, footprint) = make_belief(100, batch=1), make_look(100, batch=1)
+    visited = unvisited(belief)
+    value = acquisition.KLDivergence(make_model(), grid)
+    return {
+        "fixation, pyramid included": lambda: foveate(image, gaze, sigma=SIGMA),
+        "Kaplan's rule, one look": lambda: fuse(belief.beta, likelihood, footprint),
+        "decision by KL divergence": lambda: value(belief, visited),
+    }
+
+
+def with_threads(threads: int, run: Run) -> Run:
+    """The program with so many threads."""
+
+    def limited() -> object:
+        torch.set_num_threads(threads)
+        return run()
+
+    return limited
+
+
+def spin() -> None:
+    """Take a core."""
+    while True:
+        pass
+
+
+@contextmanager
+def beside(busy: bool) -> Iterator[None]:
+    """Have a program beside this one that takes a core."""
+    if not busy:
+        yield
+        return
+    program = multiprocessing.get_context("spawn").Process(target=spin, daemon=True)
+    program.start()
+    try:
+        yield
+    finally:
+        program.kill()
+        program.join()
+
+
+def times(seconds: float) -> dict[str, dict[str, Spread]]:
+    """Milliseconds of every path, by machine (quiet or busy) and number of threads."""
+    cores = torch.get_num_threads()
+    runs = {
+        (name, label): with_threads(threads, run)
+        for name, run in paths().items()
+        for label, threads in (("one thread", 1), ("all threads", cores))
+    }
+    named = {f"{name}|{label}": run for (name, label), run in runs.items()}
+    found: dict[str, dict[str, Spread]] = {}
+    for machine, busy in (("quiet", False), ("busy", True)):
+        with beside(busy):
+            for key, values in interleaved(named, seconds).items():
+                name, label = key.split("|")
+                found.setdefault(name, {})[f"{machine}, {label}"] = Spread.of(values)
+    torch.set_num_threads(cores)
+    return found
+
+
+@torch.inference_mode()
+def main() -> None:
+    """Measure, and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.busy", description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration of each half")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
+    options = parser.parse_args()
+    found = times(options.seconds)
+    columns = list(next(iter(found.values())))
+    rows = [
+        [
+            name,
+            *(spread(own[column]) for column in columns),
+            number(own["busy, all threads"].middle / own["quiet, one thread"].middle),
+        ]
+        for name, own in found.items()
+    ]
+    text = table(["milliseconds", *columns, "busy, all threads / quiet, one thread"], rows)
+    figures = {name: {column: asdict(value) for column, value in own.items()} for name, own in found.items()}
+    write(options.out, "busy", f"# Beside a program that takes a core\n\n{text}", {"about": describe(), **figures})
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

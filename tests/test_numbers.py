@@ -1,0 +1,389 @@
+"""Every number in a sentence of README and docs is in a table, or it is listed here with its reason.
+
+A number of a sentence is carried by a cell of a table of its page, of a page that its paragraph links to, or of a page
+that belongs to its own (`COMPANIONS`). The paragraph must say half of the words of the row, and a word of the column
+(`SAME` has other words for them). The number may be rounded, a share may be a percentage, and a difference of two such
+numbers of the sentence is carried, too. Text in code, links and formulas is left out, and so are conditions
+(`CONDITIONS`): sizes of pictures, numbers of looks, years. Where a sentence fails, correct it from its table, or say in
+its paragraph which row and column it means.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from math import log
+from pathlib import Path
+
+import pytest
+import torch
+
+from semfov import FovealObservationModel
+from semfov.agents.head import CONFIRM
+from semfov.belief import Verification
+from semfov.decision import MOST_CLOSER
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.objects import FAINTEST, LEAST
+from semfov.head import Speeds
+from semfov.live.fovea import RATE
+from semfov.live.windows import WINDOW_RATE
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
+from semfov.sensor.log_polar import Retina
+from semfov.zoom.export import OPSET
+from semfov.zoom.hints import FAINT
+from tests.test_house_rules import MOST_LINES
+
+ROOT = Path(__file__).parents[1]
+
+STRICT = [
+    "README.md",
+    *(f"docs/{name}.md" for name in ("results", "tables", "zoom", "head", "human", "detectors", "words")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/decisions/*.md")),
+]
+"""Pages whose sentences repeat what tables say."""
+
+OTHERS = [
+    *(f"docs/{name}.md" for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/measurements/*.md")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md")),
+]
+"""Pages on which a number may also be the output of a command that its section names (`COMMAND`)."""
+
+COMMAND = re.compile(r"python -m|`(?:eval|train|benchmarks)\.|`semfov fit|commit [0-9a-f]{7}")
+
+COMPANIONS = {
+    "README.md": ["docs/results.md", "docs/tables.md", "docs/measurements/zoom.md"],
+    "docs/results.md": ["docs/tables.md"],
+    "docs/tables.md": ["docs/results.md"],
+    "docs/decisions/closer_looks.md": ["docs/results.md", "docs/tables.md"],
+    "docs/decisions/tempering.md": ["docs/results.md"],
+    "docs/zoom.md": ["docs/measurements/zoom.md"],
+    "docs/head.md": ["docs/measurements/head.md"],
+    "docs/human.md": ["docs/measurements/human.md"],
+    "docs/detectors.md": ["docs/measurements/detectors.md"],
+    "docs/words.md": ["docs/measurements/words.md"],
+}
+"""Pages with the tables of a page."""
+
+_COUNTED = (
+    r"(?:(?:gaze |first |aerial |street |fitted |neighbouring )*(?:shifts?|saccades?|pass(?:es)?|looks?|photographs?|"
+    r"pictures?|mosaics?|panoramas?|people|classes|cells|starts|searches|boxes|words|dimensions|fixations?|windows|images))"
+)
+CONDITIONS = re.compile(
+    r"\d[\d,]* ?× ?\d[\d,]*"  # sizes
+    r"|\d[\d,.]* ?(?:px|million pixels|pixels|degrees|°)|of 640\b"  # lengths in pixels, and angles
+    r"|\b(?:1[89]|20)\d\d(?=[),;.])"  # years of publications
+    r"|\d+e-\d+|10⁻⁶|ln 2 / r"  # tolerances, and half-lives
+    rf"|(?:[Aa]fter|[Ww]ithin) \d+(?:, \d+)*(?: and \d+)*(?: of \d+)? {_COUNTED}\b"
+    rf"|(?:[Ii]n|[Oo]n|[Aa]t|[Ff]or|[Oo]f|[Ww]ith|[Oo]ver|to|the) (?:the |all |both |first )*\d[\d,]* {_COUNTED}\b"
+    r"|(?:[Gg]rowth|[Rr]ate(?: is| of)?|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
+)
+"""What a sentence is about, as opposed to what was measured: sizes, numbers of looks, years, settings by name."""
+
+NUMBER = re.compile(r"(?<![\w.,])[+−-]?\d(?:[\d,]*\d)?(?:\.\d+)?(?![\w]|[.,]\d)")
+HIDDEN = re.compile(
+    r"```.*?```|<!--.*?-->|`[^`]*`|\$[^$]*\$|(?<=\])\([^)]*\)|https?://\S+|^(?: {4}|#)[^\n]*", re.DOTALL | re.M
+)
+LINK = re.compile(r"\]\(([^)#\s]+\.md)?(#[\w-]+)?\)")
+
+_DATA, _DETECTOR, _SPEEDS = DataConfig(), DetectorConfig(), Speeds()
+_COUNTS = torch.tensor(FovealObservationModel.from_pretrained("yolox-nano-published-narrow").metadata["counts"])
+_VERIFICATION = Verification.from_pretrained("yolox-nano")
+_RINGS, _WEDGES = Retina(60.0).receptors((640, 480))
+_OBJECTS, _DETECTIONS = _COUNTS[1:].sum(0).tolist(), _COUNTS.sum(0).tolist()
+
+KNOWN = {
+    "README.md": {
+        "Python 3.11": "pyproject.toml; test_habits.py compares the workflows with it",
+        "probability 0.94": "what python -m eval.readme_picture draws",
+        "6.8 GB": "size of an installation",
+        f"COCO's {len(COCO_CLASSES)} classes": "code",
+    },
+    "docs/results.md": {
+        f"at least {_DATA.min_instances} boxes": "code",
+        f"at most {100 * (_DATA.max_target_area or 1):.0f} %": "code",
+        "1,893 others": "size of the fit set, in the cards of the models",
+        f"({_OBJECTS[-1]} of {_DETECTIONS[-1]:,})": "counts in the file of the model",
+        f"({_OBJECTS[0]} of {_DETECTIONS[0]:,})": "counts in the file of the model",
+        "9.9 seconds": "in milliseconds in the linked table",
+    },
+    "docs/tables.md": {
+        "10,790 searches": "ten starts for each of the pairs in the table of photographs",
+        "3,000 for each": "ten starts for each of 300 photographs",
+        f"prior of {BeliefConfig().prior}": "code",
+        "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
+        "7 in 10": "an explanation of calibration",
+        "91.9 %": "with 15 of the 21 wrong places, 11.3 % become 8.1 %",
+    },
+    "docs/zoom.md": {
+        f"confidence of {FAINT}": "code",
+        "1.6 MB": "of a belief over the cells that the sentence counts",
+        "0.41 MB": "upper bound by the size of the tensors",
+        "75 MB": "a sixteenth, a sixty-fourth and so on of what the sentence gives",
+        "900 MB": "three bytes for each pixel of the sentence",
+        "by 4, 8, 16": "a series",
+        f"opset {OPSET}": "code",
+    },
+    "docs/head.md": {
+        f"{1000 * _SPEEDS.eye_start:.0f} + {1000 * _SPEEDS.eye:.1f} A": "code",
+        f"{CONFIRM}": "code",
+    },
+    "docs/detectors.md": {
+        f"({_DETECTOR.threshold}), ({_DETECTOR.iou}, over all classes), ({_DETECTOR.limit})": "code",
+        f"{len(COCO_CLASSES)} scores": "code",
+        "in [0, 1]": "a range",
+        "counts 1, a wrong place or a find in a photograph without the target -1, and no find 0": "a rule",
+        "91 scores": "COCO's category ids with their gaps",
+        "91 outputs": "torchvision's",
+        "114 of 255": "the published networks' grey",
+        "(640)": "code",
+    },
+    "docs/words.md": {
+        "from 0 to 10": "a question to a model",
+        "is 1 if": "a rule",
+        "else 0": "a rule",
+        "ln 1.1": "a choice",
+        "ln 0.1": "a choice",
+    },
+    "docs/decisions/closer_looks.md": {
+        f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",
+        "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
+        "between 86 and 88 % where 60 %": "tried on photographs of the fit, without a command",
+        "commit 11e960c": "a commit",
+    },
+    "docs/measurements/head.md": {"the 300 of": "photographs of the results"},
+    "docs/measurements/human.md": {"(612 searches of 10 people": "the files of the data set"},
+    "docs/measurements/zoom.md": {"at score 0.1 and IoU 0.5": "what recall means"},
+    "docs/sensors.md": {
+        "δ (1 + r / a)": "a formula",
+        f"has {_RINGS} rings of {_WEDGES} receptors, which is {_RINGS * _WEDGES:,} receptors for 307,200": "code",
+        "79 s of processor time, and 220 s by the clock": "a measurement of which the sentence has the machine",
+        "a load of 9, PyTorch 2.15": "its machine",
+    },
+    "docs/pan-tilt.md": {
+        "from -1 to 1": "a range",
+        "(40 by default)": "code, tested with the agent",
+        "0.4 frames": "an example",
+    },
+    "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
+    "docs/command.md": {f"from score {LEAST}": "code"},
+    "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
+    "docs/guides/environments.md": {
+        "version 1.0": "of Gymnasium",
+        "is 0.05 in searches and 0.01 in explorations, and is 1": "signatures in the reference",
+        "is 1 once": "a rule",
+        "whole picture (0) to native pixels (1)": "a range",
+        "score of 0.1 and overlaps": "what found means",
+        f"score of {LEAST}, and an": "code",
+    },
+    "docs/guides/live.md": {
+        f"{MOST_CLOSER} by default": "code",
+        f"at most {MOST_CLOSER} of {log(2) / RATE:.0f} frames": "code",
+        f"{log(2) / WINDOW_RATE:.0f} by default": "code",
+        f"rate, {RATE}": "code",
+        "40 of the fitting": "videos of the table",
+        "20 frames": "videos of the table",
+    },
+    "docs/guides/records.md": {f"which is {LEAST} unless": "code", f"begin at {FAINTEST}": "code"},
+    "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
+    "docs/guides/index.md": {"ROS 2": "a name"},
+    "docs/decisions/tempering.md": {f"{len(COCO_CLASSES) + 1} components": "code"},
+}
+"""Numbers that no table has, each with the reason; those that are settings are written here by the code."""
+
+
+@cache
+def text_of(page):
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+@cache
+def paragraphs(page):
+    """Paragraphs of a page that are no tables; in README a row of a table is one, with the heads of its columns."""
+    text = re.sub(r"```.*?```|<!--.*?-->", "", text_of(page), flags=re.DOTALL)
+    found = []
+    for block in re.split(r"\n\s*\n", text):
+        lines = [line for line in block.splitlines() if not line.startswith("#")]
+        rows = [line for line in lines if line.startswith("|")]
+        found += [f"{rows[0]}\n{row}" for row in rows[2:]] if page == "README.md" else []
+        prose = "\n".join(line for line in lines if not line.startswith("|"))
+        found += [item for item in re.split(r"\n(?=- )", prose) if item.strip()]
+    return found
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number of a table, with words that say what it is.
+
+    Attributes:
+        number: without its sign.
+        row: words of its row.
+        column: words of its column.
+        only: words in the name of the table without which a sentence does not speak of it.
+    """
+
+    number: float
+    row: frozenset[str]
+    column: frozenset[str]
+    only: frozenset[str]
+
+
+@cache
+def cells(page):
+    """All numbers of the tables of a page."""
+    found, head, rows, only = [], None, frozenset(), frozenset()
+    for line in text_of(page).splitlines():
+        if not line.startswith("|"):
+            head = None
+            if line.startswith("<!-- table "):
+                only = words(line) & {"tiny", "narrow"}
+            elif line.startswith("<!-- end"):
+                only = frozenset()
+            continue
+        parts = [part.strip() for part in line.strip().strip("|").split("|")]
+        if head is None:
+            head = [words(part) for part in parts]
+            found += [Cell(abs(value(n)), frozenset(), frozenset(), only) for part in parts for n in numbers(part)]
+            continue
+        named = [part for part in parts if not NUMBER.match(part)]
+        rows = words(" ".join(named)) if parts[0] else rows
+        for column, part in zip(head, parts, strict=False):
+            found += [Cell(abs(value(number)), rows, column, only) for number in numbers(part)]
+    return found
+
+
+STOP = frozenset(
+    re.findall(r"\w+", "a an and are as at by each for from in is it its no not of on or than that the to with")
+)
+
+NUMERALS = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
+ORDINALS = ["zeroth", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"]
+IN_DIGITS = {word: n for names in (NUMERALS, ORDINALS) for n, word in enumerate(names)} | {
+    "twentieth": 20,
+    "thirty": 30,
+}
+
+SAME = {
+    "agent": "target evidence our learned",
+    "semfov": "target evidence our",
+    "closer": "target evidence",
+    "box": "iou",
+    "kl": "divergence",
+    "divergence": "kl",
+    "difference": "point",
+    "without": "no",
+    "percentage": "share",
+    "person": "people",
+    "sooner": "later point difference",
+    "map": "right",
+}
+"""Words of sentences, and words of tables that mean the same."""
+
+
+def words(text):
+    """Words of a text in their basic form, and its whole numbers, also those in letters."""
+    plain = re.sub(r"\d+\.\d+|±", " ", text.lower())
+    found = {word if word == "less" else word.removesuffix("s") for word in re.findall(r"[a-z]+|\d+", plain)} - STOP
+    found |= {str(IN_DIGITS[word]) for word in found & IN_DIGITS.keys()}
+    return frozenset(found.union(*(SAME[word].split() for word in found & SAME.keys())))
+
+
+def numbers(text):
+    return NUMBER.findall(text.replace("`", " ").replace("@", " "))
+
+
+def value(number):
+    return float(number.replace(",", "").replace("−", "-"))
+
+
+def carried(number, known, said):
+    """Whether a cell whose row and column are named has the number, rounded to as many digits or as a percentage."""
+    digits = len(number.partition(".")[2])
+    wanted = abs(value(number))
+    reach = 0.5 * 10**-digits + 1e-9
+    return any(
+        abs(cell.number * scale - wanted) <= reach
+        and cell.only <= said
+        and 2 * len(cell.row & said) >= len(cell.row)
+        and (not cell.column or cell.column & said)
+        for cell in known
+        for scale in ((1, 100) if cell.number <= 1 else (1,))
+    )
+
+
+def sentences(paragraph):
+    return re.split(r"(?<=[.:?!])\s+(?=[A-Z*(`“-])", paragraph)
+
+
+def sources(page, paragraph):
+    """The pages whose tables may carry the numbers of a paragraph."""
+    linked = [name for name, _ in LINK.findall(paragraph) if name]
+    beside = [(ROOT / page).parent.joinpath(name).resolve() for name in linked]
+    own = [] if page == "README.md" else [page]
+    return [*own, *COMPANIONS.get(page, []), *(path.relative_to(ROOT).as_posix() for path in beside if path.exists())]
+
+
+@cache
+def with_command(page):
+    """Paragraphs of the sections of a page that name a command."""
+    sections = re.split(r"\n(?=#+ )", text_of(page))
+    named = [" ".join(section.split()) for section in sections if COMMAND.search(section)]
+    return [each for each in paragraphs(page) if any(" ".join(each.split()) in section for section in named)]
+
+
+def numbers_without_a_table(page):
+    """Sentences of a page with the numbers that no table carries."""
+    found = []
+    for paragraph in paragraphs(page):
+        if page in OTHERS and paragraph in with_command(page):
+            continue
+        known = [cell for name in sources(page, paragraph) for cell in cells(name)]
+        said = words(paragraph)
+        for sentence in sentences(paragraph):
+            plain = " ".join(HIDDEN.sub(" ", sentence).split())
+            for phrase in KNOWN.get(page, {}):
+                plain = plain.replace(phrase, " ")
+            told = NUMBER.findall(CONDITIONS.sub(" ", plain))
+            sure = [number for number in told if carried(number, known, said)]
+            lost = [number for number in told if number not in sure and not is_difference(number, sure)]
+            if lost:
+                found.append((", ".join(lost), " ".join(sentence.split())))
+    return found
+
+
+def is_difference(number, others):
+    """Whether a number is the difference of two others of its sentence."""
+    gap = abs(value(number))
+    return any(abs(abs(value(a) - value(b)) - gap) < 0.051 for a in others for b in others) and "." in number
+
+
+@pytest.mark.parametrize("page", STRICT + OTHERS)
+def test_every_number_of_a_sentence_is_in_a_table_or_has_a_reason(page):
+    lost = numbers_without_a_table(page)
+    told = "\n".join(f"  {numbers}: {sentence}" for numbers, sentence in lost)
+    assert not lost, f"{page}: numbers that no table of the page or of a linked page has:\n{told}"
+
+
+@pytest.mark.parametrize("page", KNOWN)
+def test_every_number_with_a_reason_is_still_on_its_page(page):
+    plain = " ".join(" ".join(HIDDEN.sub(" ", paragraph).split()) for paragraph in paragraphs(page))
+    assert [phrase for phrase in KNOWN[page] if phrase not in plain] == []
+
+
+def test_most_changes_of_a_number_are_noticed():
+    """Of the decimals that tables carry, each changed by up to three units of its last digit."""
+    changed = noticed = 0
+    for page in STRICT:
+        for paragraph in paragraphs(page):
+            known = [cell for name in sources(page, paragraph) for cell in cells(name)]
+            said = words(paragraph)
+            plain = CONDITIONS.sub(" ", HIDDEN.sub(" ", paragraph))
+            for number in NUMBER.findall(plain):
+                if "." not in number or not carried(number, known, said):
+                    continue
+                digits = len(number.partition(".")[2])
+                for step in (-3, -2, -1, 1, 2, 3):
+                    other = f"{abs(value(number)) + step * 10**-digits:.{digits}f}"
+                    changed += 1
+                    noticed += not carried(other, known, said)
+    assert changed > 100
+    assert noticed / changed > 0.6, f"{noticed} of {changed}"
