@@ -76,6 +76,8 @@ CONDITIONS = re.compile(
     r"|\d+e-\d+|10⁻⁶|ln 2 / r"  # tolerances, and half-lives
     rf"|(?:[Aa]fter|[Ww]ithin) \d+(?:, \d+)*(?: and \d+)*(?: of \d+)? {_COUNTED}\b"
     rf"|(?:[Ii]n|[Oo]n|[Aa]t|[Ff]or|[Oo]f|[Ww]ith|[Oo]ver|to|the) (?:the |all |both |first )*\d[\d,]* {_COUNTED}\b"
+    r"|(?:[Aa]t|[Ww]hy|for|from|is|of) 0\.(?:005|02|1|25|5)\b(?:, 0\.\d+)*(?: and 0\.\d+)?"  # thresholds of scores
+    r"|95 % intervals"
     r"|(?:[Gg]rowth|[Rr]ate(?: is| of)?|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
 )
 """What a sentence is about, as opposed to what was measured: sizes, numbers of looks, years, settings by name."""
@@ -272,6 +274,7 @@ SAME = {
     "divergence": "kl",
     "difference": "point",
     "without": "no",
+    "hand": "non predictive raw tempering footprint box centre",
     "percentage": "share",
     "person": "people",
     "sooner": "later point difference",
