@@ -7,7 +7,7 @@ import torch
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
 from semfov.runs.candidates import Candidate
-from semfov.runs.search_protocol import Episode, run_episodes
+from semfov.runs.search_protocol import Episode, looks_of, run_episodes
 from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30
@@ -33,7 +33,8 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     candidate = Candidate(Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive()))
 
     def run(count: int, batch: int) -> object:
-        return run_episodes(todo[:count], candidate, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
+        looks = looks_of(todo[:count], seen, grid)
+        return run_episodes(todo[:count], candidate, looks, noise[:count], shifts=SHIFTS, batch=batch)
 
     return seen, run
 

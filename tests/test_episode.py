@@ -292,7 +292,7 @@ def test_choices_get_the_number_of_the_shift_and_the_episodes():
     ]
 
 
-def test_stored_looks_are_weighed_only_once_per_target():
+def test_stored_looks_are_weighed_only_once_by_each_observer_and_target():
     class Counted(Semantic):
         weighed = 0
 
@@ -313,8 +313,8 @@ def test_stored_looks_are_weighed_only_once_per_target():
         list(rollout(looks, observer, by_target, START, Greedy(drawn_from(NOISE)), most=4))
     assert mapper.weighed == 1
     assert seeker.asked == (1, 2, 3)
-    list(rollout(looks, mapper, by_target, START, Greedy(drawn_from(NOISE)), most=2))
-    assert mapper.weighed == 2  # Only the looks of the last observer are kept.
+    list(rollout(looks.of(slice(0, 2)), mapper, by_target, START[:2], Greedy(drawn_from(NOISE)), most=2))
+    assert mapper.weighed == 1
 
 
 def test_an_observer_of_targets_without_a_target_is_refused():
@@ -541,6 +541,20 @@ def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
         for mine, theirs in zip(tensors_of(one.belief), tensors_of(other.belief), strict=True):
             assert torch.equal(mine, theirs)
+
+
+def test_stored_looks_of_some_episodes_are_those_of_a_source_for_them_alone():
+    looks, observer = StoredLooks(stored(), GRID, TARGETS), Target(evidence().double())
+    for episodes in (torch.tensor([2, 0]), slice(1, 2)):
+        sources = looks.of(episodes), StoredLooks(stored(), GRID, TARGETS[episodes])
+        some, alone = (
+            list(rollout(source, observer, Uniform(), START[episodes], Greedy(drawn_from(NOISE)), most=3))
+            for source in sources
+        )
+        assert torch.equal(sources[0].targets, TARGETS[episodes])
+        for one, other in zip(some, alone, strict=True):
+            assert torch.equal(one.belief.present, other.belief.present)
+    assert StoredLooks(stored(), GRID).of(slice(0, 1)).targets is None
 
 
 def test_a_given_scanpath_may_revisit_cells_and_repeats_its_last_cell():

@@ -8,7 +8,7 @@ from torch import Tensor
 from eval.comparison.run import Run
 from eval.explore.config import ExploreConfig
 from eval.explore.references import sharp_maps
-from semfov.episode import Stopwatch
+from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
 from semfov.runs.exploration_protocol import (
@@ -37,7 +37,7 @@ class ExploreRun(Run):
         answers = answers_of(self.scenes.annotation(index), grid, len(self.scenes.classes) + 1)
         if not answers.any():
             return records, watch.seconds
-        detections = self.detections(index)
+        looks = StoredLooks(self.detections(index), grid)
         watch.lap("look")
         episodes = explorations_of(self.scenes, index, len(grid), protocol)
         noise = torch.stack([explore_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
@@ -46,7 +46,7 @@ class ExploreRun(Run):
             watch.lap("saliency")
             with torch.inference_mode():
                 outcomes = run_explorations(
-                    episodes, candidate, detections, grid, answers, noise, shifts=protocol.shifts, batch=protocol.batch
+                    episodes, candidate, looks, answers, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(name)
             records += [self._record(name, answers, *pair) for pair in zip(episodes, outcomes, strict=True)]

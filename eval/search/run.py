@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import torch
 
 from eval.comparison.run import Run
@@ -11,7 +9,7 @@ from eval.search.config import SearchConfig
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
 
 
 class SearchRun(Run):
@@ -30,26 +28,23 @@ class SearchRun(Run):
         watch.lap("look")
         if not episodes:
             return records, watch.seconds
+        looks = looks_of(episodes, detections, grid)
         noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
         for name in self.policies:
             candidate = self.candidate(name, index)
             watch.lap("saliency")
             with torch.inference_mode():
-                outcomes = run_episodes(
-                    episodes, candidate, detections, grid, noise, shifts=protocol.shifts, batch=protocol.batch
-                )
+                outcomes = run_episodes(episodes, candidate, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
             watch.lap(name)
             records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
         return records, watch.seconds
 
     def _record(self, policy: str, episode: Episode, outcome: EpisodeOutcome) -> ResultRecord:
-        fields = asdict(episode)
-        scene = fields.pop("scene")
         return {
             "policy": policy,
-            "scene": self.scenes.ids[scene],
-            **fields,
-            "target_name": self.scenes.classes[fields["target"] - 1],
+            **vars(episode),
+            "scene": self.scenes.ids[episode.scene],
+            "target_name": self.scenes.classes[episode.target - 1],
             "cells": list(outcome.cells),
             "found_at": outcome.found_at,
         }

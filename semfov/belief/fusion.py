@@ -191,8 +191,8 @@ def scale_likelihood(likelihood: Tensor) -> Tensor:
     if values_known(likelihood) and likelihood.numel():
         # NaN and infinity pass through the maximum and the minimum, so two reductions check every condition.
         least = likelihood.detach().amin()
-        usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all())
-        check(usable, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
+        if not bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()):
+            check(False, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
     return likelihood / largest
 
 
@@ -236,23 +236,43 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     batch, cells, components = beta.shape
     check_shape(likelihood, "likelihood", batch, None, components)
     check_shape(footprint, "footprint", batch, likelihood.shape[1], cells)
-    update = RULES[lookup(rule, RULES, "fusion rule")]
+    lookup(rule, RULES, "fusion rule")
     check_parameters(beta)
     soft = footprint.is_floating_point()
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
-    covered = footprint > 0
-    if not values_known(beta, likelihood, footprint):
-        return _fuse_one_by_one(beta, _scaled(likelihood, covered), footprint, update)
+    return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
+
+
+def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> Tensor:
+    """Update every cell with the detections that cover it (`fuse`), without checks.
+
+    Args:
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters, positive.
+        scaled: `(B, L, K+1)`, likelihoods from `scale_covering`.
+        footprint: `(B, L, X·Y)`, the cells that each detection updates.
+        rule: `kaplan`, `product` or `sum`.
+
+    Returns:
+        `(B, X·Y, K+1)`, new parameters.
+
+    >>> fuse_scaled(torch.ones(1, 2, 2), torch.tensor([[[0.0, 1.0]]]), torch.tensor([[[True, False]]]), "kaplan")
+    tensor([[[1., 2.],
+             [1., 1.]]])
+    """
+    update, covered, soft = RULES[rule], footprint > 0, footprint.is_floating_point()
+    if not values_known(beta, scaled, footprint):
+        return _fuse_one_by_one(beta, scaled, footprint, update)
+    batch, cells, components = beta.shape
     image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
         return beta.clone()
     rank = covered.cumsum(1, dtype=torch.int32)[image, detection, cell]
     order = rank.argsort(stable=True)
     rows = (image * cells + cell)[order]
-    sources = (image * likelihood.shape[1] + detection)[order]
+    sources = (image * scaled.shape[1] + detection)[order]
     steps = torch.bincount(rank)[1:].tolist()
     flat = beta.reshape(-1, components).clone()
-    evidence = _scaled(likelihood, covered).reshape(-1, components)
+    evidence = scaled.reshape(-1, components)
     weights = footprint[image, detection, cell][order, None].to(evidence).split(steps) if soft else None
     for i, (row, source) in enumerate(zip(rows.split(steps), sources.split(steps), strict=True)):
         said = evidence.index_select(0, source)
@@ -261,9 +281,26 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     return flat.view(batch, cells, components)
 
 
-def _scaled(likelihood: Tensor, covered: Tensor) -> Tensor:
-    """Scaled likelihoods, with ones for padding, which may hold zeros that no rule accepts."""
-    return scale_likelihood(torch.where(covered.any(-1, keepdim=True), likelihood, 1.0))
+def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
+    """Scale the likelihoods of detections that cover a cell (`scale_likelihood`); the others become 1.
+
+    Padding may hold zeros, which no rule accepts.
+
+    Args:
+        likelihood: `(..., L, K+1)`, likelihoods of the classes given each detection.
+        footprint: `(..., L, X·Y)`, the cells that each detection updates.
+
+    Returns:
+        `(..., L, K+1)`, scaled.
+
+    Raises:
+        InputError: a likelihood of a detection that covers a cell is negative or not finite, or all of them are zero.
+
+    >>> scale_covering(torch.tensor([[0.1, 0.4], [0.0, 0.0]]), torch.tensor([[True], [False]]))
+    tensor([[0.2500, 1.0000],
+            [1.0000, 1.0000]])
+    """
+    return scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))
 
 
 def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: _Rule) -> Tensor:

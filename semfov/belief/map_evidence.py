@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
+from semfov.belief.evidence import READOUT, Evidence, Gathered, apply_network, blur, logarithm, network
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import LOOK_FEATURES, class_features
 from semfov.detection.detections import Detections
@@ -148,8 +148,7 @@ class MapEvidence(Evidence):
             4 * distance,
             looks[:, None].log() / 2,
         ]
-        value: Tensor = self.void(torch.stack([each.expand_as(first) for each in inputs], -1))
-        return none - anything.clamp(min=1e-6).log() + value[..., 0]
+        return none - anything.clamp(min=1e-6).log() + apply_network(self.void, inputs, first.shape)
 
     def gain(self, probabilities: Tensor, closest: Tensor, looks: Tensor, distance: Tensor) -> Tensor:
         """Expected increase in the number of correctly classified cells after one more look, cell by cell.
@@ -174,9 +173,8 @@ class MapEvidence(Evidence):
             4 * nearer,
             looks[:, None, None].log() / 2,
         ]
-        value: Tensor = self.worth(torch.stack([each.expand_as(nearer) for each in inputs], -1))
         # Two equal distances may differ by rounding; such a look is not closer.
-        return value[..., 0] * (nearer > _ROUNDING)
+        return apply_network(self.worth, inputs, nearer.shape) * (nearer > _ROUNDING)
 
     def _record(self) -> dict[str, Any]:
         """The widths of the networks and the number of classes."""

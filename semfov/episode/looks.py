@@ -2,7 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -106,7 +108,9 @@ class LiveLooks(Looks):
 
 
 class StoredLooks(Looks):
-    """Looks at one image with stored detections, one set for the centre of each cell. Each look is weighed only once.
+    """Looks at one image with stored detections, one set for the centre of each cell.
+
+    Each look is weighed only once by each observer, also for several rollouts.
 
     Args:
         detections: the detections from every cell, a batch of X·Y.
@@ -125,8 +129,21 @@ class StoredLooks(Looks):
     def __init__(self, detections: Detections, grid: Grid, targets: Tensor | None = None) -> None:
         self.detections, self.grid, self.targets = detections, grid, targets
         self.like = detections.scores
-        self._weighed: tuple[Observer, Look] | None = None
+        self._weighed: dict[Observer, Look] = {}
         self._classes = [] if targets is None else targets.unique().tolist()
+
+    def of(self, episodes: Tensor | slice) -> Self:
+        """The same looks for some of the episodes.
+
+        Args:
+            episodes: their numbers.
+
+        Returns:
+            The looks; what observers have weighed is shared.
+        """
+        looks = copy(self)
+        looks.targets = None if self.targets is None else self.targets[episodes]
+        return looks
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Take the stored looks of the cells; the fixations must be their centres."""
@@ -171,9 +188,9 @@ class StoredLooks(Looks):
         Returns:
             A batch of X·Y looks; if the observer is `by_target`, X·Y looks for each target, one target after another.
         """
-        if self._weighed is None or self._weighed[0] is not observer:
+        if observer not in self._weighed:
             centres = self.grid.centres.to(self.like)
             targets = self._classes if observer.by_target else [None]
             said = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
-            self._weighed = observer, said[0] if len(said) == 1 else type(said[0]).join(said)
-        return self._weighed[1]
+            self._weighed[observer] = said[0] if len(said) == 1 else type(said[0]).join(said)
+        return self._weighed[observer]

@@ -24,7 +24,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import choose_classes, episodes_of, run_episodes, search_steps, tie_noise
+from semfov.runs.search_protocol import choose_classes, episodes_of, looks_of, run_episodes, search_steps, tie_noise
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
 
@@ -87,18 +87,13 @@ def search_curves(
         episodes = episodes_of(run.scenes, index, columns, rows, protocol, targets)
         if not episodes:
             continue
-        grid, detections = run.grid(index), run.detections(index)
+        grid = run.grid(index)
+        looks = looks_of(episodes, run.detections(index), grid)
         noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
         for name, strategy in ways.items():
             with torch.inference_mode():
                 outcomes = run_episodes(
-                    episodes,
-                    Candidate(strategy),
-                    detections,
-                    grid,
-                    noise,
-                    shifts=protocol.shifts,
-                    batch=protocol.batch,
+                    episodes, Candidate(strategy), looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             found = np.array([outcome.found_at for outcome in outcomes])
             curves[name].append(cumulative_performance(found, protocol.shifts))
@@ -128,7 +123,7 @@ def explore_curves(
         answers = answers_of(run.scenes.annotation(index), grid, len(run.scenes.classes) + 1)
         if not answers.any():
             continue
-        detections = run.detections(index)
+        looks = StoredLooks(run.detections(index), grid)
         episodes = explorations_of(run.scenes, index, len(grid), protocol)
         noise = torch.stack([explore_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
         cells = int(answers.any(-1).sum())
@@ -137,8 +132,7 @@ def explore_curves(
                 progress = run_explorations(
                     episodes,
                     Candidate(strategy),
-                    detections,
-                    grid,
+                    looks,
                     answers,
                     noise,
                     shifts=protocol.shifts,

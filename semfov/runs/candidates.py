@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from torch import Tensor
@@ -13,7 +13,7 @@ from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Tar
 from semfov.errors import InputError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Task, named_policy
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
 from semfov.gaze.policies.tables import salient_from
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
@@ -96,6 +96,13 @@ def load_models(config: PoliciesConfig, task: Task, eye: Eye) -> Models:
 def by_evidence(policy: PolicyConfig, task: Task) -> bool:
     """Whether a policy uses the learned target evidence."""
     return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
+
+
+def belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
+    """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
+    if by_evidence(policy, task):
+        return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
+    return replace(policy, policy=Random.name, saliency=None, samples=None)
 
 
 def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:

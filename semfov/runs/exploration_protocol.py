@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
-from semfov.detection.detections import Detections
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.exploration import count_right
@@ -67,8 +65,7 @@ def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: Pr
 def run_explorations(
     episodes: Sequence[Exploration],
     candidate: Candidate,
-    detections: Detections,
-    grid: Grid,
+    looks: StoredLooks,
     answers: Tensor,
     noise: Tensor,
     *,
@@ -80,8 +77,7 @@ def run_explorations(
     Args:
         episodes: the explorations, all of the same scene.
         candidate: the policy under comparison.
-        detections: detections from every cell of the scene, a batch of X·Y.
-        grid: the grid over the scene.
+        looks: the looks at the scene.
         answers: right classes of each cell (`answers_of`).
         noise: `(episodes, shifts+1, X·Y)`, from `explore_noise`.
         shifts: number of gaze shifts.
@@ -91,7 +87,6 @@ def run_explorations(
         The result of each exploration.
     """
     starts = torch.tensor([episode.start for episode in episodes])
-    looks = StoredLooks(detections, grid)
     progress: list[Progress] = []
     for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
         choice = Greedy(drawn_from(random))
@@ -99,7 +94,7 @@ def run_explorations(
         for step in rollout(
             looks,
             candidate.observer,
-            lambda _, cell: candidate.acquisition(None, grid, cell),
+            lambda _, cell: candidate.acquisition(None, looks.grid, cell),
             start,
             choice,
             most=shifts + 1,

@@ -5,16 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from semfov.belief.observers import Observer
 from semfov.errors import check, lookup
 from semfov.gaze.policies import Task
 from semfov.gaze.templates import at_points
-from semfov.runs.candidates import Candidate, load_models, make_strategy
-from semfov.runs.config import PoliciesConfig, SaliencyModel
+from semfov.runs.candidates import Candidate, belief_settings, load_models, make_strategy
+from semfov.runs.config import PoliciesConfig, PolicyConfig, SaliencyModel
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 from semfov.runs.scene_run import store_folder
+from semfov.strategy import Strategy
 
 
 class PolicyLooking(Looking):
@@ -42,10 +44,13 @@ class PolicyLooking(Looking):
         super().__init__(config)
         self.models = load_models(config, self.task, self.eye)
         components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
-        self.strategies = {
-            name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
-            for name, policy in self.policies.items()
-        }
+        self.strategies: dict[str, Strategy] = {}
+        observers: dict[PolicyConfig, Observer] = {}
+        for name, policy in self.policies.items():
+            made = make_strategy(policy, self.task, config.belief, components, self.models, fovea)
+            # Policies with the same belief share an observer, which then weighs each look only once.
+            observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
+            self.strategies[name] = Strategy(observer, made.policy)
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
         size = config.belief.columns, config.belief.rows
         self.saliency_stores = {

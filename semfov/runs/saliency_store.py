@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -12,11 +12,11 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.detection.placement import resize
 from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.gaze.saliency.cells import Reduction
 from semfov.io.schema import Field, Schema
-from semfov.runs.config import SaliencyConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.store import SceneStore, looks_digest
-from semfov.sensor import Sensor
+from semfov.sensor.base import Sensor
 
 SaliencyMap = Callable[[Tensor], Tensor]
 
@@ -24,6 +24,23 @@ _SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
 """Modules that saliency depends on, in addition to those of a look."""
 
 SALIENCY_CLASSES: dict[str, Callable[[], SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
+
+
+class SaliencySettings(Protocol):
+    """The settings of saliency that its values depend on (`semfov.runs.config.SaliencyConfig`).
+
+    The class is not imported: stored saliency would then depend on the code of all settings, and on what they import.
+    """
+
+    @property
+    def view(self) -> Literal["foveated", "picture"]:
+        """What saliency is computed of: the foveated view from each fixation, or the whole photograph once."""
+        ...
+
+    @property
+    def reduction(self) -> Reduction:
+        """How the saliency of a cell follows from that of its pixels."""
+        ...
 
 
 class SaliencyStore(SceneStore):
@@ -38,7 +55,7 @@ class SaliencyStore(SceneStore):
     """
 
     def __init__(
-        self, folder: Path, name: str, saliency: SaliencyConfig, sensor: Mapping[str, Any], grid: tuple[int, int]
+        self, folder: Path, name: str, saliency: SaliencySettings, sensor: Mapping[str, Any], grid: tuple[int, int]
     ) -> None:
         what = {
             "model": name,
@@ -63,7 +80,7 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_table(
-    name: str, saliency: SaliencyConfig, sensor: Sensor, reference: float, image: Tensor, grid: Grid
+    name: str, saliency: SaliencySettings, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
     """Saliency of every cell of a photograph.
 
@@ -100,6 +117,6 @@ def seen_by(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> 
     return sensor.open(resize(image[None], size), ratio.new_ones(2)), (points + 0.5) * ratio - 0.5
 
 
-def saliency_of_cells(model: SaliencyMap, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
+def saliency_of_cells(model: SaliencyMap, pictures: Tensor, grid: Grid, saliency: SaliencySettings) -> Tensor:
     """Saliency of the cells of pictures `(B, 3, h, w)`, `(B, X·Y)`."""
     return cell_saliency(model(pictures), grid.columns, grid.rows, saliency.reduction)

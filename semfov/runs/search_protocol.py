@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.belief.observers import Semantic
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.episode import Step, StoredLooks, rollout
@@ -139,11 +140,24 @@ def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolCo
     return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
 
 
+def looks_of(episodes: Sequence[Episode], detections: Detections, grid: Grid) -> StoredLooks:
+    """The looks of episodes of one scene, which all policies share.
+
+    Args:
+        episodes: the episodes.
+        detections: detections from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
+
+    Returns:
+        The looks.
+    """
+    return StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
+
+
 def run_episodes(
     episodes: Sequence[Episode],
     candidate: Candidate,
-    detections: Detections,
-    grid: Grid,
+    looks: StoredLooks,
     noise: Tensor,
     *,
     shifts: int,
@@ -154,8 +168,7 @@ def run_episodes(
     Args:
         episodes: the episodes, all of the same scene.
         candidate: the policy under comparison.
-        detections: detections from every cell of the scene, a batch of X·Y.
-        grid: the grid over the scene.
+        looks: the looks of these episodes (`looks_of`).
         noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
         shifts: largest number of gaze shifts.
         batch: number of episodes computed together.
@@ -166,13 +179,14 @@ def run_episodes(
     outcomes: list[EpisodeOutcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
-        outcomes += _run_batch(episodes[part], candidate, detections, grid, noise[part], shifts)
+        outcomes += _run_batch(episodes[part], candidate, looks.of(part), noise[part], shifts)
     return outcomes
 
 
 def _run_batch(
-    episodes: Sequence[Episode], candidate: Candidate, detections: Detections, grid: Grid, noise: Tensor, shifts: int
+    episodes: Sequence[Episode], candidate: Candidate, looks: StoredLooks, noise: Tensor, shifts: int
 ) -> list[EpisodeOutcome]:
+    grid = looks.grid
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
     for row, episode in enumerate(episodes):
         goals[row, list(episode.goal)] = True
@@ -190,9 +204,13 @@ def _run_batch(
     def lands(step: Step) -> Tensor:
         return goals[seeking[step.episodes], step.next_cell]
 
-    looks = StoredLooks(detections, grid, cues[seeking])
+    if candidate.strategy.policy.by_belief:
+        observer, seen = candidate.observer, looks.of(seeking)
+    else:
+        # No look changes what the policy does, and most of the time would go into the belief.
+        observer, seen = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)
     choice = Greedy(drawn_from(noise[seeking]))
-    for step in rollout(looks, candidate.observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
+    for step in rollout(seen, observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
         going = ~step.visited.all(-1)
         number = seeking[step.episodes[going]]
         visits[number, step.shift + 1] = step.next_cell[going]

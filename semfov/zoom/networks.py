@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.belief.evidence import neighbourhood_peak
 from semfov.sensor.lines import constant
 
 STEPS = 3
@@ -65,13 +66,6 @@ def tapered(border: Tensor, span: int) -> Tensor:
     cell = torch.arange(span, device=border.device)
     ring = torch.minimum(cell, span - 1 - cell) * 8 // span
     return border.sigmoid()[ring.clamp(max=3)]
-
-
-def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
-    """Largest value of maps `(T, rows, columns)` in the square about each cell."""
-    # One axis after the other: fewer comparisons.
-    along = F.max_pool1d(values, side, 1, side // 2)
-    return F.max_pool1d(along.mT, side, 1, side // 2).mT
 
 
 def neighbourhood_mean(values: Tensor, side: int) -> Tensor:

@@ -16,10 +16,10 @@ from semfov.io.storage import write_file
 
 
 class Recorder(nn.Module):
-    """Records its inputs, and corrects every cell by 0.5."""
+    """Records its inputs, one table for each of 8 episodes, and corrects every cell by 0.5."""
 
     def forward(self, inputs):
-        self.read = inputs
+        self.read = inputs.unflatten(0, (8, -1))
         return inputs.new_full((*inputs.shape[:-1], 1), 0.5)
 
 

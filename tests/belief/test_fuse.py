@@ -130,7 +130,7 @@ def test_the_observation_model_gets_the_distance_of_each_box():
     torch.testing.assert_close(near[0, 0], torch.tensor([0.01, 0.36, 0.09]))
     torch.testing.assert_close(near[0, 1], torch.ones(3))
     said = Semantic(3, Sharper()).weigh(seen(grid), fixation, grid)
-    assert torch.equal(said.likelihood, near)
+    assert torch.equal(said.likelihood[0, :2], near[0, :2] / near[0, :2].amax(-1, keepdim=True))
     assert torch.equal(said.footprint[0, :2], grid.footprint(seen(grid).boxes)[0, :2])
     assert not said.footprint[0, 2].any()
 

@@ -13,6 +13,8 @@ from eval.explore.references import FUSED, PAINTED
 from eval.explore.run import ExploreRun
 from semfov import observers
 from semfov.gaze.saliency import VOCUS2
+from semfov.io.code import closure
+from semfov.runs import saliency_store
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SaliencyConfig
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 
@@ -136,6 +138,12 @@ def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
     assert other.store.key != run.store.key
     assert other.saliency_stores["vocus2"].key == run.saliency_stores["vocus2"].key
     assert torch.equal(other.saliency("vocus2", 0), run.saliency("vocus2", 0))
+
+
+def test_stored_saliency_does_not_depend_on_the_code_of_beliefs_and_policies():
+    code = {path.stem for path in closure(saliency_store._SOURCES, lambda name: name.startswith("semfov."))}
+    assert {"vocus2", "itti", "grid", "saliency_store"} <= code
+    assert not {"fusion", "belief", "config", "candidates", "choice"} & code
 
 
 def test_saliency_is_stored_by_all_settings_that_affect_it(finished):

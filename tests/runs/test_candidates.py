@@ -20,7 +20,7 @@ from semfov.gaze.acquisition import (
     TargetPosterior,
 )
 from semfov.runs import candidates
-from semfov.runs.candidates import Candidate, Models, load_models, make_strategy, needs_observation
+from semfov.runs.candidates import Candidate, Models, belief_settings, load_models, make_strategy, needs_observation
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.presets import known_policies, presets, resolve
 from semfov.strategy import Strategy
@@ -43,6 +43,29 @@ def context():
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
     """The strategy of a policy for two classes, made with the given models."""
     return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, Models(**models), fovea)
+
+
+@pytest.mark.parametrize("task", ["search", "exploration"])
+def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, model):
+    models = {"observation": model, "evidence": TargetEvidence(components=3), "map": MapEvidence(components=3)}
+    seen = {}
+    for name in presets(task):
+        plain = resolve(name, task)
+        own = candidates.by_evidence(plain, task) or plain.scores == "learned"
+        for policy in (plain,) if own else (plain, replace(plain, tempering=0.5), replace(plain, misses=True)):
+            observer = strategy(policy, task, **models).observer
+            look = type(observer), repr(observer), [id(part) for part in observer.children()]
+            assert seen.setdefault(belief_settings(policy, task), look) == look
+    assert 3 < len(seen) < 3 * len(presets(task))
+
+
+@pytest.mark.parametrize("name", [name for name, kind in policies.POLICIES.items() if not kind.by_belief])
+def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(name):
+    policy, cell = policies.POLICIES[name](), torch.tensor([1, 5])
+    values = policy.in_scene(1, GRID, torch.rand(12, 12), cell)
+    beliefs = (DirichletBelief(0.5 + torch.rand(2, 12, components)) for components in (1, 3))
+    first, second = (values(belief, torch.zeros(2, 12, dtype=torch.bool)) for belief in beliefs)
+    assert torch.equal(first, second)
 
 
 def needs_model(belief=None, *choices, task="search"):

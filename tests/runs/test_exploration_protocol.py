@@ -9,6 +9,7 @@ import torch
 from semfov import Detections, FovealObservationModel, Grid, policies
 from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
+from semfov.episode import StoredLooks
 from semfov.metrics.exploration import answers_of
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
@@ -108,8 +109,8 @@ def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
     # In float64, so that the reference finds the same ties.
     double = SemanticLook(look.likelihood.double(), look.footprint, look.distance.double())
     explorer = Candidate(Strategy(FixedLook(double), policies.KL(model.double())))
-    nothing = Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask)
-    progress = run_explorations(episodes, explorer, nothing, GRID, answers, noise, shifts=shifts, batch=batch)
+    looks = StoredLooks(Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask), GRID)
+    progress = run_explorations(episodes, explorer, looks, answers, noise, shifts=shifts, batch=batch)
     right_classes = [set(row.nonzero()[:, 0].tolist()) for row in answers]
     for episode, random, outcome in zip(episodes, noise, progress, strict=True):
         expected = explore_by_loop(episode, look, model, right_classes, random, shifts)
@@ -124,7 +125,7 @@ def test_answers_with_and_without_background_are_both_recorded(look):
     answers = answers_of(ANNOTATION, GRID, 4)
     assert not answers[:, 0].any()
     explorer = Candidate(Strategy(FixedLook(look), policies.Random()))
-    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=5, batch=100)
+    progress = run_explorations(episodes, explorer, StoredLooks(NOTHING, GRID), answers, noise, shifts=5, batch=100)
     for outcome in progress:
         counts = zip(outcome.right, outcome.right_without_background, strict=True)
         assert all(right <= without_background for right, without_background in counts)
@@ -142,7 +143,7 @@ def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
         Candidate(Strategy(observer, policy), saliency=table, weight=0.5),
         answers_of(ANNOTATION, GRID, 4),
     )
-    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=6, batch=3)
+    progress = run_explorations(episodes, explorer, StoredLooks(NOTHING, GRID), answers, noise, shifts=6, batch=3)
     for outcome in progress:
         belief, visited = observer.start(1, GRID, look.likelihood), torch.zeros(1, 12, dtype=torch.bool)
         for here, there in pairwise(outcome.cells):
@@ -163,7 +164,9 @@ def test_saliency_alone_replaces_the_policy(look):
     for table in (saliency, saliency[:1]):
         explorer = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
         answers = answers_of(ANNOTATION, GRID, 4)
-        progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=11, batch=100)
+        progress = run_explorations(
+            episodes, explorer, StoredLooks(NOTHING, GRID), answers, noise, shifts=11, batch=100
+        )
         for episode, outcome in zip(episodes, progress, strict=True):
             cells = [episode.start]
             while len(cells) < 12:

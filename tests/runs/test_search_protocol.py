@@ -12,7 +12,7 @@ from semfov.data import Annotation
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.search_protocol import EpisodeOutcome, episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.strategy import Strategy
 from tests.small import FixedLook
 
@@ -62,7 +62,9 @@ def run(scenes, look, policy, protocol, batch=1024, index=0):
     episodes = episodes_of(scenes, index, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
     candidate = Candidate(Strategy(FixedLook(look), policy))
-    outcomes = run_episodes(episodes, candidate, NOTHING, GRID, noise, shifts=protocol.shifts, batch=batch)
+    outcomes = run_episodes(
+        episodes, candidate, looks_of(episodes, NOTHING, GRID), noise, shifts=protocol.shifts, batch=batch
+    )
     return episodes, noise, outcomes
 
 
@@ -115,7 +117,7 @@ def test_saliency_alone_replaces_the_policy(scenes, look):
     saliency = torch.rand(25, 25, generator=torch.Generator().manual_seed(0))
     for table in (saliency, saliency[:1]):
         candidate = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
-        outcomes = run_episodes(episodes, candidate, NOTHING, GRID, noise, shifts=8, batch=4)
+        outcomes = run_episodes(episodes, candidate, looks_of(episodes, NOTHING, GRID), noise, shifts=8, batch=4)
         for episode, outcome in zip(episodes, outcomes, strict=True):
             cells = [episode.start]
             while len(cells) <= 8 and cells[-1] not in episode.goal:
@@ -124,6 +126,29 @@ def test_saliency_alone_replaces_the_policy(scenes, look):
                 cells.append(int(seen.argmax()))
             assert outcome.cells == tuple(cells)
             assert outcome.found_at == (len(cells) - 1 if cells[-1] in episode.goal else -1)
+
+
+class Unread(FixedLook):
+    """An observer that must not be used."""
+
+    def update(self, belief, look):
+        raise AssertionError("updated")
+
+
+def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look):
+    protocol = ProtocolConfig(starts=4, shifts=9)
+    episodes, noise, expected = run(scenes, look, policies.Random(), protocol)
+    looks, candidate = looks_of(episodes, NOTHING, GRID), Candidate(Strategy(Unread(look), policies.Random()))
+    assert run_episodes(episodes, candidate, looks, noise, shifts=9, batch=8) == expected
+    for episode, random, outcome in zip(episodes, noise, expected, strict=True):
+        cells = [episode.start]
+        while len(cells) <= 9 and cells[-1] not in episode.goal:
+            random[len(cells) - 1][cells] = -1
+            cells.append(int(random[len(cells) - 1].argmax()))
+        assert outcome.cells == tuple(cells)
+    seeing = Candidate(Strategy(Unread(look), policies.NonPredictive()))
+    with pytest.raises(AssertionError, match="updated"):
+        run_episodes(episodes, seeing, looks, noise, shifts=9, batch=8)
 
 
 @pytest.mark.parametrize("policy", [policies.Random(), policies.NonPredictive()], ids=lambda policy: policy.name)
@@ -184,6 +209,6 @@ def test_a_search_ends_when_no_cell_is_left(scenes, look):
     hidden = [episodes[0].__class__(**{**episodes[0].__dict__, "goal": ()})]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
     candidate = Candidate(Strategy(FixedLook(look), policies.Random()))
-    outcome = run_episodes(hidden, candidate, NOTHING, GRID, noise, shifts=40, batch=8)[0]
+    outcome = run_episodes(hidden, candidate, looks_of(hidden, NOTHING, GRID), noise, shifts=40, batch=8)[0]
     assert outcome.found_at == -1
     assert sorted(outcome.cells) == list(range(25))

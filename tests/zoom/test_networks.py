@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch.nn import functional
 
+from semfov.belief.evidence import neighbourhood_peak
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, neighbourhood_mean, neighbourhood_peak, small_network, through
+from semfov.zoom.networks import features, neighbourhood_mean, small_network, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])

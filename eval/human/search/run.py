@@ -15,7 +15,7 @@ from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, run_episodes, tie_noise
+from semfov.runs.search_protocol import Episode, looks_of, run_episodes, tie_noise
 
 
 class PeopleSearchRun(Run):
@@ -48,13 +48,14 @@ class PeopleSearchRun(Run):
         start = int(grid.cell_of(torch.tensor(self.config.screen.start)))
         (target,) = self.scenes.targets(index)
         episode = Episode(index, target, target, 0, start, goal, True)
+        looks = looks_of([episode], detections, grid)
         noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
         records: list[ResultRecord] = []
         for policy in self.policies:
             candidate = self.candidate(policy, index)
             with torch.inference_mode():
                 (outcome,) = run_episodes(
-                    [episode], candidate, detections, grid, noise, shifts=protocol.shifts, batch=protocol.batch
+                    [episode], candidate, looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(policy)
             found = {"cells": list(outcome.cells), "found_at": outcome.found_at}

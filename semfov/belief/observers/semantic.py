@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.evidence import farther
-from semfov.belief.fusion import RULES, fuse
+from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
 from semfov.belief.observers.base import Look, Observer, own
@@ -33,7 +33,7 @@ class SemanticLook(Look):
     """Likelihoods of a batch of looks, ready for fusion.
 
     Attributes:
-        likelihood: `(B, L, K+1)`, likelihood of each class given each detection, up to a common factor.
+        likelihood: `(B, L, K+1)`, likelihood of each class given each detection, scaled to a maximum of 1.
         footprint: `(B, L, X·Y)`, the cells that each detection updates: boolean, or weights in [0, 1] that are used as
             exponents of the likelihood; false or 0 for padding.
         distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
@@ -136,7 +136,7 @@ class Semantic(Observer):
         """Likelihoods of the detections (`likelihoods`), the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.observation, tempering=self.tempering)
         cells = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
-        return SemanticLook(likelihood, cells, grid.distance(fixation).to(likelihood))
+        return SemanticLook(scale_covering(likelihood, cells), cells, grid.distance(fixation).to(likelihood))
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
@@ -162,7 +162,7 @@ class Semantic(Observer):
         return DirichletBelief(self.prior + keep * (known.beta - self.prior), known.closest + farther(keep))
 
     def _fuse(self, beta: Tensor, look: SemanticLook) -> Tensor:
-        fused = fuse(beta, look.likelihood.to(beta.dtype), look.footprint, self.fusion)
+        fused = fuse_scaled(beta, look.likelihood.to(beta.dtype), look.footprint, self.fusion)
         if self.misses is None:
             return fused
         nothing = ~(look.footprint > 0).any(-2)

@@ -66,6 +66,7 @@ class Policy(nn.Module, ABC):
         table: the table that it needs of every scene; None for most policies.
         needs_model: whether it is made from an observation model.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
+        by_belief: whether its choice depends on the belief.
         by_samples: whether it can take an expectation over drawn looks (`SamplingPolicy`).
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
@@ -84,6 +85,7 @@ class Policy(nn.Module, ABC):
     table: ClassVar[Table | None] = None
     needs_model: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
+    by_belief: ClassVar[bool] = True
     by_samples: ClassVar[bool] = False
     by_place: ClassVar[bool] = False
 

@@ -27,6 +27,7 @@ class Random(Policy):
 
     name = "random"
     tasks: ClassVar[tuple[Task, ...]] = ("search", "exploration")
+    by_belief = False
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The same value for every cell."""

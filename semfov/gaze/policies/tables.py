@@ -46,6 +46,7 @@ class SaliencyMaximum(TablePolicy):
     name = "saliency"
     tasks: ClassVar[tuple[Task, ...]] = ("search", "exploration")
     table = "saliency"
+    by_belief = False
 
     def in_scene(
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
