@@ -267,7 +267,7 @@ def _only(seen: Detections, number: int) -> Detections:
 
 @styled
 def grid_example(example: Example) -> Figure:
-    """The cells of the map: the fixated one, and those that the detections of the foveal image update."""
+    """The cells of the map: the fixated one, and those that its detections of a score of 0.1 or more update."""
     from matplotlib.colors import ListedColormap
 
     figure, (axes,) = example.pictures(1, 1, 5.4)

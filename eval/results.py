@@ -21,14 +21,15 @@ from typing import Any
 
 from eval.calibration.config import CalibrationConfig
 from eval.calibration.evaluation import judge_beliefs
+from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
 from eval.decide.config import DecideConfig
 from eval.explore import explore
 from eval.explore.config import ExploreConfig
 from eval.page.curves import OBJECTS
-from eval.page.experiments import STUDIES, ResultsConfig, experiments
-from eval.page.figures import PAGE_FIGURES, draw_figures
-from eval.page.findings import findings
+from eval.page.experiments import AT_THRESHOLDS, STUDIES, ResultsConfig, experiments
+from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
+from eval.page.findings import findings, words_of_findings
 from eval.page.origin import missing, origin
 from eval.page.tables import (
     Runs,
@@ -43,6 +44,7 @@ from eval.page.tables import (
     study_table,
     told_table,
 )
+from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
 from eval.search import search
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, lookup
@@ -70,7 +72,9 @@ def results(config: ResultsConfig) -> None:
         kept += others
     drawn = draw_figures(config.pictures, runs)
     renewed = [found["name"] for text in texts for found in PLACE.finditer(text) if found["name"] not in kept]
-    kept += [f"{name}.png" for name in PAGE_FIGURES if config.pictures / f"{name}.png" not in drawn]
+    kept += [
+        f"{name}.png" for name in (*PAGE_FIGURES, THRESHOLD_FIGURE) if config.pictures / f"{name}.png" not in drawn
+    ]
     print(f"\nrenewed: {', '.join([*renewed, *(path.name for path in drawn)]) or 'nothing'}")
     print(f"kept, because experiments have not run: {', '.join(kept) or 'nothing'}")
     for path in [*pages, *drawn]:
@@ -141,6 +145,10 @@ _SEARCHES, _EXPLORATIONS = (tuple(published(kind).values()) for kind in ("search
 WHOLE = {
     "paper": PageTable(_SEARCHES, beside_paper),
     "findings": PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
+    "findings-words": PageTable((*_SEARCHES, *_EXPLORATIONS), words_of_findings),
+    "verdicts": PageTable(AT_THRESHOLDS, verdicts),
+    "verdicts-words": PageTable(AT_THRESHOLDS, words_of_verdicts),
+    "thresholds": PageTable(AT_THRESHOLDS, by_threshold),
     "photographs": PageTable(_SEARCHES[:1], photographs),
     "readings": PageTable(_SEARCHES[:1], readings),
 }
@@ -156,6 +164,7 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
     ExploreConfig: explore,
     DecideConfig: search_and_decide,
     CalibrationConfig: judge_beliefs,
+    ThresholdLooksConfig: look_at_thresholds,
 }
 """Functions that run an experiment, by the class of its settings."""
 

@@ -9,7 +9,7 @@ import torch
 import semfov
 from semfov.belief import ContextPrior
 from semfov.io.compatibility import learned_for, recommended_model
-from semfov.presets import PUBLISHED_SENSORS
+from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE, features
@@ -169,7 +169,8 @@ def test_every_detector_has_all_kinds_of_models():
     names = {"yolov3-tiny", "yolox-nano"}
     learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)}
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
-    kinds = ("", "-sharp", "-published", "-published-narrow")
+    at_thresholds = (f"-published-{threshold}" for threshold in (0.1, 0.25, 0.5))
+    kinds = ("", "-sharp", "-published", "-published-narrow", *at_thresholds)
     every = {name + kind for name in names for kind in kinds}
     assert {path.stem for path in OBSERVATION} == every | {f"{name}-zoom" for name in names}
 
@@ -194,6 +195,17 @@ def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(de
     assert not model.log_prior.any()
     assert float(model.tempering) == 1
     torch.testing.assert_close(model.expected_scores(), model.alpha / model.alpha.sum(-1, keepdim=True))
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.25, 0.5])
+@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+def test_published_models_are_fitted_at_other_thresholds_too(detector, threshold):
+    assert published_model(detector, "published", threshold) == f"{detector}-published-{threshold}"
+    model = semfov.FovealObservationModel.from_pretrained(f"{detector}-published-{threshold}")
+    assert model.metadata["detector"]["selection"]["threshold"] == threshold
+    assert model.metadata["sensor"]["sigma"] == pytest.approx(100)
+    assert model.metadata["method"] == "newton"
+    assert not model.log_prior.any()
 
 
 @pytest.mark.weights

@@ -11,6 +11,7 @@ its paragraph which row and column it means.
 import re
 from dataclasses import dataclass
 from functools import cache
+from math import log
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,12 @@ import torch
 from semfov import FovealObservationModel
 from semfov.agents.head import CONFIRM
 from semfov.belief import Verification
+from semfov.decision import MOST_CLOSER
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
+from semfov.live.fovea import RATE
+from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import Retina
 from semfov.zoom.export import OPSET
@@ -40,7 +44,7 @@ STRICT = [
 OTHERS = [
     *(f"docs/{name}.md" for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method")),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/measurements/*.md")),
-    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md") if path.stem != "live"),
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md")),
 ]
 """Pages on which a number may also be the output of a command that its section names (`COMMAND`)."""
 
@@ -68,10 +72,13 @@ CONDITIONS = re.compile(
     r"\d[\d,]* ?× ?\d[\d,]*"  # sizes
     r"|\d[\d,.]* ?(?:px|million pixels|pixels|degrees|°)|of 640\b"  # lengths in pixels, and angles
     r"|\b(?:1[89]|20)\d\d(?=[),;.])"  # years of publications
-    r"|\d+e-\d+|10⁻⁶"  # tolerances
+    r"|\b95 %(?= (?:intervals?|limit)\b)"  # levels of errors
+    r"|\d+e-\d+|10⁻⁶|ln 2 / r"  # tolerances, and half-lives
     rf"|(?:[Aa]fter|[Ww]ithin) \d+(?:, \d+)*(?: and \d+)*(?: of \d+)? {_COUNTED}\b"
     rf"|(?:[Ii]n|[Oo]n|[Aa]t|[Ff]or|[Oo]f|[Ww]ith|[Oo]ver|to|the) (?:the |all |both |first )*\d[\d,]* {_COUNTED}\b"
-    r"|(?:[Gg]rowth|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
+    r"|(?:[Aa]t|[Ww]hy|for|from|is|of) 0\.(?:005|02|1|25|5)\b(?:, 0\.\d+)*(?: and 0\.\d+)?"  # thresholds of scores
+    r"|95 % intervals"
+    r"|(?:[Gg]rowth|[Rr]ate(?: is| of)?|[τκσ] =|τ <|temperature|threshold of) \d+(?:\.\d+)?"  # settings by name
 )
 """What a sentence is about, as opposed to what was measured: sizes, numbers of looks, years, settings by name."""
 
@@ -171,6 +178,14 @@ KNOWN = {
         "score of 0.1 and overlaps": "what found means",
         f"score of {LEAST}, and an": "code",
     },
+    "docs/guides/live.md": {
+        f"{MOST_CLOSER} by default": "code",
+        f"at most {MOST_CLOSER} of {log(2) / RATE:.0f} frames": "code",
+        f"{log(2) / WINDOW_RATE:.0f} by default": "code",
+        f"rate, {RATE}": "code",
+        "40 of the fitting": "videos of the table",
+        "20 frames": "videos of the table",
+    },
     "docs/guides/records.md": {f"which is {LEAST} unless": "code", f"begin at {FAINTEST}": "code"},
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
     "docs/guides/index.md": {"ROS 2": "a name"},
@@ -259,6 +274,7 @@ SAME = {
     "divergence": "kl",
     "difference": "point",
     "without": "no",
+    "hand": "non predictive raw tempering footprint box centre",
     "percentage": "share",
     "person": "people",
     "sooner": "later point difference",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -17,7 +17,8 @@ from semfov.runs.config import ScenesConfig
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread, tight
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import store_folder
+from semfov.runs.scene_run import finish, store_folder
+from semfov.runs.settings import Share
 from semfov.runs.store import DetectionStore, cell_store
 
 
@@ -87,29 +88,46 @@ class ThresholdEyes:
         return found
 
 
+@dataclass(frozen=True)
+class ThresholdLooksConfig(ScenesConfig):
+    """Look at scenes from every cell, and store the looks for each of several score thresholds.
+
+    Args:
+        data: the scenes.
+        detector: the detector; `thresholds` replace its threshold.
+        sensor: the foveal sensor.
+        belief: the belief; its columns and rows are the cells.
+        out: folder in which finished scenes are noted.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: must be true.
+        workers: number of processes (None: one per CPU core).
+        thresholds: the score thresholds.
+    """
+
+    thresholds: tuple[Share, ...] = (0.02, 0.1, 0.25, 0.5)
+
+
 class ThresholdLooking(Looking):
     """Looks at scenes from every cell, which are stored for each of several thresholds.
 
     A run with one of these thresholds finds its looks stored, as if it had taken them itself.
 
     Args:
-        config: the settings; the detector's threshold is not used.
-        thresholds: the thresholds.
+        config: the settings.
     """
 
-    config: ScenesConfig
+    config: ThresholdLooksConfig
 
-    def __init__(self, config: ScenesConfig, thresholds: Sequence[float]) -> None:
+    def __init__(self, config: ThresholdLooksConfig) -> None:
         super().__init__(config)
-        self.thresholds = tuple(thresholds)
-        self.eyes = ThresholdEyes(self.eye, self.thresholds)
+        self.eyes = ThresholdEyes(self.eye, config.thresholds)
         folder, belief = store_folder(config.cache) / "looks", config.belief
         size, components = (belief.columns, belief.rows), len(self.scenes.classes) + 1
         self.stores = [cell_store(folder, settings, *size, components) for settings in self.eyes.settings]
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the cells and the thresholds."""
-        return {**super().depends_on(), "thresholds": self.thresholds}
+        return {**super().depends_on(), "thresholds": self.config.thresholds}
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Look at a scene from every cell, and store the looks that are missing; there are no records."""
@@ -136,3 +154,8 @@ def _at(settings: dict[str, Any], threshold: float) -> dict[str, Any]:
     detector = settings["detector"]
     selection = {**detector["selection"], "threshold": threshold}
     return {**settings, "detector": {**detector, "selection": selection}}
+
+
+def look_at_thresholds(config: ThresholdLooksConfig) -> None:
+    """Take the looks of all scenes that are not stored yet."""
+    finish(ThresholdLooking(config), "looking")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.calibration.config import CalibrationConfig
+from eval.comparison.thresholds import ThresholdLooksConfig
 from eval.decide.config import DecideConfig
 from eval.explore.config import ExploreConfig
 from eval.search.config import SearchConfig
@@ -60,6 +61,9 @@ PUBLISHED_EXPLORATION = (
 )
 """Exploration policies of the paper."""
 
+SCORE_THRESHOLDS = (0.02, 0.1, 0.25, 0.5)
+"""Score thresholds of the detector at which the page tests the findings of the paper, which gives none."""
+
 PROPOSED = (
     "random",
     "non-predictive-calibrated",
@@ -96,22 +100,17 @@ BEYOND_EXPLORATION = (
 
 _SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
-SAMPLES = 16
-"""Number of drawn looks in the policies that take an expectation over them."""
-
-EXPECTED = tuple(
-    PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, SAMPLES)
-)
+EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
 """Predictive searches with the expected scores, and with the expectation over drawn looks."""
 
 EXPECTED_EXPLORATION = tuple(
     PolicyConfig(policy, "calibrated", samples=samples)
     for policy in ("kl", "negative-entropy")
-    for samples in (None, SAMPLES)
+    for samples in (None, 16)
 )
 """The same two kinds of explorations."""
 
-Experiment = RunConfig | DecideConfig | CalibrationConfig
+Experiment = RunConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
 
 Changes = dict[str, dict[str, object]]
@@ -254,12 +253,15 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
             yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
             yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=PUBLISHED_EXPLORATION)
+        yield from _thresholds(name, settings, common)
         sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
         yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
         if name == "nano":
-            few = ProtocolConfig(starts=3, shifts=20)
-            yield "expected-search", seek(sensor=sensor, belief=belief, policies=EXPECTED)
-            yield "expected-explore", tour(sensor=sensor, belief=belief, policies=EXPECTED_EXPLORATION, protocol=few)
+            # One start: an expectation takes ten times as long as the published decision.
+            seen: dict[str, Any] = {"sensor": sensor, "belief": belief}
+            yield "expected-search", seek(**seen, protocol=ProtocolConfig(1), policies=EXPECTED)
+            once = ProtocolConfig(1, shifts=20)
+            yield "expected-explore", tour(**seen, protocol=once, policies=EXPECTED_EXPLORATION)
         yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
@@ -271,6 +273,33 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
         belief = BeliefConfig(model=f"{settings.name}-sharp")
         yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor, belief=belief)
+
+
+def at_threshold(kind: str, threshold: float, name: str) -> str:
+    """Name of the experiment of a kind at a score threshold, with a detector of `DETECTORS`."""
+    return f"{kind}-threshold-{threshold:g}-{name}"
+
+
+AT_THRESHOLDS = tuple(
+    at_threshold(kind, threshold, name)
+    for kind in ("search", "explore")
+    for threshold in SCORE_THRESHOLDS
+    for name in DETECTORS
+)
+"""Names of the experiments at all score thresholds."""
+
+
+def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> Iterator[tuple[str, Experiment]]:
+    """The paper's searches and explorations at each score threshold, after the looks, which share a pass."""
+    sensor = SensorConfig(name="published")
+    yield f"looks-threshold-{name}", ThresholdLooksConfig(**common, sensor=sensor, thresholds=SCORE_THRESHOLDS)
+    for threshold in SCORE_THRESHOLDS:
+        # Without a name, the observation model is the one that was fitted at the threshold.
+        own = {**common, "detector": replace(settings, threshold=threshold), "sensor": sensor}
+        seek = SearchConfig(**own, scanpaths=0, policies=tuple(p for p in PUBLISHED if p != "vocus2"))
+        tour = ExploreConfig(**own, policies=PUBLISHED_EXPLORATION[:4])
+        yield at_threshold("search", threshold, name), seek
+        yield at_threshold("explore", threshold, name), tour
 
 
 def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:

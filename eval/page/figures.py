@@ -1,12 +1,14 @@
-"""Figures of the pages of results: the paper's four, each for both detectors and both foveas."""
+"""Figures of the pages of results: the paper's four, for both detectors and foveas, and one of score thresholds."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from eval.page.curves import per_image, records_of, repetition_error
+from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
 from eval.page.findings import LAST
 from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
+from eval.page.thresholds import CONTRASTS, Contrast
 from semfov.metrics.averages import FloatArray
 from semfov.viz.style import save_figure
 
@@ -43,11 +45,26 @@ PAGE_FIGURES = {
 LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
 
 
+THRESHOLD_FIGURE = "thresholds"
+"""File of the figure of differences at all score thresholds."""
+
+
 def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     """Draw the figures whose experiments are all finished; returns their files."""
     from semfov.viz import plot_curve_panels
 
     written = []
+    if not missing(AT_THRESHOLDS, runs):
+        shown = {
+            f"{title}, {contrast.text}": (contrast, name)
+            for contrast in CONTRASTS
+            for name, title in DETECTORS.items()
+            if not contrast.one.endswith("raw")
+        }
+        drawn = plot_curve_panels(
+            {title: threshold_panel(*chosen, runs) for title, chosen in shown.items()}, label="difference (points)"
+        )
+        written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
         if missing(published(figure.kind).values(), runs):
             continue
@@ -65,3 +82,9 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
         {policy: per_image(these, last).mean(0) for policy, these in records.items()},
         {policy: repetition_error(these, last) for policy, these in records.items()},
     )
+
+
+def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
+    told = {f"threshold {threshold:g}": contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS}
+    return {label: mean for label, (mean, _) in told.items()}, {label: error for label, (_, error) in told.items()}

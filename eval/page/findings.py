@@ -1,19 +1,103 @@
-"""Whether the paper's findings hold here: for each finding, numbers and a verdict by detector and fovea."""
+"""The paper's findings, and whether they hold here: sizes and verdicts by detector, fovea and measure."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from eval.page.curves import behind, difference, per_image, records_of, spans
+from eval.page import paper
+from eval.page.curves import OBJECTS, behind, corrected_signs, difference, per_image, records_of, spans
+from eval.page.experiments import DETECTORS
 from eval.page.tables import Runs, published_columns
+from eval.page.verdicts import VERDICTS, Answer, gain_verdict, legend, overtaken_verdict
 from semfov.metrics.averages import FloatArray
 from semfov.runs.tables import table
 
 LAST = {"search": 30, "explore": 20}
 
-Answer = Callable[[Path], str]
+NO_DETECTOR = ("random", "vocus2")
+"""Policies that use no detector."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What is counted in episodes of a kind.
+
+    Attributes:
+        text: its name in tables.
+        commonest: for searches, only each image's commonest target, as in the paper.
+        field: for explorations, the answers that are counted.
+    """
+
+    text: str
+    commonest: bool = False
+    field: str = "right"
+
+
+COUNTED = {
+    "search": (Measure("one target", commonest=True), Measure("all targets")),
+    "explore": (Measure("with background"), Measure("without", field=OBJECTS)),
+}
+"""Ways to count, by the kind of the experiment; the paper's way comes first."""
+
+
+@dataclass(frozen=True)
+class Advantage:
+    """The finding that one policy is better than another by so much, or no better.
+
+    Attributes:
+        one: the first policy.
+        other: the policy that is subtracted.
+        shifts: gaze shifts at which they are compared.
+        expected: 1 if the finding is that the first policy is better, 0 if it is that the two are level.
+    """
+
+    one: str
+    other: str
+    shifts: tuple[int, ...]
+    expected: int = 1
+
+    def answer(self, mean: FloatArray, error: FloatArray) -> Answer:
+        """Sizes in percentage points, with standard errors, and the verdict."""
+        chosen, errors = mean[list(self.shifts)], error[list(self.shifts)]
+        told = " / ".join(f"{100 * m:+.1f} ± {100 * e:.1f}" for m, e in zip(chosen, errors, strict=True))
+        within = bool((np.abs(chosen) <= 2 * errors).all())
+        signs = {int(sign) for sign in corrected_signs(chosen, errors)}
+        return Answer(told, gain_verdict(signs, self.expected, within))
+
+    def published(self) -> str:
+        """The paper's sizes, where it prints both policies."""
+        printed = paper.TABLE_II | paper.TABLE_I
+        if self.one not in printed or self.other not in printed or self.shifts != paper.TABLE_SHIFTS:
+            return "-"
+        pairs = zip(printed[self.one][:-1], printed[self.other][:-1], strict=True)
+        return " / ".join(f"{one - other:+.1f}" for one, other in pairs)
+
+
+@dataclass(frozen=True)
+class Overtaken:
+    """The finding that a policy first leads another and is overtaken by it.
+
+    Attributes:
+        one: the policy.
+        other: the policy that overtakes it.
+        paper: until when it leads in the paper.
+    """
+
+    one: str
+    other: str
+    paper: str
+
+    def answer(self, mean: FloatArray, error: FloatArray) -> Answer:
+        """Gaze shifts at which it is ahead and behind, and the verdict."""
+        leads, trails = behind(-mean, error), behind(mean, error)
+        told = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
+        within = bool((np.abs(mean) <= 2 * error).all())
+        return Answer(told, overtaken_verdict(leads, trails, within))
+
+    def published(self) -> str:
+        """Until when it leads in the paper."""
+        return self.paper
 
 
 @dataclass(frozen=True)
@@ -23,177 +107,143 @@ class Finding:
     Attributes:
         text: the finding.
         kind: kind of the experiment that tests it.
-        shown: description of the numbers.
-        answer: gives numbers and verdict for the folder of a run.
+        shown: description of the sizes.
+        test: the test.
     """
 
     text: str
     kind: str
     shown: str
-    answer: Answer
+    test: Advantage | Overtaken
+
+    def answer(self, folder: Path, measure: Measure) -> Answer:
+        """The answer of a run, by a measure."""
+        last = LAST[self.kind]
+        curves = [
+            per_image(records_of(folder, policy, commonest=measure.commonest), last, measure.field)
+            for policy in (self.test.one, self.test.other)
+        ]
+        return self.test.answer(*difference(*curves))
+
+    @property
+    def detects(self) -> bool:
+        """Whether a policy of the finding uses a detector."""
+        return not {self.test.one, self.test.other} <= set(NO_DETECTOR)
 
 
-def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: int = 1) -> Answer:
-    """Test whether the paired difference of two policies has the expected sign.
+SEARCH, EXPLORE = paper.TABLE_SHIFTS, (1, 5, 15)
 
-    A sign holds if the difference is more than two standard errors away from zero; otherwise the policies are level.
-
-    Args:
-        one: the first policy.
-        other: the policy that is subtracted.
-        shifts: gaze shifts at which the policies are compared.
-        kind: kind of the experiment.
-        expected: 1 if the finding is that the first policy is better, 0 if it is that the two are level.
-
-    Returns:
-        A function that gives the differences in percentage points and a verdict.
-    """
-
-    def answer(folder: Path) -> str:
-        mean, error = paired_difference(folder, one, other, kind)
-        figures = " / ".join(f"{100 * mean[n]:+.1f}" for n in shifts)
-        signs = {int(np.sign(mean[n])) if abs(mean[n]) > 2 * error[n] else 0 for n in shifts}
-        return f"{figures}: {verdict(signs, expected)}"
-
-    return answer
-
-
-def verdict(signs: set[int], expected: int) -> str:
-    """The verdict on a finding.
-
-    Args:
-        signs: the signs of the differences; 0 for a difference within two standard errors of zero.
-        expected: the sign that the finding claims.
-
-    Returns:
-        The verdict.
-
-    >>> verdict({1}, 1), verdict({1, 0}, 1), verdict({0}, 1), verdict({-1}, 1), verdict({-1, 0}, 1), verdict({0}, 0)
-    ('holds', 'holds in part', 'level', 'reversed', 'reversed in part', 'holds')
-    """
-    if signs == {expected}:
-        return "holds"
-    if expected == 0:
-        return "does not hold"
-    words = {
-        frozenset({0}): "level",
-        frozenset({-expected}): "reversed",
-        frozenset({expected, 0}): "holds in part",
-        frozenset({-expected, 0}): "reversed in part",
-    }
-    return words.get(frozenset(signs), "mixed")
-
-
-def overtaken(policy: str, baseline: str, kind: str) -> Answer:
-    """Test whether a policy first leads its baseline and is then overtaken, each by more than two standard errors."""
-
-    def answer(folder: Path) -> str:
-        mean, error = paired_difference(folder, policy, baseline, kind)
-        leads, trails = behind(-mean, error), behind(mean, error)
-        first = bool(leads) and (not trails or leads[0] < trails[0])
-        told = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
-        return f"{told}: {'holds' if first and trails else 'leads, not overtaken' if first else 'does not hold'}"
-
-    return answer
-
-
-def paired_difference(folder: Path, one: str, other: str, kind: str) -> tuple[FloatArray, FloatArray]:
-    """Paired difference of two policies of a run; for searches over all legal targets, of which there are most."""
-    curves = [per_image(records_of(folder, policy), LAST[kind]) for policy in (one, other)]
-    return difference(*curves)
-
-
-SEARCH, EXPLORE = (5, 15, 30), (1, 5, 15)
-
-FINDINGS = (
+TESTED = (
     Finding(
         "Calibration is considerably beneficial for non-predictive search.",
         "search",
         "calibrated less raw at 5 / 15 / 30 shifts",
-        gain("non-predictive-calibrated", "non-predictive-raw", SEARCH, "search"),
+        Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH),
     ),
     Finding(
         "Calibration does not influence predictive search.",
         "search",
         "calibrated less raw at 5 / 15 / 30 shifts",
-        gain("predictive-calibrated", "predictive-raw", SEARCH, "search", expected=0),
+        Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0),
     ),
     Finding(
         "Predictive search comfortably outperforms non-predictive search on raw scores",
         "search",
         "predictive less non-predictive at 5 / 15 / 30 shifts",
-        gain("predictive-raw", "non-predictive-raw", SEARCH, "search"),
+        Advantage("predictive-raw", "non-predictive-raw", SEARCH),
     ),
     Finding(
         "… and on calibrated scores.",
         "search",
         "the same",
-        gain("predictive-calibrated", "non-predictive-calibrated", SEARCH, "search"),
+        Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH),
     ),
     Finding(
-        "Calibrated predictive search leads random gaze at first (to the 13th iteration) and is overtaken",
+        "Calibrated predictive search leads random gaze at first and is overtaken",
         "search",
         "gaze shifts",
-        overtaken("predictive-calibrated", "random", "search"),
+        Overtaken("predictive-calibrated", "random", "ahead to the 13th"),
     ),
     Finding(
-        "… calibrated non-predictive search too (to the 10th),",
+        "… calibrated non-predictive search too,",
         "search",
         "gaze shifts",
-        overtaken("non-predictive-calibrated", "random", "search"),
+        Overtaken("non-predictive-calibrated", "random", "ahead to the 10th"),
     ),
     Finding(
         "… and raw non-predictive search.",
         "search",
         "gaze shifts",
-        overtaken("non-predictive-raw", "random", "search"),
+        Overtaken("non-predictive-raw", "random", "ahead initially"),
     ),
+    Finding(
+        "KL divergence leads random gaze at first; random gaze overtakes it (calibrated).",
+        "explore",
+        "gaze shifts",
+        Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th"),
+    ),
+    Finding(
+        "The same with raw scores.",
+        "explore",
+        "gaze shifts",
+        Overtaken("kl-raw", "random-raw", "ahead to about the 4th"),
+    ),
+    Finding(
+        "Exploration has no particular advantage from calibration.",
+        "explore",
+        "KL, calibrated less raw at 1 / 5 / 15 shifts",
+        Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0),
+    ),
+)
+"""Findings that are tested at every score threshold."""
+
+BASELINES = (
     Finding(
         "VOCUS2 is far below random gaze in search.",
         "search",
         "random less VOCUS2 at 5 / 15 / 30 shifts",
-        gain("random", "vocus2", SEARCH, "search"),
+        Advantage("random", "vocus2", SEARCH),
     ),
     Finding(
         "KL divergence consistently outperforms negative entropy (calibrated).",
         "explore",
         "KL less negative entropy at 1 / 5 / 15 shifts",
-        gain("kl-calibrated", "negative-entropy-calibrated", EXPLORE, "explore"),
+        Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE),
     ),
     Finding(
         "KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
         "explore",
         "KL less two-peak at 1 / 2 / 4 shifts",
-        gain("kl-calibrated", "two-peaks-calibrated", (1, 2, 4), "explore"),
+        Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4)),
     ),
     Finding(
         "KL divergence outperforms VOCUS2 in exploration (calibrated).",
         "explore",
         "KL less VOCUS2 at 1 / 5 / 15 shifts",
-        gain("kl-calibrated", "vocus2-calibrated", EXPLORE, "explore"),
-    ),
-    Finding(
-        "KL divergence leads random gaze at first; random gaze overtakes it after about 4 saccades (calibrated).",
-        "explore",
-        "gaze shifts",
-        overtaken("kl-calibrated", "random-calibrated", "explore"),
-    ),
-    Finding("The same with raw scores.", "explore", "gaze shifts", overtaken("kl-raw", "random-raw", "explore")),
-    Finding(
-        "Exploration has no particular advantage from calibration.",
-        "explore",
-        "KL, calibrated less raw at 1 / 5 / 15 shifts",
-        gain("kl-calibrated", "kl-raw", EXPLORE, "explore", expected=0),
+        Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE),
     ),
 )
+"""Findings that are tested at the default threshold alone."""
+
+FINDINGS = (*TESTED[:7], BASELINES[0], *BASELINES[1:], *TESTED[7:])
 """Findings that can be tested on curves; costs are measured by `python -m benchmarks.decisions`."""
 
 
 def findings(runs: Runs) -> list[str]:
-    """The table of all findings."""
+    """The table of all findings at the default threshold: sizes and verdicts for both detectors and both foveas."""
     folders = {kind: published_columns(kind, runs) for kind in LAST}
-    rows = [["the paper finds", "shown", *folders["search"]]]
+    rows = [["the paper finds", "shown", "in the paper", *folders["search"]]]
     for finding in FINDINGS:
-        answers = [finding.answer(folder) for folder in folders[finding.kind].values()]
-        rows.append([finding.text, finding.shown, *answers])
+        measure = COUNTED[finding.kind][-1 if finding.kind == "search" else 0]
+        answers: dict[str, str] = {}
+        for heading, folder in folders[finding.kind].items():
+            first = heading.startswith(next(iter(DETECTORS.values())))
+            answers[heading] = str(finding.answer(folder, measure)) if first or finding.detects else "no detector"
+        rows.append([finding.text, finding.shown, finding.test.published(), *answers.values()])
     return table(rows)
+
+
+def words_of_findings(runs: Runs) -> list[str]:
+    """The verdicts that the table of all findings uses, and their meanings."""
+    cells = "\n".join(findings(runs))
+    return legend({word for word in VERDICTS if f": {word} " in cells})

@@ -14,24 +14,26 @@ from semfov.zoom.lattice import Lattice
 def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
     """The looks at a stream, without the detections whose place a later look has shown as closely.
 
-    What moves would otherwise be shown at every place where a look saw it.
+    What moves would otherwise be shown at every place where a look saw it. A box counts as shown if it lies in the
+    window with half its size around it, as far as the picture reaches.
 
     Args:
         glances: looks at frames, in their order.
         lattice: lattice of the frames.
 
     Returns:
-        The looks with the detections that lie in no later window of at least the same magnification.
+        The looks with the detections that no later window of at least the same magnification has shown.
     """
     kept = []
     for number, glance in enumerate(glances):
         seen, left = glance.detections, glance.detections.mask[0]
+        low, high = seen.boxes[0].split(2, -1)
+        around = (high - low) / 2
+        low, high = (low - around).clamp(min=0), (high + around).minimum(low.new_tensor(lattice.size))
         for later in (each.window for each in glances[number + 1 :]):
             if later.fixation[2] >= glance.window.fixation[2]:
-                x1, y1, x2, y2 = later.region(lattice)
-                low, high = seen.boxes.new_tensor([x1, y1]), seen.boxes.new_tensor([x2, y2])
-                inside = (seen.boxes[0, :, :2] >= low) & (seen.boxes[0, :, 2:] <= high)
-                left = left & ~inside.all(-1)
+                first, last = low.new_tensor(later.region(lattice)).split(2)
+                left = left & ~((low >= first) & (high <= last)).all(-1)
         parts = (part[:, left] for part in (seen.boxes, seen.scores, seen.mask))
         kept.append(replace(glance, detections=Detections(*parts), cut=glance.cut[left]))
     return kept

@@ -95,6 +95,41 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert "written:" not in printed.out
 
 
+def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):
+    large = torch.full((3, 768, 1024), 0.4)
+    large[0, 320:352, 640:672] = 0.95
+    path = write(tmp_path / "large.avi", [large] * 4)
+    _, printed = run("live", path, "--find", "red,green", "--out", tmp_path / "out")
+    lines = printed.out.splitlines()
+    assert lines[0] == "large.avi: finding all “red”, “green”"
+    assert re.match(r"     0  at \(\d+, \d+\) × 0\.\d\d: .* \d × red, 0 × green from score 0\.3", lines[1])
+    assert [film.shape for film in read(tmp_path / "out" / f"live{video_suffix()}")] == [(768, 1024, 3)] * 4
+    _, printed = run("live", path, "--target", "red", "--frames", 1)
+    assert re.search(r"0  at .* red: (found|undecided), p 0\.\d\d", printed.out)
+    code, printed = run("live", path, "--how", "head")
+    assert code == 1
+    assert printed.err.startswith("error: how: expected 'fovea', 'windows' or 'auto' for a stream")
+    _, printed = run("live", path, "--target", "red", "--find", "red")
+    assert "find: expected a target or classes to find, not both, got red" in printed.err
+
+
+def test_windows_and_objects_are_drawn_into_a_frame(agent):
+    """The present window has a wide frame, and the next one and each object a thin one."""
+    large = torch.full((3, 768, 1024), 0.4)
+    large[0, 320:352, 640:672] = 0.95
+    live = agent.live(how="windows")
+    moments = [live.step(large) for _ in range(6)]
+    moment = next(each for each in reversed(moments) if each.window.level)
+    plain = np.asarray((large * 255).round().byte().permute(1, 2, 0)).astype(int)
+    changed = abs(draw_moment(large, moment, "red").astype(int) - plain).max(-1) > 8
+    x1, y1, _, y2 = (round(n) for n in moment.window.region(moment.lattice))
+    assert changed[max(y1, 22) : min(y2, 768) - 3, x1 : x1 + 3].all()
+    for a, _, c, d in [*moment.objects.boxes.tolist(), moment.next_window.region(moment.lattice)]:
+        left, right, row = max(int(a), 0), min(int(c), 1023), min(int(d), 767)
+        assert changed[row - 2 : row + 1, left:right].any(0).all()
+    assert np.array_equal(draw_moment((large * 255).round().byte(), moment, "red"), draw_moment(large, moment, "red"))
+
+
 class Sure(Verification):
     """Every place holds the target."""
 

@@ -1,5 +1,7 @@
 """The figures of the paper that show a photograph."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from semfov import Detections, FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye
+from semfov.viz import save_figure
 from tests.colours import CLASSES, write_network, write_photographs
 
 
@@ -35,7 +38,8 @@ def config(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_every_figure_is_drawn_or_said_to_be_missing(config, capsys):
+def test_every_figure_is_drawn_or_said_to_be_missing(config, capsys, monkeypatch):
+    monkeypatch.setattr("eval.figures.save_figure", partial(save_figure, dpi=50))
     figures(config)
     told = dict(line.split(": ") for line in capsys.readouterr().out.splitlines())
     assert list(told) == list(FIGURES)

@@ -2,19 +2,23 @@
 
 import json
 import re
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from eval.explore.config import ExploreConfig
 from eval.page import paper
-from eval.page.curves import behind
-from eval.page.experiments import ResultsConfig, experiments
+from eval.page.curves import behind, corrected_signs
+from eval.page.experiments import AT_THRESHOLDS, SCORE_THRESHOLDS, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
-from eval.page.findings import FINDINGS, gain, overtaken
+from eval.page.findings import BASELINES, COUNTED, FINDINGS, TESTED, Advantage, Finding, Overtaken
 from eval.page.origin import missing, origin
 from eval.page.tables import agreement, by_samples, paired
+from eval.page.thresholds import CONTRASTS
+from eval.page.verdicts import VERDICTS
 from eval.results import PLACE, WHOLE, fill_page, page_table, results
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, InputError
@@ -243,6 +247,29 @@ def test_differences_are_paired_over_images(searched):
     assert expected in rows[2]
 
 
+def rejected_by_closed_testing(chance, alpha):
+    """A hypothesis is rejected if every set of hypotheses that it is in has a p-value below its Bonferroni level."""
+    numbers = range(len(chance))
+    sets = [each for size in range(1, len(chance) + 1) for each in combinations(numbers, size)]
+    return [
+        all(min(chance[m] for m in each) <= alpha / len(each) for each in sets if number in each) for number in numbers
+    ]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_signs_are_corrected_as_closed_testing_corrects_them(seed):
+    rng = np.random.default_rng(seed)
+    mean, error = rng.normal(0, 2.5, 7), rng.uniform(0.5, 1.5, 7)
+    chance = 2 * norm.sf(np.abs(mean) / error)
+    expected = np.where(rejected_by_closed_testing(chance, 0.05), np.sign(mean), 0)
+    np.testing.assert_array_equal(corrected_signs(mean, error), expected)
+
+
+def test_differences_without_any_error_have_signs():
+    np.testing.assert_array_equal(corrected_signs(np.array([0.0, 0.1, -0.1]), np.zeros(3)), [0, 1, -1])
+    assert behind(np.array([0.0, -0.1, -0.3, -0.2, 0.4]), np.array([0.0, 0.06, 0.1, 0.1, 0.1])) == [2]
+
+
 def test_samples_are_compared_with_the_same_policy_without(runs):
     folder = runs["expected-search"].out
     drawn, found = "predictive-raw, samples 16", {"predictive-raw": 3, "predictive-raw, samples 16": 9, "random": 30}
@@ -253,11 +280,6 @@ def test_samples_are_compared_with_the_same_policy_without(runs):
     scenes = {n: [(0 <= 9 - s <= n) - float(0 <= 3 - s <= n) for s in range(6)] for n in (1, 5, 9)}
     expected = [f"{100 * np.mean(d):+.1f} ± {100 * np.std(d, ddof=1) / 6**0.5:.1f}" for d in scenes.values()]
     assert rows[2:] == [[drawn, *expected]]
-
-
-def test_a_policy_is_behind_by_more_than_two_standard_errors():
-    mean, error = np.array([0.0, -0.1, -0.3, -0.2, 0.4]), np.array([0.0, 0.06, 0.1, 0.1, 0.1])
-    assert behind(mean, error) == [2]
 
 
 def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
@@ -273,16 +295,83 @@ def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     assert rows[5][1:4] == ["max. SEM", "1.059", "0.000"]
 
 
-def test_findings_have_verdicts(runs):
-    folder = runs["search-published-nano"].out
-    found = {"random": 9, "vocus2": 20}
-    write_records(folder, searches(("random", "vocus2"), lambda policy, scene, _: found[policy] + scene % 2))
-    answer = gain("random", "vocus2", (5, 15, 30), "search")(folder)
-    assert answer == "+0.0 / +100.0 / +0.0: holds in part"
-    assert gain("random", "vocus2", (5, 30), "search", expected=0)(folder).endswith("holds")
-    verdict = overtaken("random", "vocus2", "search")(folder)
-    assert verdict == "ahead at 9 to 20, behind at no shift: leads, not overtaken"
-    assert len({finding.text for finding in FINDINGS}) == len(FINDINGS)
+def test_findings_have_sizes_and_verdicts(tmp_path):
+    """VOCUS2 finds every target one shift after random gaze."""
+    found = {"random": 9, "vocus2": 10}
+    write_records(tmp_path, searches(found, lambda policy, scene, _: found[policy] + 5 * (scene % 2)))
+    every, few = COUNTED["search"][1], COUNTED["search"][0]
+    finding = Finding("", "search", "", Advantage("random", "vocus2", (5, 9, 15)))
+    assert str(finding.answer(tmp_path, few)) == "+0.0 ± 0.0 / +100.0 ± 0.0 / +0.0 ± 0.0: holds in part"
+    assert str(finding.answer(tmp_path, every)) == "+0.0 ± 0.0 / +50.0 ± 22.4 / +0.0 ± 0.0: open"
+    assert (
+        Finding("", "search", "", Advantage("random", "vocus2", (5, 30), 0)).answer(tmp_path, every).verdict == "holds"
+    )
+    first = Finding("", "search", "", Overtaken("random", "vocus2", "")).answer(tmp_path, few)
+    assert str(first) == "ahead at 9, behind at no shift: not overtaken"
+    assert not finding.detects
+    assert finding.test.published() == "-"
+    assert Advantage("random", "vocus2", (5, 15, 30)).published() == "+29.7 / +43.0 / +28.0"
+    assert len({finding.text for finding in FINDINGS}) == len(FINDINGS) == len(TESTED) + len(BASELINES)
+
+
+def explorations(policies, right):
+    """Explorations of six scenes with eight cells; `right` is a function of policy, scene and measure."""
+    fields = ("right", "right_without_background", "right_everywhere")
+    return [
+        {
+            "policy": policy,
+            "scene": scene,
+            "repetition": 0,
+            "object_cells": 8,
+            "grid_cells": 8,
+            **{field: [right(policy, scene, field)] * 21 for field in fields},
+        }
+        for policy in policies
+        for scene in range(6)
+    ]
+
+
+@pytest.fixture
+def at_thresholds(runs):
+    """At 0.02 calibrated search finds all at once and KL has one cell more; at other thresholds it is the reverse."""
+    for name in AT_THRESHOLDS:
+        run, low = runs[name], "-0.02-" in name
+        if name.startswith("search"):
+            records = searches(run.policies, lambda policy, scene, _, low=low: 1 if ("raw" in policy) != low else -1)
+        else:
+            records = explorations(run.policies, lambda policy, scene, _, low=low: 3 + (policy.startswith("kl") == low))
+        write_records(run.out, records)
+    return runs
+
+
+def test_every_threshold_has_a_model_of_its_own_and_the_same_sensor(runs):
+    for name in AT_THRESHOLDS:
+        run = runs[name]
+        assert (run.sensor.name, run.belief.model) == ("published", None)
+        assert run.detector.threshold == float(name.split("-")[2])
+    for name in ("nano", "tiny"):
+        looks = runs[f"looks-threshold-{name}"]
+        assert looks.thresholds == SCORE_THRESHOLDS
+        assert list(runs).index(f"looks-threshold-{name}") < list(runs).index(f"search-threshold-0.02-{name}")
+
+
+def test_verdicts_name_the_thresholds_at_which_they_hold(at_thresholds):
+    rows = [cells_of(row) for row in page_table("verdicts", at_thresholds).make(at_thresholds)]
+    assert rows[0] == ["the paper finds", "in the paper", "counted", "YOLOX-nano", "YOLOv3-tiny"]
+    assert rows[2][1:4] == ["+11.2 / +10.4 / +5.8", "one target", "holds at 0.02; reversed at 0.1, 0.25, 0.5"]
+    told = {cell for row in rows[2:] for cell in row[3:]}
+    words = [row[0] for row in map(cells_of, page_table("verdicts-words", at_thresholds).make(at_thresholds)[2:])]
+    assert words == [word for word in VERDICTS if any(f"{word} at" in cell for cell in told)]
+
+
+def test_differences_are_shown_at_every_threshold(at_thresholds, tmp_path):
+    rows = [cells_of(row) for row in page_table("thresholds", at_thresholds).make(at_thresholds)]
+    assert rows[0] == ["detector", "difference", "shifts", "0.02", "0.1", "0.25", "0.5"]
+    assert rows[2][:5] == ["YOLOX-nano", CONTRASTS[0].text, "5", "+100.0 ± 0.0", "-100.0 ± 0.0"]
+    kl = next(row for row in rows if row[1] == "exploration, with background: KL less random, calibrated")
+    assert kl[2:5] == ["1", "+12.5 ± 0.0", "-12.5 ± 0.0"]
+    assert sum(row[0] == "YOLOv3-tiny" for row in rows) == 1
+    assert [path.stem for path in draw_figures(tmp_path, at_thresholds)] == ["thresholds"]
 
 
 def test_agreement_compares_policies_episode_by_episode(tmp_path):

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval.comparison.thresholds import ThresholdEyes, ThresholdLooking
+from eval.comparison.thresholds import ThresholdEyes, ThresholdLooksConfig, look_at_thresholds
 from semfov import Eye, Foveation
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.selection import select
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ScenesConfig, SensorConfig
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looking import Looking
 from semfov.runs.looks import tight
 
@@ -77,14 +77,16 @@ def test_what_passes_a_higher_threshold_is_part_of_what_passes_a_lower_one(dtype
 
 @pytest.mark.weights
 def test_a_run_finds_the_looks_of_its_threshold_stored(tmp_path):
-    config = ScenesConfig(
+    config = ThresholdLooksConfig(
         data=DataConfig(limit=1),
         sensor=SensorConfig("published"),
         belief=BeliefConfig(columns=3, rows=2),
         cache=tmp_path,
         out=tmp_path,
+        workers=1,
+        thresholds=THRESHOLDS,
     )
-    ThresholdLooking(config, THRESHOLDS).outcomes(0)
+    look_at_thresholds(config)
     for threshold in THRESHOLDS:
         own = replace(config, detector=DetectorConfig(threshold=threshold))
         stored, anew = Looking(own), Looking(replace(own, store=False))

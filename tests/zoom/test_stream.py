@@ -133,8 +133,8 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
     windows = [(0, 0, 0), (1, 4, 4), (2, 8, 8), (1, 0, 0), (2, 20, 20), (0, 0, 0), (2, 10, 9)]
     glances = []
     for action in windows:
-        low = torch.rand(6, 2, generator=generator) * 600
-        boxes = torch.cat([low, low + 60], -1)[None]
+        low = torch.rand(6, 2, generator=generator) * 700
+        boxes = torch.cat([low, low + 40], -1)[None]
         detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
         glances.append(Glance(on_lattice(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
     kept = without_replaced(glances, lattice)
@@ -144,7 +144,10 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
             hidden = False
             for later in glances[number + 1 :]:
                 a, b, c, d = later.window.region(lattice)
-                inside = a <= x1 and b <= y1 and x2 <= c and y2 <= d
+                w, h = (x2 - x1) / 2, (y2 - y1) / 2
+                inside = (
+                    a <= max(x1 - w, 0) and b <= max(y1 - h, 0) and min(x2 + w, 1024) <= c and min(y2 + h, 768) <= d
+                )
                 hidden |= inside and later.window.level >= glance.window.level
             if not hidden:
                 expected.append(place)
