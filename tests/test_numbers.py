@@ -72,6 +72,7 @@ CONDITIONS = re.compile(
     r"\d[\d,]* ?× ?\d[\d,]*"  # sizes
     r"|\d[\d,.]* ?(?:px|million pixels|pixels|degrees|°)|of 640\b"  # lengths in pixels, and angles
     r"|\b(?:1[89]|20)\d\d(?=[),;.])"  # years of publications
+    r"|\b95 %(?= (?:intervals?|limit)\b)"  # levels of errors
     r"|\d+e-\d+|10⁻⁶|ln 2 / r"  # tolerances, and half-lives
     rf"|(?:[Aa]fter|[Ww]ithin) \d+(?:, \d+)*(?: and \d+)*(?: of \d+)? {_COUNTED}\b"
     rf"|(?:[Ii]n|[Oo]n|[Aa]t|[Ff]or|[Oo]f|[Ww]ith|[Oo]ver|to|the) (?:the |all |both |first )*\d[\d,]* {_COUNTED}\b"
