@@ -20,8 +20,9 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
     This is equation 7 of Luzio, Bernardino and Moreno (2024), after Kaplan, Chakraborty and Bisdikian, "Fusion of
     classifiers: A subjective logic perspective", IEEE Aerospace Conference 2012. The whole numerator is divided by the
     whole denominator. The exact posterior is a mixture of the Dirichlets Dir(β + e_k) with weights β_k λ_k / D; it has
-    the same mean as Dir(β'). The rule is computed in the equal form `β + β (λ − min λ) / (D + min λ)`, which adds no
-    negative terms.
+    the same mean as Dir(β'). On average over scores that arise by the true likelihoods, the mean does not change
+    (`semfov.acquisition.PredictedTargetPosterior`). The rule is computed in the equal form
+    `β + β (λ − min λ) / (D + min λ)`, which adds no negative terms.
 
     Args:
         beta: `(..., K+1)`, Dirichlet parameters, positive.

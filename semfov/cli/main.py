@@ -95,6 +95,8 @@ SUBCOMMANDS: dict[str, Subcommand] = {
 }
 """The subcommands by name. What they need is imported when they run."""
 
+_LOOKING = "search", "find", "explore", "live"
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command.
@@ -116,8 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("--help", "-h", "--help-all"):
         print(texts.OVERVIEW, end="")
         return 0
-    if name not in SUBCOMMANDS:
-        print(f"error: {_unknown(name, rest)}", file=sys.stderr)
+    refused = _of_other_commands(SUBCOMMANDS[name], rest) if name in SUBCOMMANDS else _unknown(name, rest)
+    if refused is not None:
+        print(f"error: {refused}", file=sys.stderr)
         return 2
     command = SUBCOMMANDS[name]
     if "--help" in rest or "-h" in rest:
@@ -143,6 +146,23 @@ def _unknown(name: str, rest: Sequence[str]) -> str:
     near = get_close_matches(name, SUBCOMMANDS, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(SUBCOMMANDS)}"
     return f"unknown command {name!r}; {hint}"
+
+
+def _of_other_commands(command: Subcommand, rest: Sequence[str]) -> str | None:
+    """What to say about an option that only other subcommands have; None if there is none."""
+    for word in rest:
+        option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
+        having = [
+            name for name in _LOOKING if option in _options(SUBCOMMANDS[name]) and option not in _options(command)
+        ]
+        if having and command in map(SUBCOMMANDS.get, _LOOKING):
+            return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
+    return None
+
+
+def _options(command: Subcommand) -> set[str]:
+    """Names of the options of a subcommand."""
+    return {field.name for field in fields(command.options())} - {command.positional[0]}
 
 
 @contextmanager

@@ -52,6 +52,8 @@ WRONG_USE = {
     "--target cup": "expected a command before --target: search, find",
     "FOLDER --target cup": "try `semfov search FOLDER --target CLASS`",
     "search --targt cup": "unknown option --targt; did you mean --target?",
+    "find --closer 3": "unknown option --closer; it is one of `semfov search` and `semfov live`",
+    "explore --frames=3": "unknown option --frames; it is one of `semfov live`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
