@@ -27,7 +27,7 @@ from eval.decide.config import DecideConfig
 from eval.explore import explore
 from eval.explore.config import ExploreConfig
 from eval.page.curves import OBJECTS
-from eval.page.experiments import AT_THRESHOLDS, STUDIES, ResultsConfig, experiments
+from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
 from eval.page.findings import findings, words_of_findings
 from eval.page.origin import missing, origin
@@ -50,6 +50,7 @@ from eval.search.config import SearchConfig
 from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
 from semfov.runs.command import run_command
+from semfov.runs.presets import label
 
 END = "<!-- end -->"
 PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{END}", re.DOTALL)
@@ -175,6 +176,7 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "explore-cells": partial(told_table, "summary.md", 2, columns=EXPLORED),
     "agreement": agreement,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
+    "paired-by-hand": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 15, 30)),
     "presence": partial(told_table, "decisions.md", 0),
     "decisions": partial(told_table, "decisions.md", 1),
     "differences": partial(told_table, "decisions.md", 2),

@@ -238,7 +238,7 @@ def cells(page):
         if not line.startswith("|"):
             head = None
             if line.startswith("<!-- table "):
-                only = words(line) & {"tiny", "narrow"}
+                only = words(line) & {"tiny", "narrow", "threshold", "hand"}
             elif line.startswith("<!-- end"):
                 only = frozenset()
             continue

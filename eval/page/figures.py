@@ -56,10 +56,10 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     written = []
     if not missing(AT_THRESHOLDS, runs):
         shown = {
-            f"{title}, {contrast.text}": (contrast, name)
+            f"{title}\n{contrast.text}": (contrast, name)
             for contrast in CONTRASTS
             for name, title in DETECTORS.items()
-            if not contrast.one.endswith("raw")
+            if contrast.kind == "search" or contrast.other == "random-calibrated"
         }
         drawn = plot_curve_panels(
             {title: threshold_panel(*chosen, runs) for title, chosen in shown.items()}, label="difference (points)"

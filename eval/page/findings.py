@@ -36,7 +36,7 @@ class Measure:
 
 COUNTED = {
     "search": (Measure("one target", commonest=True), Measure("all targets")),
-    "explore": (Measure("with background"), Measure("without", field=OBJECTS)),
+    "explore": (Measure("with background"), Measure("without background", field=OBJECTS)),
 }
 """Ways to count, by the kind of the experiment; the paper's way comes first."""
 

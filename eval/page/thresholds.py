@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from eval.page.curves import difference, per_image, records_of
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
-from eval.page.findings import COUNTED, LAST, SEARCH, TESTED, Finding, Measure
+from eval.page.findings import COUNTED, EXPLORE, LAST, SEARCH, TESTED, Finding, Measure
 from eval.page.tables import Runs
 from eval.page.verdicts import VERDICTS, Answer, legend
 from semfov.metrics.averages import FloatArray
@@ -101,6 +101,17 @@ CONTRASTS = (
         for scores in ("calibrated", "raw")
         for measure in COUNTED["explore"]
     ),
+    *(
+        Contrast(
+            f"exploration by KL, {measure.text}: calibrated less raw",
+            "explore",
+            "kl-calibrated",
+            "kl-raw",
+            measure,
+            EXPLORE,
+        )
+        for measure in COUNTED["explore"]
+    ),
 )
 """Differences on which the two headlines of the paper rest."""
 
@@ -109,9 +120,9 @@ def by_threshold(runs: Runs) -> list[str]:
     """The table of the differences at each score threshold, in percentage points, for both detectors."""
     rows = [["detector", "difference", "shifts", *(f"{threshold:g}" for threshold in SCORE_THRESHOLDS)]]
     for name, title in DETECTORS.items():
-        for place, contrast in enumerate(CONTRASTS):
+        for contrast in CONTRASTS:
             told = [contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS]
-            for number, n in enumerate(contrast.shifts):
-                head = [title if place == number == 0 else "", contrast.text if number == 0 else "", str(n)]
-                rows.append([*head, *(f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for mean, error in told)])
+            for n in contrast.shifts:
+                cells = (f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for mean, error in told)
+                rows.append([title, contrast.text, str(n), *cells])
     return table(rows)

@@ -23,7 +23,7 @@ class Answer:
 
 
 VERDICTS = {
-    "holds": "every difference has the sign of the finding, or first ahead and later behind",
+    "holds": "every difference is as the finding says, or the policy is first ahead and later behind",
     "holds in part": "some differences have the sign, and none the opposite one",
     "not overtaken": "ahead at some shifts, and behind at none",
     "level": "every difference is within two standard errors of zero",
