@@ -162,11 +162,11 @@ class ActivePerception(nn.Module):
         """The agent of Luzio, Bernardino and Moreno (2024), with one of the small detectors that have shipped models.
 
         It has 10 x 10 cells with a uniform prior of 0.5. Kaplan's rule updates every cell that a box overlaps, with
-        scores calibrated by Dirichlets of maximum likelihood. Exploration maximises the Kullback-Leibler
-        divergence. The paper does not give the widths of its wide and its narrow fovea; ours are 100 and 50 pixels
-        of 640. It does not give a score threshold either. Ours is 0.02; for `threshold=` 0.1, 0.25 and 0.5 the wide
-        fovea has models that are fitted at them. Its detector is YOLOv3, larger than ours. With a folder of models,
-        detector, sensor, grid and observation model are those of the folder.
+        scores calibrated by Dirichlets of maximum likelihood. Exploration maximises the Kullback-Leibler divergence.
+        The paper does not give the widths of its wide and its narrow fovea; ours are 100 and 50 pixels of 640. It does
+        not give a score threshold either. Ours is 0.02; for `threshold=` 0.1, 0.25 and 0.5 the wide fovea has models
+        that are fitted at them. Its detector is YOLOv3, larger than ours. With a folder of models, detector, sensor,
+        grid and observation model are those of the folder.
 
         Args:
             name: a detector that models are shipped for, `yolov3-tiny` or `yolox-nano`, or a folder of models.
