@@ -85,7 +85,10 @@ def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
         closely = [each.closer for each in moments if each.closer is not None]
         for one, other in zip(closely, searched.closer, strict=True):
             assert torch.equal(one.box, other.box)
-            assert vars(one) | {"box": None} == vars(other) | {"box": None}
+            # A moment has one look of the fovea, and a search has all of them.
+            apart = {"box": None, "fixation": 0}
+            assert one.fixation == 0
+            assert vars(one) | apart == vars(other) | apart
         for before, after in pairwise(moments):
             assert after.cell == before.next_cell
         assert searched.ending == "decision"
@@ -340,10 +343,14 @@ def test_without_closer_looks_the_belief_decides_as_before(one_thread):
 
 def test_thresholds_are_those_of_the_verification_unless_given():
     """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
-    assert agent(Counted(3)).live("red", rate=0).thresholds == AT
-    assert agent(Counted(3)).live("red").thresholds == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
-    assert agent(Counted(3)).live("red", confirm=0.99, give_up=0.5).thresholds == Thresholds(0.99, 0.5, AT.place)
-    assert agent(Counted(3)).live("red", closer=0).thresholds == Counted.thresholds
+
+    def thresholds(**options):
+        return agent(Counted(3)).live("red", **options)._fovea.thresholds
+
+    assert thresholds(rate=0) == AT
+    assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
+    assert thresholds(confirm=0.99, give_up=0.5) == Thresholds(0.99, 0.5, AT.place)
+    assert thresholds(closer=0) == Counted.thresholds
 
 
 def test_examined_places_are_worth_a_frame_also_when_no_cell_is_worth_a_look():
