@@ -5,6 +5,7 @@ import logging
 import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -246,10 +247,11 @@ def look_at_all(
         title="looking",
         unit="mosaic",
     )
-    for (kind, index), looks in done:
-        digest = mosaics[kind].digest(index)
-        if store.read(digest) is None:
-            store.write(digest, unpack_tensors(looks))
+    with closing(done):
+        for (kind, index), looks in done:
+            digest = mosaics[kind].digest(index)
+            if store.read(digest) is None:
+                store.write(digest, unpack_tensors(looks))
     prepare_worker()
     return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
 

@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -302,8 +303,9 @@ def collect_samples(settings: SampleSettings, folder: Path, where: Where, title:
         title=title,
         unit="shard",
     )
-    for shard, tensors in done:
-        sampler.save(shard, Samples(**unpack_tensors(tensors)))
+    with closing(done):
+        for shard, tensors in done:
+            sampler.save(shard, Samples(**unpack_tensors(tensors)))
     parts = []
     for shard in sampler.shards:
         part = sampler.load(shard)

@@ -8,6 +8,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -129,10 +130,11 @@ def finish(run: SceneRun, title: str) -> None:
         title=title,
         unit="scene",
     )
-    for index, (records, seconds, stored) in done:
-        if stored is not None:
-            run.keep(index, stored)
-        results.save(index, records, seconds)
+    with closing(done):
+        for index, (records, seconds, stored) in done:
+            if stored is not None:
+                run.keep(index, stored)
+            results.save(index, records, seconds)
 
 
 def gather(run: SceneRun) -> tuple[list[ResultRecord], dict[str, float]]:

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
@@ -52,10 +52,11 @@ def run_tasks(
     settings: tuple[object, ...],
     title: str,
     unit: str,
-) -> Iterator[tuple[_Task, Result]]:
+) -> Generator[tuple[_Task, Result], None, None]:
     """Run `function(task)` for every task, and yield tasks and results in any order, with a progress bar.
 
-    Results come back to this process, which stores them: workers need not see its folders.
+    Results come back to this process, which stores them: workers need not see its folders. Close the generator if you
+    stop early: that ends the work.
 
     Args:
         function: a module-level function; it reads the globals that `setup` has set in its module.

@@ -12,7 +12,7 @@ from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye
 
-BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
+BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
 
 
