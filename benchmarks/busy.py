@@ -80,7 +80,7 @@ def times(seconds: float) -> dict[str, dict[str, Spread]]:
     found: dict[str, dict[str, Spread]] = {}
     for machine, busy in (("quiet", False), ("busy", True)):
         with beside(busy):
-            for key, values in interleaved(named, seconds).items():
+            for key, values in interleaved(named, seconds, times=10).items():
                 name, label = key.split("|")
                 found.setdefault(name, {})[f"{machine}, {label}"] = Spread.of(values)
     torch.set_num_threads(cores)
