@@ -203,7 +203,6 @@ def _describe(likelihood: Tensor) -> str:
     return "a negative value" if (likelihood < 0).any() else "a row of zeros"
 
 
-@one_thread_if_small
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
     """Update every cell with the detections that cover it, one after another.
 
@@ -244,6 +243,7 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
 
 
+@one_thread_if_small
 def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> Tensor:
     """Update every cell with the detections that cover it (`fuse`), without checks.
 
