@@ -18,12 +18,10 @@ from semfov.metrics.averages import FloatArray
 from semfov.report.curves import curves_html, table_html
 from semfov.report.episode import Data, Pool, episode_data
 from semfov.report.page import write_page
+from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import plain
 from semfov.viz.views import foveated_views
-
-WHERE = ("out", "cache", "workers", "scheduler")
-"""Settings of folders and processes, which do not change the results and are left out of the page."""
 
 MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""

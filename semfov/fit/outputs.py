@@ -14,6 +14,7 @@ from semfov.errors import DataError
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.io.files import inside, write_text
 from semfov.io.pretrained import Pretrained
+from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking, looking_of
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import plain
@@ -34,7 +35,7 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
     Returns:
         The metadata.
     """
-    left_out = {"out", "cache", "workers", "scheduler", "data", "detector", "sensor", *besides}
+    left_out = {*WHERE, "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
 

@@ -292,6 +292,10 @@ class WorkConfig(OutcomeConfig):
         return self.workers if self.scheduler is None else self.scheduler
 
 
+WHERE = ("out", "cache", "workers", "scheduler")
+"""Settings of folders and processes, which do not change results."""
+
+
 @dataclass(frozen=True)
 class LookingConfig(WorkConfig):
     """Looks from every cell of a grid.

@@ -18,6 +18,7 @@ from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
+from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
@@ -25,7 +26,7 @@ from semfov.runs.workers import run_tasks
 
 _log = logging.getLogger(__name__)
 
-_BESIDES = ("out", "cache", "store", "workers", "scheduler", "data", "detector")
+_BESIDES = (*WHERE, "store", "data", "detector")
 
 
 class SceneRun(ABC):

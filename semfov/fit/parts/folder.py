@@ -18,6 +18,7 @@ from semfov.fit.parts.verification import VerificationFit
 from semfov.fit.parts.windows import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
+from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import digest_of
 
@@ -90,5 +91,4 @@ class FolderFit:
 
 def _plain(settings: dict[str, Any]) -> Any:
     """Return the settings that a part depends on, as JSON values."""
-    left_out = ("out", "cache", "workers", "scheduler")
-    return json.loads(json.dumps({name: each for name, each in settings.items() if name not in left_out}, default=str))
+    return json.loads(json.dumps({name: each for name, each in settings.items() if name not in WHERE}, default=str))
