@@ -118,7 +118,7 @@ DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms",
 VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
 """Settings that the verification depends on."""
 
-COUNTING = ("searched", "judged", "passes", "tile", "seed")
+COUNTING = ("searched", "far", "judged", "passes", "tile", "seed")
 """Settings that the certainty depends on."""
 
 SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
@@ -353,7 +353,9 @@ def fit_counts(
 ) -> list[str]:
     """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
     prepare_worker()
-    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "far", "judged")}
+    # A far mosaic has three times as many photographs.
+    opened["far"] = opened["far"][: max(1, config.searched // 5)]
     lines = certainty_again(model, mosaics, opened, passes=config.passes)
     model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     return lines

@@ -177,21 +177,28 @@ def certainty_again(
     *,
     passes: int,
 ) -> list[str]:
-    """Fit the certainty of a model on the mosaics `searched`, and evaluate it on those `judged`.
+    """Fit the certainty of a model on the mosaics `searched` and `far`, and evaluate it on those `judged`.
+
+    Pictures differ in how far the evidence can be believed, so mosaics of two kinds are needed.
 
     Args:
         model: the model; its certainty is replaced.
         mosaics: the mosaics by kind.
-        opened: the stored looks by kind.
+        opened: the stored looks by kind; of a kind, the first mosaics.
         passes: number of passes of the detector in each mosaic.
 
     Returns:
         Lines of the report in Markdown.
     """
-    known, held_out = (
+    near, far, held_out = (
         list(explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
-        for kind, title in (("searched", "exploring"), ("judged", "exploring held-out mosaics"))
+        for kind, title in (
+            ("searched", "exploring"),
+            ("far", "exploring far mosaics"),
+            ("judged", "exploring held-out mosaics"),
+        )
     )
+    known = near + far
     fitted = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
     model.certainty = fit_unseen(fitted, known)
     facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
