@@ -177,9 +177,9 @@ def certainty_again(
     *,
     passes: int,
 ) -> list[str]:
-    """Fit the certainty of a model on the mosaics `searched` and `far`, and evaluate it on those `judged`.
+    """Fit the certainty of a model on the mosaics `searched`, `far` and `small`, and evaluate it on those `judged`.
 
-    Pictures differ in how far the evidence can be believed, so mosaics of two kinds are needed.
+    Pictures differ in how far the evidence can be believed, so mosaics of several kinds are needed.
 
     Args:
         model: the model; its certainty is replaced.
@@ -190,15 +190,16 @@ def certainty_again(
     Returns:
         Lines of the report in Markdown.
     """
-    near, far, held_out = (
+    *kinds, held_out = (
         list(explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
         for kind, title in (
             ("searched", "exploring"),
             ("far", "exploring far mosaics"),
+            ("small", "exploring small photographs"),
             ("judged", "exploring held-out mosaics"),
         )
     )
-    known = near + far
+    known = [each for kind in kinds for each in kind]
     fitted = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
     model.certainty = fit_unseen(fitted, known)
     facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
