@@ -372,7 +372,7 @@ def least_of(certainty: Certainty | None) -> float:
     return LEAST if certainty is None else LIKELY
 
 
-def objects_of(
+def window_objects(
     glances: Sequence[Glance],
     lattice: Lattice,
     target: int | Sequence[int] | None,
@@ -447,7 +447,7 @@ class _Windows:
 
     def record(self, ending: Ending | None = None) -> ZoomPath:
         """The record so far."""
-        objects, unseen = objects_of(
+        objects, unseen = window_objects(
             self.seen, self.glances.lattice, self.targets or self.target, self.certainty, self.belief, self.promised
         )
         return ZoomPath(

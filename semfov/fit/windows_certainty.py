@@ -27,7 +27,7 @@ _STRENGTHS = tuple(2.0**n for n in range(-2, 9))
 
 
 @dataclass(frozen=True)
-class Exploration:
+class MosaicExploration:
     """An exploration of a mosaic.
 
     Attributes:
@@ -58,9 +58,9 @@ class Exploration:
 
 
 @torch.inference_mode()
-def explorations(
+def mosaic_explorations(
     model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> Iterator[Exploration]:
+) -> Iterator[MosaicExploration]:
     """Explore mosaics, for objects of all classes and for those of the most frequent class of each.
 
     Args:
@@ -88,7 +88,7 @@ def explorations(
                 hits = right_boxes(objects, annotation)
                 facts.append(told[hits >= 0])
                 right.append(hits[hits >= 0] > 0)
-            yield Exploration(looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right))
+            yield MosaicExploration(looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right))
         looks.save()
 
 
@@ -135,7 +135,7 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
     return Certainty(offset, tuple(weights))
 
 
-def fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certainty:
+def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> Certainty:
     """Fit how many objects further looks show to what they showed, by maximum likelihood over a grid.
 
     Args:
@@ -191,7 +191,7 @@ def certainty_again(
         Lines of the report in Markdown.
     """
     *kinds, held_out = (
-        list(explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
+        list(mosaic_explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
         for kind, title in (
             ("searched", "exploring"),
             ("far", "exploring far mosaics"),

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.agents.windows import NEW_OBJECTS, ZoomAgent, least_of, objects_of
+from semfov.agents.windows import NEW_OBJECTS, ZoomAgent, least_of, window_objects
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.decision import Decision
@@ -149,7 +149,7 @@ class WindowPerception(FramePerception):
         closer = () if self._decisions is None else self._decisions.looks
         shown = without_replaced(seen, glances.lattice) if self.forgetting.rate else seen
         certainty = None if self.evidence is None else self.evidence.certainty
-        objects, unseen = objects_of(
+        objects, unseen = window_objects(
             shown,
             glances.lattice,
             self.targets or self.target,
