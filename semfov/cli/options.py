@@ -30,7 +30,7 @@ class AgentOptions(Settings):
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
-        weights: file of the weights of a detector that is a `.cfg` file.
+        weights: file of the weights, for a detector that is a `.cfg` file or whose weights are not downloaded.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
