@@ -79,7 +79,9 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
     with pytest.raises(InputError, match="a sensor with a fovea, got Dimmed, which has none"):
         config.fovea  # noqa: B018
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"the settings of a Foveation or a LogPolar, got \{'kind': 'dimmed'"):
+    with pytest.raises(
+        InputError, match=r"the settings of a Foveation or a LogPolar or a MultiScaleFovea, got \{'kind': 'dimmed'"
+    ):
         sensor_of({"kind": "dimmed", "share": 0.5})
 
 
