@@ -40,9 +40,10 @@ class MultiScaleFovea(Sensor):
     along x and along y, for a fixation g. Where the edges of the crop lie between pixels, this is the average of blocks
     of pixels (OpenCV's `INTER_AREA`); elsewhere it is linear interpolation between such averages.
 
-    It is the sensor of SemBA (Luzio, Moreno and Bernardino), of SemBA-FAST (Neurocomputing 673, 2026) and of
-    "Cost-efficient multi-scale fovea" (arXiv 2604.03836), whose crops are 160, 320, 640 and 1280 pixels wide. How they
-    reduce the crops, and what they do with objects that several crops show, is our choice.
+    It is the sensor of Luzio, Bernardino and Moreno, "Cost-efficient multi-scale fovea for semantic-based visual search
+    attention" (arXiv 2604.03836), whose crops are 160, 320, 640 and 1280 pixels wide. Their code
+    (vislab-tecnico-lisboa/SemBA) reduces the crops by bilinear interpolation without averaging, and uses the boxes of
+    all crops as they are. The averages are our choice, and so is the merging (`semfov.detection.crops.merge_crops`).
 
     The crops are taken from the picture in its reference size (`Eye(…, reference=640)`) and not from the detector's
     input, so a larger reference shows finer detail for the same number of the detector's pixels.

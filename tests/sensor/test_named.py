@@ -135,6 +135,17 @@ def test_an_observation_model_is_fitted_and_used(home):
     assert search(searching(home, "calibrated", ["predictive-calibrated"], *chosen)) == 0
 
 
+def test_the_levels_of_a_multi_scale_fovea_are_its_scales(home):
+    network = ["--detector.name", str(home / "colours.onnx")]
+    crops = ["--sensor.name", "multi-scale", "--sensor.settings.side", "64", "--sensor.settings.scales", "3"]
+    assert fit_fom(given(home, "scales", *network, *crops, "--fixations", "2", "--holdout", "4")) == 0
+    model = FovealObservationModel.from_pretrained(home / "scales/colours.safetensors")
+    assert model.metadata["sensor"] == {"kind": "multi-scale", "side": 64, "scales": 3, "reference": 640}
+    assert model.edges.tolist() == pytest.approx([32 / 640, 64 / 640, 128 / 640])
+    chosen = "--belief.model", str(home / "scales/colours.safetensors")
+    assert search(searching(home, "by_scales", ["predictive-calibrated", "vocus2"], *crops, *chosen)) == 0
+
+
 def test_a_folder_of_models_keeps_its_sensor(home, tmp_path):
     small = ["--columns", "3", "--rows", "2", "--holdout", "2", "--steps", "4", "--map_steps", "5", "--fixations", "3"]
     arguments = given(home, "models", *small, "--judged", "2", "--sensor.settings.fovea", "80")
