@@ -12,8 +12,8 @@ from semfov.errors import check, check_shape, check_whole
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.glimpse import windows_at
 
-Means = tuple[Tensor, ...]
-"""Means of all squares of 2^l pixels that touch an image, with a black border, finest scale first."""
+Planes = tuple[Tensor, ...]
+"""Planes of all squares of 2^l pixels that touch an image, with a black border, finest scale first."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MultiScaleCanvas:
         size: `(width, height)` of the canvas.
     """
 
-    means: Means
+    means: Planes
     size: tuple[int, int]
 
 
@@ -75,14 +75,14 @@ class MultiScaleFovea(Sensor):
         """Number of pictures that the detector sees in a look, L."""
         return self.scales
 
-    def means(self, image: Tensor) -> Means:
+    def means(self, image: Tensor) -> Planes:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
 
         Args:
             image: `(B, C, H, W)`.
 
         Returns:
-            Means of squares at every scale, finest first.
+            Planes of squares at every scale, finest first.
         """
         check_shape(image, "image", None, None, None, None)
         check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
@@ -95,7 +95,7 @@ class MultiScaleFovea(Sensor):
             found.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
         return tuple(found)
 
-    def forward(self, image: Tensor | Means, gaze: Tensor) -> Tensor:
+    def forward(self, image: Tensor | Planes, gaze: Tensor) -> Tensor:
         """Compute the crops around fixations.
 
         Args:
