@@ -42,7 +42,8 @@ def list_detectors(options: DetectorsOptions) -> int:
         return 0
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
-        there = "here" if (cache_folder() / weights.file).is_file() else "downloaded when needed"
+        elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
+        there = "here" if (cache_folder() / weights.file).is_file() else elsewhere
         models = [what for what, kind in PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
         rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
     print("\n".join(table_lines(rows)))

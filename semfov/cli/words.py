@@ -28,13 +28,15 @@ def in_command_words(message: str, options: Iterable[str]) -> str:
 
     >>> in_command_words("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"])
     'use --how windows or --give-up 0.1, or `semfov find`'
+    >>> in_command_words("give its path as weights=", ["weights"])
+    'give its path as --weights'
     """
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)
     names = "|".join(map(re.escape, options))
 
     def option(found: re.Match[str]) -> str:
-        value = found[2].strip("'\"")
+        value = (found[2] or "").strip("'\"")
         return f"--{found[1].replace('_', '-')}{' ' if value else ''}{value}"
 
     return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

@@ -41,7 +41,8 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
     - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: published Darknet networks; options of `load_yolo`.
     - A path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
     - A path that ends in `.onnx`: your own ONNX model; options of `semfov.detection.onnx.load_onnx`.
-    - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`: published ONNX models; options of `semfov.detection.onnx.load_onnx`.
+    - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`, `"nanodet-plus-m-1.5x"`: published ONNX models; options of
+      `semfov.detection.onnx.load_onnx`. The last one needs `weights=`, a file that you have.
     - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.load_torchvision`.
     - `"hf:<owner>/<name>"`: models of Hugging Face's hub; options of `semfov.detection.transformers.load_hub`.
     - A model of torchvision, transformers or Ultralytics: options of `wrap_torchvision`, `wrap_transformers` and

@@ -97,7 +97,7 @@ def merge_boxes(
     """Merge boxes from several windows of a picture into one box for each object.
 
     The boxes may come from any detector, for instance from one that was applied to slices of the picture. They are
-    merged by the rule of `distinct`: of two boxes of the same object, a whole box is kept rather than one that the
+    merged by the rule of `merge_looks`: of two boxes of the same object, a whole box is kept rather than one that the
     border of its window cuts. If both or neither are cut, the box of the smaller window is kept, and within a window
     the box with the higher score.
 
@@ -162,42 +162,6 @@ def merge_looks(
 ) -> Objects:
     """Merge the boxes of several looks into one box for each object.
 
-    The boxes that are kept are those of `distinct`.
-
-    Args:
-        boxes: `(M, 4)`, in picture pixels.
-        scores: `(M,)`, scores.
-        labels: `(M,)`, classes.
-        looks: `(M,)`, number of the look of each box.
-        cut: `(M,)`, boolean, boxes that the border of their look cuts.
-        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
-        score: boxes with a lower score are left out.
-        iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a cut box from which on it is the same object.
-        around: width of a picture whose left and right borders meet; None for others.
-
-    Returns:
-        Objects, most confident first.
-    """
-    kept = distinct(boxes, scores, labels, looks, cut, sharpness, score=score, iou=iou, inside=inside, around=around)
-    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept])
-
-
-def distinct(
-    boxes: Tensor,
-    scores: Tensor,
-    labels: Tensor,
-    looks: Tensor,
-    cut: Tensor,
-    sharpness: Tensor,
-    *,
-    score: float = FAINTEST,
-    iou: float = 0.5,
-    inside: float = 0.8,
-    around: float | None = None,
-) -> Tensor:
-    """Choose one box for each object among the boxes of several looks.
-
     Two boxes of one class are the same object when their intersection over union is at least `iou`. Boxes of two looks
     are also the same object when one of them is cut, and at least `inside` of its area lies in the other. Of two boxes
     of the same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
@@ -216,11 +180,44 @@ def distinct(
         around: width of a picture whose left and right borders meet; None for others.
 
     Returns:
-        Indices of the boxes that are kept, those with the highest score first.
+        Objects, most confident first.
     """
     enough = (scores >= score).nonzero()[:, 0]
+    parts = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
+    kept = enough[unlike(*parts, iou=iou, inside=inside, around=around)]
+    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept])
+
+
+def unlike(
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    looks: Tensor,
+    cut: Tensor,
+    sharpness: Tensor,
+    *,
+    iou: float = 0.5,
+    inside: float = 0.8,
+    around: float | None = None,
+) -> Tensor:
+    """One box of each object, by the rule of `merge_looks`.
+
+    Args:
+        boxes: `(M, 4)`, in picture pixels.
+        scores: `(M,)`, scores.
+        labels: `(M,)`, classes.
+        looks: `(M,)`, number of the look of each box.
+        cut: `(M,)`, boolean, boxes that the border of their look cuts.
+        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+        around: width of a picture whose left and right borders meet; None for others.
+
+    Returns:
+        Indices of the boxes, most confident first.
+    """
     # Stable sorts, the last key first.
-    order = enough[scores[enough].argsort(descending=True, stable=True)]
+    order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
     kept = order[_unlike(boxes[order], labels[order], cut[order], looks[order], iou, inside, around)]

@@ -14,7 +14,8 @@ from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.onnx_file import check_canvas, check_elements
-from semfov.detection.onnx_recognition import HEADS, Signature, recognise
+from semfov.detection.onnx_recognition import HEADS, STRIDES, Signature, recognise
+from semfov.detection.onnx_resize import with_input_size
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.onnx_settings import read_settings
 from semfov.detection.placement import Placement, letterbox
@@ -29,6 +30,9 @@ from semfov.io.schema import excerpt
 
 ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name."""
+
+RESIZABLE = {"nanodet-plus-m-1.5x": STRIDES}
+"""Published models with a fixed input whose size can be changed all the same, with the strides of their maps."""
 
 
 class OnnxDetector(Detector):
@@ -180,7 +184,8 @@ def load_onnx(
             recognises the head by names and shapes of the outputs.
         classes: name of each score in order, `"N/A"` for scores that do not stand for a class. None is enough for
             models with 80 or 91 scores, which are taken as COCO's.
-        input_size: size of the canvas in pixels, one side or `(width, height)`, for models that take any size.
+        input_size: size of the canvas in pixels, one side or `(width, height)`, for models that take any size, and for
+            those of `RESIZABLE`.
         stride: for models that take any size: pad the canvas only to a multiple of this number of pixels.
         preprocessing: settings of `Preprocessing` that differ from those of the family.
         logits: whether the model returns scores before the sigmoid.
@@ -202,9 +207,14 @@ def load_onnx(
         DataError: the model or its settings file is missing or damaged.
     """
     name = fspath(name_or_path)
-    path = _locate(name, weights)
+    file = _locate(name, weights)
+    digest = sha256(file) if file.is_file() else ""
+    known_as = name if name in ONNX_MODELS else NETWORKS.get(digest)
+    path = file
+    if known_as in RESIZABLE and input_size is not None:
+        path = with_input_size(file, _sides(input_size), RESIZABLE[known_as])
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
-    stored = read_settings(path, session.metadata)
+    stored = read_settings(file, session.metadata)
     options = {
         "head": head,
         "classes": classes,
@@ -212,7 +222,7 @@ def load_onnx(
         "stride": stride,
         "logits": logits,
         "background": background,
-        "name": name if name in ONNX_MODELS else None,
+        "name": known_as,
     }
     chosen = stored | {key: value for key, value in options.items() if value is not None}
     size = canvas_size(session, chosen.get("input_size"))
@@ -220,7 +230,8 @@ def load_onnx(
     names = chosen.get("classes")
     if "head" not in chosen:
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
-        count = None if names is None else len(names)
+        coco = len(COCO_CLASSES) if known_as else None
+        count = coco if names is None else len(names)
         chosen["head"] = recognise(Signature(session.image, shapes, size, session.producer, count))
     known = HEADS[lookup(chosen["head"], HEADS, "head")]
     if not isinstance(preprocessing, Preprocessing):
@@ -235,13 +246,12 @@ def load_onnx(
         ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
     names = coco_names(scores) if names is None else names
-    digest = sha256(path)
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
         session,
         chosen["head"],
         names,
-        name=chosen.get("name") or NETWORKS.get(digest, path.stem),
+        name=chosen.get("name") or file.stem,
         input_size=size,
         stride=chosen.get("stride"),
         preprocessing=preprocessing,
@@ -262,12 +272,18 @@ def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tup
             )
         check_canvas(session.path.name, (width, height))
         return width, height
+    sizes = _sides(wanted)
+    check_canvas("input_size", sizes)
+    fits = width in (None, sizes[0]) and height in (None, sizes[1])
+    check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)
+    return sizes
+
+
+def _sides(wanted: int | Sequence[int]) -> tuple[int, int]:
+    """`(width, height)` of one side or two."""
     sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
     whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
     check(whole, "input_size", "(width, height) in pixels", excerpt(sizes))
-    check_canvas("input_size", (sizes[0], sizes[1]))
-    fits = width in (None, sizes[0]) and height in (None, sizes[1])
-    check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)
     return sizes[0], sizes[1]
 
 

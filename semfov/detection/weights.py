@@ -19,7 +19,8 @@ class Weights:
         size: its size in bytes.
         sha256: sha256 of its content.
         licence: licence under which it is published.
-        sources: sources, tried in order.
+        sources: sources, tried in order; none for a file that has to be given.
+        remark: for the error without a source, where the weights are published.
     """
 
     file: str
@@ -27,6 +28,7 @@ class Weights:
     sha256: str
     licence: str
     sources: tuple[Address | SourceDistribution, ...]
+    remark: str = ""
 
 
 DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
@@ -79,6 +81,17 @@ WEIGHTS: dict[str, Weights] = {
         "yolox_tiny.onnx", 20_219_662, "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7"
     ),
     "yolox-s": _yolox("yolox_s.onnx", 35_858_002, "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063"),
+    # Models are shipped for this file: the checkpoint of upstream's release with its weights rounded to 8 bits, rebuilt
+    # as ONNX from l-sf/Nanodet_openvino_quant_deploy@ccb0f67. Nobody offers it for download.
+    "nanodet-plus-m-1.5x": Weights(
+        "nanodet_plus_m_1.5x_416.onnx",
+        2_917_332,
+        "f204092ce304306e6d0635eae7112355e7dd59417cef2c50a2ef94f8ec54d56a",
+        "Apache-2.0 (NanoDet, RangiLyu)",
+        (),
+        "upstream's own file is nanodet-plus-m-1.5x_416.onnx of "
+        "https://github.com/RangiLyu/nanodet/releases/tag/v1.0.0-alpha-1",
+    ),
 }
 
 
@@ -111,7 +124,7 @@ def fetch(name: str) -> Path:
         if sha256(path) == entry.sha256:
             return path
         warnings.warn(f"{path} is damaged (its sha256 is wrong) and will be fetched again", stacklevel=2)
-    faults = []
+    faults = [] if entry.sources else ["no source has this file"]
     for source in entry.sources:
         try:
             with replacing(path) as temporary:
@@ -123,7 +136,7 @@ def fetch(name: str) -> Path:
             return path
     raise DataError(
         f"cannot fetch the weights {name!r} ({'; '.join(faults)}); put {entry.file} ({entry.size} bytes, sha256 "
-        f"{entry.sha256}) into {path.parent}, or give its path as weights="
+        f"{entry.sha256}) into {path.parent}, or give its path as weights={'; ' * bool(entry.remark)}{entry.remark}"
     )
 
 

@@ -10,10 +10,12 @@ from semfov.errors import InputError
 NETWORKS = {
     "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14": "yolox-nano",
     "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d": "yolox-nano",
+    "f204092ce304306e6d0635eae7112355e7dd59417cef2c50a2ef94f8ec54d56a": "nanodet-plus-m-1.5x",
 }
 """Networks that models are shipped for, by the sha256 of their file; the name of the file does not matter.
 
 Files listed under one name are conversions of one checkpoint. YOLOX-nano's were made by Kazuhito00 and by its authors.
+NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 """
 
 SHIPPED_SIGMA = 100.0

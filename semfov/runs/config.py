@@ -53,8 +53,8 @@ class DetectorConfig(Settings):
     """The detector, which is applied to each foveated view.
 
     Args:
-        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, a Darknet cfg file, an
-            ONNX model, or `torchvision:<model>`.
+        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, `nanodet-plus-m-1.5x`, a
+            Darknet cfg file, an ONNX model, or `torchvision:<model>`.
         weights: file with the weights (None: the weights registered for the name).
         background: how the background score is computed (`semfov.detection.scores`; None: the policy that suits the
             network).
@@ -64,7 +64,8 @@ class DetectorConfig(Settings):
         limit: keep at most this many boxes per view, the most confident ones.
         stride: pad the view to a multiple of this number of pixels (None: to the detector's square input, as Darknet
             pads it; `auto`: whatever is fastest, 32 for Darknet's networks).
-        input_size: longer side in pixels to which a Darknet network's input is resized (None: the network's own, 416).
+        input_size: longer side in pixels of the network's input, for networks that take any size, such as Darknet's and
+            NanoDet-Plus (None: the network's own, 416).
         runtime: what runs a Darknet network: `torch`, `onnxruntime`, or the faster of the two (`auto`).
         classes: names of the classes in the order of the scores (None: the network's own names, or those of COCO).
         head: output format of an ONNX model whose format is not recognised (docs/detectors.md).

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, Objects, distinct, merge_looks
+from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
 from semfov.zoom.certainty import FACTS, Certainty, object_facts
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
@@ -51,7 +51,8 @@ def merge(
 ) -> Objects:
     """Merge the detections of several looks at windows into one box for each object.
 
-    The rule is that of `semfov.detection.objects.distinct`; the look with the higher magnification is the sharper one.
+    The rule is that of `semfov.detection.objects.merge_looks`; the look with the higher magnification is the sharper
+    one.
 
     Args:
         glances: looks at one picture.
@@ -101,7 +102,7 @@ def merge_with_facts(
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
-    kept = distinct(boxes, scores, labels, looks, cut, sharpness)
+    kept = unlike(boxes, scores, labels, looks, cut, sharpness)
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]

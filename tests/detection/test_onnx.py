@@ -326,7 +326,7 @@ def refuse(address, destination):
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize("name", ["yolox_nano_416", "picodet_s_416_coco"])
+@pytest.mark.parametrize("name", ["yolox_nano_416", "picodet_s_416_coco", "nanodet_plus_m_1.5x_416"])
 def test_real_models_against_opencv_and_numpy(shared, name):
     import cv2
     import onnxruntime as ort
@@ -350,15 +350,20 @@ def test_real_models_against_opencv_and_numpy(shared, name):
         boxes /= [inner.shape[1] / width, inner.shape[0] / height] * 2
         classes, objectness = out[:, 5:], out[:, 4]
     else:
-        rgb = cv2.resize(bgr.astype(np.float32), (416, 416))[..., ::-1] / 255
-        canvas = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-        out = session.run(None, {"image": canvas.transpose(2, 0, 1)[None].astype(np.float32)})
-        classes, objectness = np.concatenate(out[:4], 1)[0], None
-        powers = np.exp(np.concatenate(out[4:], 1)[0].reshape(-1, 4, 8))
+        small, objectness = cv2.resize(bgr.astype(np.float32), (416, 416)), None
+        if name.startswith("picodet"):
+            canvas = (small[..., ::-1] / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+            out = session.run(None, {"image": canvas.transpose(2, 0, 1)[None].astype(np.float32)})
+            classes, distances, offset = np.concatenate(out[:4], 1)[0], np.concatenate(out[4:], 1)[0], 0.5
+        else:
+            canvas = (small - [103.53, 116.28, 123.675]) / [57.375, 57.12, 58.395]
+            out = session.run(None, {"data": canvas.transpose(2, 0, 1)[None].astype(np.float32)})[0][0]
+            classes, distances, offset = out[:, :80], out[:, 80:], 0.0
+        powers = np.exp(distances.reshape(-1, 4, 8))
         reach = (powers * np.arange(8)).sum(-1) / powers.sum(-1)
         grid = [(c, r, s) for s in (8, 16, 32, 64) for r in range(-(-416 // s)) for c in range(-(-416 // s))]
-        boxes = np.array([[(c + 0.5 - d[0]) * s, (r + 0.5 - d[1]) * s, (c + 0.5 + d[2]) * s, (r + 0.5 + d[3]) * s]
-                          for d, (c, r, s) in zip(reach, grid, strict=True)])  # fmt: skip
+        boxes = np.array([[c - d[0], r - d[1], c + d[2], r + d[3]] for d, (c, r, _) in zip(reach, grid, strict=True)])
+        boxes = (boxes + offset) * np.array([[s] for _, _, s in grid])
         boxes /= [416 / width, 416 / height] * 2
     detector = load_detector(path)
     fitted, placement = detector.fit(torch.tensor(bgr[..., ::-1].copy()).permute(2, 0, 1)[None] / 255)

@@ -86,6 +86,13 @@ def test_the_error_without_a_working_source_names_the_remedy(cache, register):
     assert not list(cache.iterdir())
 
 
+def test_a_file_without_a_source_is_asked_for(cache):
+    with pytest.raises(DataError) as caught:
+        fetch("nanodet-plus-m-1.5x")
+    for part in ("no source", "RangiLyu/nanodet/releases", "nanodet-plus-m-1.5x_416.onnx", "weights=", str(cache)):
+        assert part in str(caught.value)
+
+
 def test_unknown_names_are_refused_with_a_suggestion():
     with pytest.raises(InputError, match="did you mean 'yolov3-tiny'"):
         fetch("yolo3-tiny")

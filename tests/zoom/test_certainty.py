@@ -12,7 +12,7 @@ from scipy.stats import nbinom
 from semfov.agents import ZoomAgent
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects, distinct
+from semfov.detection.objects import Objects, unlike
 from semfov.errors import InputError
 from semfov.fit.windows_certainty import fit_certainty
 from semfov.io.storage import read, write_file
@@ -111,7 +111,7 @@ def test_facts_equal_a_plain_loop(latest, dtype):
     scores = (0.06 + 0.9 * torch.rand(count, generator=generator)).to(dtype)
     labels = torch.randint(1, 3, (count,), generator=generator)
     looks, cut = torch.randint(0, 4, (count,), generator=generator), torch.rand(count, generator=generator) < 0.3
-    kept = distinct(boxes, scores, labels, looks, cut, SCALES[looks])
+    kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
     assert 5 < len(kept) < count - 5
     every = boxes, scores, labels, looks, cut
     facts = object_facts(kept, *every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)

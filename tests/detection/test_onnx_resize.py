@@ -1,0 +1,89 @@
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch.nn import functional as F
+from torchvision.ops import box_iou
+
+from semfov.detection.load import load_detector
+from semfov.detection.onnx_resize import with_input_size
+from semfov.detection.onnx_session import OnnxSession
+from semfov.errors import InputError
+
+WEIGHT = np.random.default_rng(0).normal(size=(6, 3, 8, 8)).astype(np.float32)
+
+
+@pytest.fixture(params=["initializer", "node"])
+def shuffled(request, tmp_path, monkeypatch):
+    """A convolution of stride 8 and a shuffle of its channels, exported for 64 x 64 pixels."""
+    monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path / "cache"))
+    shapes = {"apart": [1, 2, 3, 8, 8], "together": [1, -1, 8, 8], "cells": [1, 6, -1]}
+    tensors = {name: numpy_helper.from_array(np.array(shape), name) for name, shape in shapes.items()}
+    steps = [
+        helper.make_node("Conv", ["image", "weight"], ["map"], strides=[8, 8]),
+        helper.make_node("Reshape", ["map", "apart"], ["groups"]),
+        helper.make_node("Transpose", ["groups"], ["mixed"], perm=[0, 2, 1, 3, 4]),
+        helper.make_node("Reshape", ["mixed", "together"], ["joined"]),
+        helper.make_node("Reshape", ["joined", "cells"], ["output"]),
+    ]
+    stored = [numpy_helper.from_array(WEIGHT, "weight")]
+    if request.param == "node":
+        steps = [helper.make_node("Constant", [], [name], value=each) for name, each in tensors.items()] + steps
+    else:
+        stored += tensors.values()
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 64])
+    output = helper.make_tensor_value_info("output", TensorProto.FLOAT, [1, 6, 64])
+    graph = helper.make_graph(steps, "shuffled", [image], [output], stored)
+    path = tmp_path / "shuffled.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
+
+
+@pytest.mark.parametrize("canvas", [(64, 64), (96, 64), (32, 128)])
+def test_a_resized_network_computes_the_same_convolution(shuffled, canvas):
+    path = with_input_size(shuffled, canvas, (8, 16))
+    image = torch.rand(1, 3, canvas[1], canvas[0], generator=torch.Generator().manual_seed(0))
+    expected = F.conv2d(image, torch.from_numpy(WEIGHT), stride=8)[:, [0, 3, 1, 4, 2, 5]].flatten(2)
+    torch.testing.assert_close(OnnxSession(path)(image)["output"], expected, rtol=1e-4, atol=1e-4)
+    assert with_input_size(shuffled, canvas, (8, 16)) == path
+    assert (path == shuffled) == (canvas == (64, 64))
+
+
+def test_a_damaged_copy_is_made_again(shuffled):
+    path = with_input_size(shuffled, (96, 96), (8,))
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    assert with_input_size(shuffled, (96, 96), (8,)).read_bytes() == content
+
+
+def test_a_size_that_does_not_fit_the_maps_is_refused(shuffled):
+    with pytest.raises(InputError, match="input_size: expected multiples of 32 pixels"):
+        with_input_size(shuffled, (100, 64), (8,))
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("size", [416, 640])
+def test_nanodet_plus_is_recognised_by_content_and_takes_other_sizes(shared, tmp_path, size, monkeypatch):
+    monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path))
+    file = tmp_path / "mine.onnx"
+    file.write_bytes((shared / "weights" / "nanodet_plus_m_1.5x_416.onnx").read_bytes())
+    detector = load_detector(file, input_size=size)
+    named = load_detector("nanodet-plus-m-1.5x", weights=file, input_size=size)
+    assert (detector.name, detector.digest) == (named.name, named.digest)
+    assert detector.input_size == (size, size)
+    picture = torch.rand(1, 3, 300, 400, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(detector(picture).scores, named(picture).scores)
+
+
+@pytest.mark.shared
+def test_nanodet_plus_sees_the_same_objects_at_both_sizes(shared, tmp_path, monkeypatch):
+    from skimage.data import astronaut
+
+    monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path))
+    file = shared / "weights" / "nanodet_plus_m_1.5x_416.onnx"
+    image = torch.from_numpy(astronaut()).permute(2, 0, 1)[None] / 255
+    small, large = (load_detector("nanodet-plus-m-1.5x", weights=file, input_size=size) for size in (416, 640))
+    first, second = small(image), large(image)
+    assert small.classes[first.labels[0, 0] - 1] == large.classes[second.labels[0, 0] - 1] == "person"
+    assert float(box_iou(first.boxes[0, :1], second.boxes[0, :1])) > 0.8
