@@ -80,6 +80,7 @@ class OnnxDetector(Detector):
             fill=preprocessing.fill,
             stride=stride,
             stretch=preprocessing.stretch,
+            faint=family.faint,
             digest=digest,
         )
         fixed = None not in session.shape[2:]
