@@ -215,8 +215,9 @@ HEADS: dict[str, DetectionHead] = {
     "yolov8": DetectionHead(lambda outputs, canvas: heads.decode_yolov8(_first(outputs))),
     "picodet": DetectionHead(_level_maps, _IMAGENET),
     "nanodet": DetectionHead(_level_maps, _NANODET),
-    # Without objectness nearly every candidate exceeds the usual threshold.
-    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, faint=0.02),
+    # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
+    # some score, which would dilute that of the best one if only their shares counted.
+    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02),
     "detr": DetectionHead(
         lambda outputs, canvas: heads.decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
