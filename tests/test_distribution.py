@@ -26,7 +26,6 @@ from pathlib import Path
 import torch
 import semfov
 from semfov.report.page import page_html
-from semfov.report.episode import Pool
 
 home = Path(semfov.__file__).parent
 assert Path(sys.prefix) in home.parents, home
@@ -35,7 +34,7 @@ assert len(models) > 15, models
 semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
 semfov.TargetEvidence.from_pretrained("yolov3-tiny")
 semfov.MapEvidence.from_pretrained("yolov3-tiny")
-assert "<script" in page_html("a page", [], Pool())
+assert "<script" in page_html("a page", [])
 view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
 print(semfov.__version__, view.shape[-1])
 """

@@ -16,8 +16,8 @@ from eval.comparison.run import Run
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
 from semfov.report.curves import curves_html, table_html
-from semfov.report.episode import Data, Pool, episode_data
-from semfov.report.page import write_page
+from semfov.report.episode import Data, episode_data
+from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import plain
@@ -69,10 +69,9 @@ def write_run_report(
     told = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
     settings = escape(yaml.safe_dump(told, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
-    pool = Pool()
-    data = _episodes(run, choose_episodes(records, list(run.policies), episodes), pool)
+    data = _episodes(run, choose_episodes(records, list(run.policies), episodes))
     title = f"semfov: {run.task} with {run.eye.detector.name}"
-    return write_page(run.config.out / "report.html", title, data, pool, sections="\n".join(sections))
+    return write_page(run.config.out / "report.html", title, data, sections="\n".join(sections))
 
 
 def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count: int) -> list[ResultRecord]:
@@ -101,10 +100,10 @@ def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count:
     return chosen
 
 
-def _episodes(run: Run, records: Sequence[ResultRecord], pool: Pool) -> list[Data]:
-    data, size, settings = [], 0, run.eye.settings()
+def _episodes(run: Run, records: Sequence[ResultRecord]) -> list[Data]:
+    data, size, settings, pictures = [], 0, run.eye.settings(), set[str]()
     for record in records:
-        if len(pool) + size > MOST_BYTES:
+        if sum(map(len, pictures)) + size > MOST_BYTES:
             break
         index = list(run.scenes.ids).index(record["scene"])
         scene, scanpath = run.scenes[index], replay(run, index, record)
@@ -116,7 +115,6 @@ def _episodes(run: Run, records: Sequence[ResultRecord], pool: Pool) -> list[Dat
                 scanpath,
                 scene.image,
                 views,
-                pool,
                 name=name,
                 settings=settings,
                 boxes=boxes,
@@ -125,6 +123,7 @@ def _episodes(run: Run, records: Sequence[ResultRecord], pool: Pool) -> list[Dat
                 quality=60,
             )
         )
+        pictures.update(pictures_of(data[-1]))
         size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
         size += 7 * scanpath.values.numel()
     return data

@@ -36,8 +36,10 @@ _OUTPUT = """\
   --out FILE           results as .json, .csv, .geojson, or for COCO .coco.json, written while it runs
   --out FOLDER         figures and results of each picture; --draw scanpath,views,belief,belief_bars,animation or none
   --report PAGE.html   a page in which to step through the looks; --looks prints them
+  --workers N          processes that look at several pictures; --scheduler tcp://HOST:8786 for those of a Dask cluster
 
-A picture of several that cannot be read is reported and skipped; the exit code is then 1. --help-all: all options."""
+A picture of several that cannot be read is reported and skipped; the exit code is then 1. If the command is stopped,
+the same command continues with the pictures that are left. --help-all: all options."""
 
 SEARCH = f"""\
 semfov search: is it there, and where?
@@ -141,7 +143,6 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
   --out FOLDER             folder for the models (default mymodels)
   --holdout N              hold out one in N photographs, on which each part is compared with raw scores
   --windows false          no evidence for large pictures (it takes about 50 photographs, of which mosaics are made)
-  --windows false          without evidence for pictures larger than the detector's input
   --workers N              processes that look (default: one for each core)
 
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw

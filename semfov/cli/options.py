@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from semfov.agent import How
 from semfov.agents.limits import MOST_PASSES
 from semfov.errors import InputError
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
+from semfov.runs.workers import Where
 from semfov.sensor.named import SensorName
 
 Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
@@ -63,6 +64,8 @@ class PictureOptions(AgentOptions):
             folder). If `out` is a file, they are written into a folder of its name.
         report: HTML page to write, in which to step through the looks.
         looks: print every look.
+        workers: number of processes that look at several pictures (each takes the memory of a detector).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     pictures: tuple[str, ...] = ()
@@ -75,6 +78,13 @@ class PictureOptions(AgentOptions):
     draw: tuple[Drawing, ...] | None = None
     report: Path | None = None
     looks: bool = False
+    workers: Workers = 1
+    scheduler: str | None = None
+
+    @property
+    def where(self) -> Where:
+        """Where several pictures are looked at."""
+        return self.workers if self.scheduler is None else self.scheduler
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,33 @@ def kind_of(path: Path) -> str | None:
     return kind
 
 
+def result_row(
+    record: GazeRecord, name: str, seconds: float, kind: str | None, file: Path | None = None
+) -> dict[str, Any]:
+    """Make what a file of results has of a picture.
+
+    Args:
+        record: the record of the picture.
+        name: name of the picture.
+        seconds: time that it took.
+        kind: one of `RESULT_KINDS`; None for the results in a folder.
+        file: file of the picture, which may tell its place on earth; None for an embedded scene.
+
+    Returns:
+        JSON values: `picture`, and for some kinds `parts` of the file, one for each object, with what they have in
+        common.
+    """
+    row: dict[str, Any] = {"picture": {**_summary(name, record, seconds), "objects": record.object_rows()}}
+    if kind == ".geojson":
+        collection = record.to_geojson(source=file)
+        row["coordinates"] = collection["coordinates"]
+        row["parts"] = [_of_picture(each, name) for each in collection["features"]]
+    elif kind == ".coco.json":
+        row["categories"] = _categories(record.classes[1:])
+        row["parts"] = [_area(each) for each in record.to_coco(0, row["categories"])]
+    return row
+
+
 class ResultsFile:
     """A file of results that is complete for the pictures so far, whenever the command ends.
 
@@ -57,38 +84,24 @@ class ResultsFile:
 
     def __init__(self, path: Path, kind: str, *, searched: bool) -> None:
         self.path, self.kind, self.searched = path, kind, searched
-        self._pictures: list[dict[str, Any]] = []
-        self._annotations: list[dict[str, Any]] = []
-        self._categories: list[dict[str, Any]] = []
-        self._coordinates: set[str] = set()
-        self._skipped: list[dict[str, str]] = []
+        self._rows: dict[int, dict[str, Any]] = {}
+        self._skipped: dict[int, dict[str, str]] = {}
         self._due = 0.0
 
-    def add(self, name: str, record: GazeRecord, seconds: float, file: Path | None = None) -> None:
-        """Add the record of a picture.
+    def add(self, number: int, row: dict[str, Any]) -> None:
+        """Add a picture.
 
         Args:
-            name: name of the picture.
-            record: its record.
-            seconds: time that it took.
-            file: file of the picture, which may tell its place on earth; None for an embedded scene.
+            number: its place among the pictures, which may come in any order.
+            row: what the file has of it (`result_row`).
         """
-        self._pictures.append({**_summary(name, record, seconds), "objects": record.object_rows()})
-        if self.kind == ".geojson":
-            collection = record.to_geojson(source=file)
-            self._coordinates.add(collection["coordinates"])
-            self._annotations += [_of_picture(each, name) for each in collection["features"]]
-        elif self.kind == ".coco.json":
-            self._categories = self._categories or _categories(record.classes[1:])
-            found = record.to_coco(len(self._pictures), self._categories)
-            first = len(self._annotations) + 1
-            self._annotations += [{"id": number, **_area(each)} for number, each in enumerate(found, first)]
+        self._rows[number] = row
         if time.monotonic() >= self._due:
             self.write()
 
-    def skip(self, name: str, reason: str) -> None:
+    def skip(self, number: int, name: str, reason: str) -> None:
         """Add a picture that could not be read, and the reason."""
-        self._skipped.append({"picture": name, "error": reason})
+        self._skipped[number] = {"picture": name, "error": reason}
 
     def write(self) -> None:
         """Write the file, atomically."""
@@ -98,26 +111,34 @@ class ResultsFile:
         self._due = began + took / _SHARE
 
     def _text(self) -> str:
+        rows = [self._rows[number] for number in sorted(self._rows)]
+        pictures = [row["picture"] for row in rows]
+        whole: dict[str, Any] = {
+            "pictures": pictures, "skipped": [self._skipped[number] for number in sorted(self._skipped)]
+        }  # fmt: skip
         if self.kind == ".csv":
-            return self._csv()
-        whole: dict[str, Any] = {"pictures": self._pictures, "skipped": self._skipped}
+            return self._csv(pictures)
         if self.kind == ".geojson":
-            unit = "; ".join(sorted(self._coordinates))
-            whole = {"type": "FeatureCollection", "coordinates": unit, "features": self._annotations}
+            unit = "; ".join(sorted({row["coordinates"] for row in rows}))
+            parts = [each for row in rows for each in row["parts"]]
+            whole = {"type": "FeatureCollection", "coordinates": unit, "features": parts}
         elif self.kind == ".coco.json":
             images = [
                 {"id": number, "file_name": each["picture"], "width": each["width"], "height": each["height"]}
-                for number, each in enumerate(self._pictures, 1)
+                for number, each in enumerate(pictures, 1)
             ]
-            whole = {"images": images, "annotations": self._annotations, "categories": self._categories}
+            parts = [{**each, "image_id": number} for number, row in enumerate(rows, 1) for each in row["parts"]]
+            annotations = [{"id": number, **each} for number, each in enumerate(parts, 1)]
+            categories = rows[0]["categories"] if rows else []
+            whole = {"images": images, "annotations": annotations, "categories": categories}
         return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
-    def _csv(self) -> str:
+    def _csv(self, pictures: list[dict[str, Any]]) -> str:
         text = io.StringIO()
         if self.searched:
-            rows, names = self._pictures, list(_DECISIONS)
+            rows, names = pictures, list(_DECISIONS)
         else:
-            rows = [{"picture": each["picture"], **row} for each in self._pictures for row in each["objects"]]
+            rows = [{"picture": each["picture"], **row} for each in pictures for row in each["objects"]]
             names = list(rows[0]) if rows else ["picture", "class", "score", "x1", "y1", "x2", "y2"]
         table = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         table.writeheader()

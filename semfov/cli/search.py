@@ -7,9 +7,10 @@ from typing import Any
 
 from semfov.agent import PictureLike
 from semfov.cli.agent import check_target, known_classes, make_agent, several_classes
-from semfov.cli.episodes import PictureSource, look_at_pictures, picture_sources, start_beside
+from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
 from semfov.cli.results import kind_of
+from semfov.cli.sources import PictureSource, start_beside
 from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check
@@ -25,24 +26,7 @@ def search_pictures(options: SearchOptions) -> int:
     Returns:
         The exit code.
     """
-    check_target(options.target, options)
-    start = _check(options)
-    known = known_classes(options)
-    wanted = None if known is None else meant(options, known)
-    agent = make_agent(options)
-    wanted = meant(options, agent.classes[1:]) if wanted is None else wanted
-    target = next(iter(wanted))
-    given: dict[str, Any] = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
-
-    def look(picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
-        kind = agent.kind_of_look(picture, shared["how"])
-        if kind != "fovea":
-            only_likeliest(wanted)
-        aim = wanted if kind == "fovea" and len(wanted) > 1 else target
-        first = start if start is not None or kind != "fovea" else start_beside(agent, source, options.seed)
-        return agent.search(picture, aim, start=first, **given, **shared)
-
-    return look_at_pictures(options, agent, look, f"search for “{target}”", target)
+    return look_at_pictures(SearchJob(options))
 
 
 def find_objects(options: FindOptions) -> int:
@@ -53,23 +37,8 @@ def find_objects(options: FindOptions) -> int:
 
     Returns:
         The exit code.
-
-    Raises:
-        InputError: an option does not fit.
     """
-    if options.start is not None:
-        raise InputError(f"start: expected none for find, which begins with the whole picture, got {options.start!r}")
-    _check(options)
-    targets = several_classes(options.target, known_classes(options))
-    agent = make_agent(options)
-    targets = several_classes(options.target, agent.classes[1:])
-    given: dict[str, Any] = {"worth": options.worth, "batch": options.batch}
-
-    def look(picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
-        return agent.find_all(picture, targets, **given, **shared)
-
-    first = None if targets is None else targets[0]
-    return look_at_pictures(options, agent, look, f"all {' and '.join(targets or ['objects'])}", first)
+    return look_at_pictures(FindJob(options))
 
 
 def explore_pictures(options: ExploreOptions) -> int:
@@ -81,19 +50,91 @@ def explore_pictures(options: ExploreOptions) -> int:
     Returns:
         The exit code.
     """
-    start = _check(options)
-    known_classes(options)
-    agent = make_agent(options)
+    return look_at_pictures(ExploreJob(options))
 
-    def look(picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
-        return agent.explore(picture, start=start, seed=options.seed, worth=options.worth, **shared)
 
-    return look_at_pictures(options, agent, look, "exploration")
+class SearchJob(PictureJob):
+    """Searches pictures for a class.
+
+    Args:
+        options: the options.
+    """
+
+    def __init__(self, options: SearchOptions) -> None:
+        check_target(options.target, options)
+        super().__init__(options)
+        self.start = _check(options)
+        known = known_classes(options)
+        wanted = None if known is None else meant(options, known)
+        self.agent = make_agent(options)
+        self.wanted = meant(options, self.agent.classes[1:]) if wanted is None else wanted
+        self.target = next(iter(self.wanted))
+        self.title = f"search for “{self.target}”"
+
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+        """Search a picture."""
+        agent, options, wanted = self.agent, self.options, self.wanted
+        given = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
+        kind = agent.kind_of_look(picture, shared["how"])
+        if kind != "fovea":
+            only_likeliest(wanted)
+        aim = wanted if kind == "fovea" and len(wanted) > 1 else next(iter(wanted))
+        beside = self.start is None and kind == "fovea"
+        start = start_beside(agent, source, options.seed) if beside else self.start
+        return agent.search(picture, aim, start=start, **given, **shared)
+
+
+class FindJob(PictureJob):
+    """Finds all objects in pictures.
+
+    Args:
+        options: the options.
+
+    Raises:
+        InputError: an option does not fit.
+    """
+
+    def __init__(self, options: FindOptions) -> None:
+        if options.start is not None:
+            raise InputError(
+                f"start: expected none for find, which begins with the whole picture, got {options.start!r}"
+            )
+        super().__init__(options)
+        _check(options)
+        several_classes(options.target, known_classes(options))
+        self.agent = make_agent(options)
+        self.targets = several_classes(options.target, self.agent.classes[1:])
+        self.target = None if self.targets is None else self.targets[0]
+        self.title = f"all {' and '.join(self.targets or ['objects'])}"
+
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+        """Find all objects in a picture."""
+        return self.agent.find_all(picture, self.targets, worth=self.options.worth, batch=self.options.batch, **shared)
+
+
+class ExploreJob(PictureJob):
+    """Explores pictures.
+
+    Args:
+        options: the options.
+    """
+
+    title = "exploration"
+
+    def __init__(self, options: ExploreOptions) -> None:
+        super().__init__(options)
+        self.start = _check(options)
+        known_classes(options)
+        self.agent = make_agent(options)
+
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+        """Explore a picture."""
+        options = self.options
+        return self.agent.explore(picture, start=self.start, seed=options.seed, worth=options.worth, **shared)
 
 
 def _check(options: PictureOptions) -> Any:
     """Check what can be checked before anything is loaded; returns the first cell."""
-    picture_sources(options)
     if options.out is not None:
         kind_of(options.out)
     check(not options.draw or options.out is not None, "draw", "--out FOLDER beside --draw", "none")

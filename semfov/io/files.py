@@ -125,8 +125,13 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file atomically."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)
 
 
 def sha256(path: str | Path) -> str:

@@ -1,7 +1,7 @@
 """HTML pages on which a reader steps through episodes in a browser."""
 
-from semfov.report.episode import Pool, episode_data
+from semfov.report.episode import episode_data
 from semfov.report.page import page_html, write_page
 from semfov.report.zoom import zoom_data
 
-__all__ = ["Pool", "episode_data", "page_html", "write_page", "zoom_data"]
+__all__ = ["episode_data", "page_html", "write_page", "zoom_data"]

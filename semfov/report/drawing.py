@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.paths import Record
-from semfov.report.episode import Pool
+from semfov.report.episode import jpeg_uri
 from semfov.viz.style import FOUND, GAZE, TARGET
 
 WIDTH = 640
@@ -29,10 +29,8 @@ def record_html(record: Record) -> str:
     unit = max(width, height) / WIDTH
     shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
     if record.image is not None:
-        pool = Pool()
-        pool.add(record.image, WIDTH, _QUALITY)
         size = f'width="{width}" height="{height}" preserveAspectRatio="none"'
-        shapes = [f'<image href="{pool.pictures[0]}" {size}/>']
+        shapes = [f'<image href="{jpeg_uri(record.image, WIDTH, _QUALITY)}" {size}/>']
     for look in record:
         x1, y1, x2, y2 = look.region
         if x2 - x1 > width - 1 and y2 - y1 > height - 1:

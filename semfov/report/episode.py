@@ -22,43 +22,6 @@ from semfov.viz.semantic import entropy
 Data = dict[str, Any]
 
 
-class Pool:
-    """The pictures of a page, each kept once.
-
-    Attributes:
-        pictures: data URIs of the pictures.
-
-    >>> pool, grey = Pool(), torch.full((3, 60, 80), 0.5)
-    >>> pool.add(grey, 40, 75), pool.add(grey, 40, 75), len(pool.pictures)
-    (0, 0, 1)
-    """
-
-    def __init__(self) -> None:
-        self.pictures: list[str] = []
-        self._index: dict[str, int] = {}
-
-    def add(self, image: Tensor, width: int, quality: int) -> int:
-        """Add a picture.
-
-        Args:
-            image: `(3, H, W)`, RGB in [0, 1].
-            width: largest width in pixels; wider pictures are reduced.
-            quality: of the JPEG file.
-
-        Returns:
-            The number of the picture.
-        """
-        uri = jpeg_uri(image, width, quality)
-        if uri not in self._index:
-            self._index[uri] = len(self.pictures)
-            self.pictures.append(uri)
-        return self._index[uri]
-
-    def __len__(self) -> int:
-        """Total size of the pictures in bytes."""
-        return sum(map(len, self.pictures))
-
-
 def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
     """A picture `(3, H, W)` as a data URI, reduced to at most `width` pixels."""
     from PIL import Image
@@ -75,7 +38,6 @@ def episode_data(
     scanpath: Scanpath,
     image: Tensor | None,
     views: Sequence[Tensor] | None,
-    pool: Pool,
     *,
     name: str,
     settings: Mapping[str, Any] | None = None,
@@ -90,7 +52,6 @@ def episode_data(
         scanpath: the episode.
         image: `(3, H, W)`, RGB in [0, 1]; None shows no photograph.
         views: for each fixation the foveated photograph `(3, h, w)`, of any size; None shows no views.
-        pool: collects the pictures.
         name: name of the episode.
         settings: settings of detector and sensor (`Eye.settings()`); None takes those that the scanpath kept.
         boxes: `(M, 4)`, true boxes of the target.
@@ -100,13 +61,13 @@ def episode_data(
         quality: of the JPEG files.
 
     Returns:
-        The data, for `page_html` and `write_page`.
+        The data, for `page_html` and `write_page`; pictures are data URIs.
 
     Example::
 
-        path, pool = agent.search(image, "cup"), Pool()
-        data = episode_data(path, path.image, path.views(), pool, name="kitchen.jpg")
-        write_page(Path("kitchen.html"), "Search for a cup", [data], pool)
+        path = agent.search(image, "cup")
+        data = episode_data(path, path.image, path.views(), name="kitchen.jpg")
+        write_page(Path("kitchen.html"), "Search for a cup", [data])
     """
     grid = scanpath.grid
     size = grid.extent.tolist()
@@ -116,7 +77,7 @@ def episode_data(
     fixations = [
         {
             "cell": cell,
-            "view": None if view is None else pool.add(view, width, quality),
+            "view": None if view is None else jpeg_uri(view, width, quality),
             "detections": detection_data(scanpath, number),
             "values": [rounded(value) for value in scanpath.values[number].tolist()],
             "next": after[number],
@@ -132,7 +93,7 @@ def episode_data(
         "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
-        "image": None if image is None else pool.add(image, width * 3 // 2, quality),
+        "image": None if image is None else jpeg_uri(image, width * 3 // 2, quality),
         "target": None if scanpath.target is None else scanpath.classes[scanpath.target],
         "found": scanpath.found,
         "truth": [] if boxes is None else boxes.tolist(),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.report.curves import table_html
-from semfov.report.episode import Data, Pool
+from semfov.report.episode import Data
 from semfov.report.zoom import LISTED
 from semfov.viz.labels import place_labels
 
@@ -21,12 +21,11 @@ ABOUT = {
 """Entries at the head of an episode, by their keys in its data."""
 
 
-def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> str:
+def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
     """The picture with its windows and objects, all looks, and a table of the objects.
 
     Args:
         data: data of the path (`semfov.report.zoom.zoom_data`).
-        pool: the pictures.
         place: id of the element.
         headed: whether the head of the page shows this path. Otherwise a head is added for readers without JavaScript.
 
@@ -36,20 +35,20 @@ def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> st
     name, count = escape(data["name"]), data["count"]
     told = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
     head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
-    looks = "".join(_look(data, number, pool, f"{place}-look-{number}") for number in range(len(data["looks"])))
+    looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
         f"Click on the number or the border of a window to choose its look. Green objects were confirmed by the "
         f"decision or a closer look.</p>"
-        f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data, pool)}</figure>'
+        f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data)}</figure>'
         f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
     )
 
 
-def _picture(data: Data, pool: Pool) -> str:
+def _picture(data: Data) -> str:
     """The picture with numbered windows and objects."""
     width, height = data["size"]
     unit = max(width, height) / 640
@@ -70,11 +69,11 @@ def _picture(data: Data, pool: Pool) -> str:
     label = f"The picture with {len(windows)} numbered windows and {data['count']} object{several}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
-        f'{_image(pool.pictures[data["image"]], (width, height))}{"".join(shapes)}<g class="chosen"></g></svg>'
+        f'{_image(data["image"], (width, height))}{"".join(shapes)}<g class="chosen"></g></svg>'
     )
 
 
-def _look(data: Data, number: int, pool: Pool, place: str) -> str:
+def _look(data: Data, number: int, place: str) -> str:
     """A look: its pixels with its detections, its window and value, and a table of the detections."""
     look = data["looks"][number]
     x1, y1, x2, y2 = look["box"]
@@ -113,7 +112,7 @@ def _look(data: Data, number: int, pool: Pool, place: str) -> str:
         f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
         f'<h4 id="{place}-title">Look {number}{": the whole picture" if look["whole"] else ""}</h4>'
         f'<svg viewBox="0 0 {size[0]} {size[1]}" role="img" aria-label="{label}">'
-        f"{_image(pool.pictures[look['view']], size)}{''.join(shapes)}{''.join(tags)}</svg>"
+        f"{_image(look['view'], size)}{''.join(shapes)}{''.join(tags)}</svg>"
         f'<dl class="facts">{told}</dl>{table}{_left_out(left, "detection")}</section>'
     )
 

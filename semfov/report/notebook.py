@@ -11,7 +11,7 @@ from semfov.metrics.scanpath.beside import compare_scanpath
 from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Scanpath, ZoomPath
 from semfov.paths.drawing import draws
 from semfov.report.drawing import record_html
-from semfov.report.episode import Pool, episode_data
+from semfov.report.episode import episode_data
 from semfov.report.page import page_html
 from semfov.report.record import write_record, write_scanpath
 from semfov.viz.animation import animate
@@ -50,11 +50,10 @@ def notebook_html(scanpath: Scanpath) -> str:
         across, down = scanpath.grid.extent.tolist()
         name = f"{across:.0f} × {down:.0f} px"
         for width, quality in FINENESS:
-            pool = Pool()
             data = episode_data(
-                scanpath, scanpath.image, views, pool, name=name, classes=classes, width=width, quality=quality
+                scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality
             )
-            frame = framed(page_html(f"semfov: {scanpath.describe()}", [data], pool), scanpath.describe())
+            frame = framed(page_html(f"semfov: {scanpath.describe()}", [data]), scanpath.describe())
             if len(frame.encode()) <= MOST_CHARACTERS:
                 return frame
     words = escape(repr(scanpath))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semfov.io.files import write_text
-from semfov.report.episode import Data, Pool
+from semfov.report.episode import Data
 from semfov.report.looks import ABOUT, looks_html
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
@@ -23,14 +23,13 @@ _OPACITY = 0.82
 """Opacity over the photograph of colours that do not stand for probabilities."""
 
 
-def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, sections: str = "") -> Path:
+def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: str = "") -> Path:
     """Write a page on which a reader steps through episodes.
 
     Args:
         path: the HTML file.
         title: plain text.
         episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
-        pool: pictures of the episodes.
         sections: HTML to insert above the episodes, with special characters already escaped.
 
     Returns:
@@ -38,36 +37,34 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, 
 
     Example::
 
-        path, pool = agent.explore("harbour.tif", passes=16), Pool()
-        data = zoom_data(path, "harbour.tif", pool, name="harbour")
-        write_page(Path("harbour.html"), "Harbour", [data], pool)
+        path = agent.explore("harbour.tif", passes=16)
+        write_page(Path("harbour.html"), "Harbour", [zoom_data(path, "harbour.tif", name="harbour")])
     """
-    write_text(path, page_html(title, episodes, pool, sections=sections))
+    write_text(path, page_html(title, episodes, sections=sections))
     return path
 
 
-def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str = "") -> str:
+def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> str:
     """Make a page on which a reader steps through episodes.
 
     Args:
         title: plain text.
         episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
-        pool: pictures of the episodes.
         sections: HTML to insert above the episodes, with special characters already escaped.
 
     Returns:
         The HTML of the page.
 
-    >>> page = page_html("Cats & dogs", [], Pool())
+    >>> page = page_html("Cats & dogs", [])
     >>> page[:15], "<h1>Cats &amp; dogs</h1>" in page
     ('<!DOCTYPE html>', True)
     """
     # Pictures of large pictures are in the markup, which is complete without the script.
-    drawn = {episode["image"] for episode in episodes if "looks" not in episode}
-    drawn |= {each["view"] for episode in episodes if "looks" not in episode for each in episode["fixations"]}
+    drawn = [picture for episode in episodes if "looks" not in episode for picture in pictures_of(episode)]
+    numbers = {picture: number for number, picture in enumerate(dict.fromkeys(drawn))}
     data = {
-        "episodes": [_scripted(episode, number) for number, episode in enumerate(episodes)],
-        "pictures": [uri if number in drawn else None for number, uri in enumerate(pool.pictures)],
+        "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
+        "pictures": list(numbers),
         "colours": {
             "time": colour_steps(TIME),
             "overlay": colour_steps(overlay_colours()),
@@ -83,7 +80,7 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
         "sections": sections,
         "about": about_html(episodes),
         "looks": "".join(
-            looks_html(episode, pool, _place(number), headed=number == 0)
+            looks_html(episode, _place(number), headed=number == 0)
             for number, episode in enumerate(episodes)
             if "looks" in episode
         ),
@@ -112,10 +109,24 @@ def _place(number: int) -> str:
     return f"large-{number}"
 
 
-def _scripted(episode: Data, number: int) -> Data:
-    """The data of an episode that the page's script reads, as JSON values."""
+def pictures_of(episode: Data) -> list[str]:
+    """The pictures of an episode as data URIs, each as often as it is shown.
+
+    Args:
+        episode: data of an episode.
+
+    Returns:
+        The data URIs.
+    """
+    views = [each["view"] for each in episode["looks" if "looks" in episode else "fixations"]]
+    return [picture for picture in (episode["image"], *views) if picture is not None]
+
+
+def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
+    """The data of an episode that the page's script reads, as JSON values; each picture is on the page once."""
     if "looks" not in episode:
-        return episode
+        fixations = [{**each, "view": pictures.get(each["view"])} for each in episode["fixations"]]
+        return {**episode, "image": pictures.get(episode["image"]), "fixations": fixations}
     looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
     about = {key: episode[key] for key in (*ABOUT, "summary")}
     return {**about, "article": _place(number), "looks": looks}

@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.data.inputs import ImageLike, as_image
 from semfov.data.large import LargePicture
 from semfov.paths import Record, Scanpath
-from semfov.report.episode import Pool, episode_data
+from semfov.report.episode import episode_data
 from semfov.report.page import write_page
 from semfov.report.zoom import zoom_data
 from semfov.viz.drawing import photograph_of
@@ -38,9 +38,8 @@ def write_record(
         InputError: the picture was neither kept nor given, or has other proportions.
         DataError: the file cannot be written.
     """
-    pool = Pool()
-    data = zoom_data(record, picture, pool, name=_name(record, name))
-    return write_page(Path(path), f"semfov: {record.describe()}", [data], pool)
+    data = zoom_data(record, picture, name=_name(record, name))
+    return write_page(Path(path), f"semfov: {record.describe()}", [data])
 
 
 def write_scanpath(
@@ -67,11 +66,10 @@ def write_scanpath(
         InputError: the photograph was neither kept nor given.
         DataError: the file cannot be written.
     """
-    pool = Pool()
     image = photograph_of(scanpath, None if picture is None else as_image(picture))
     views = None if scanpath.stimulus is None else scanpath.views()
-    data = episode_data(scanpath, image, views, pool, name=_name(scanpath, name), boxes=boxes)
-    return write_page(Path(path), f"semfov: {scanpath.describe()}", [data], pool)
+    data = episode_data(scanpath, image, views, name=_name(scanpath, name), boxes=boxes)
+    return write_page(Path(path), f"semfov: {scanpath.describe()}", [data])
 
 
 def _name(record: Record, name: str | None) -> str:

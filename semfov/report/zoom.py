@@ -15,7 +15,7 @@ from semfov.data.reduction import reduction_for
 from semfov.errors import check
 from semfov.paths import HeadPath, Record, RecordedLook, ZoomPath
 from semfov.paths.stimulus import LONGEST
-from semfov.report.episode import Data, Pool, rounded, tagged
+from semfov.report.episode import Data, jpeg_uri, rounded, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.viz.head import head_views
 from semfov.zoom.gist import FOUND
@@ -50,7 +50,6 @@ _PROBABILITY = (
 def zoom_data(
     path: Record,
     picture: LargePicture | ImageLike | None,
-    pool: Pool,
     *,
     name: str,
     settings: Mapping[str, Any] | None = None,
@@ -66,7 +65,6 @@ def zoom_data(
         path: the search or exploration.
         picture: the picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`. It
             may be reduced; None takes the one that the record kept.
-        pool: collects the pictures.
         name: name of the picture.
         settings: settings of the eye (`WindowEye.settings()`), for the name of the detector; None leaves the name out.
         width: largest width in pixels of the whole picture on the page.
@@ -87,7 +85,7 @@ def zoom_data(
     ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
     ...     candidates=Objects.none(), ending="passes",
     ... )
-    >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
+    >>> data = zoom_data(path, torch.rand(3, 1200, 1600), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
     ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup from score 0.3. The only pass was used.')
     """
@@ -110,8 +108,8 @@ def zoom_data(
         "size": [wide, high],
         "target": path.target_name,
         "values": values_in_words(path),
-        "image": pool.add(_pixels(source, (0, 0, wide, high), path.size, min(width, wide)), width, quality),
-        "looks": [_look(path, look, view, objects, pool, quality) for look, view in zip(path, views, strict=True)],
+        "image": jpeg_uri(_pixels(source, (0, 0, wide, high), path.size, min(width, wide)), width, quality),
+        "looks": [_look(path, look, view, objects, quality) for look, view in zip(path, views, strict=True)],
         "objects": objects[:DRAWN],
         "count": len(objects),
     }
@@ -235,7 +233,7 @@ def _objects(path: Record) -> list[Data]:
     ]
 
 
-def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], pool: Pool, quality: int) -> Data:
+def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     (x, y), number, (x1, y1, x2, y2) = look.fixation, look.number, look.region
     width, height = path.size
@@ -254,7 +252,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         told.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
     told.append(f"Objects that it brought: {kinds or 'none'}.")
     return {
-        "view": pool.add(view.pixels, view.across, quality),
+        "view": jpeg_uri(view.pixels, view.across, quality),
         "box": [round(side) for side in look.region],
         "size": list(view.size),
         "whole": whole,

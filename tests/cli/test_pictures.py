@@ -10,6 +10,7 @@ from PIL import Image
 
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
+from tests.colours import write_network
 
 
 def episodes_of(page):
@@ -161,6 +162,88 @@ def test_an_interrupted_folder_leaves_its_results_and_ends_in_one_line(run, phot
     assert printed.err.splitlines()[-1] == "interrupted"
     assert len(json.loads((tmp_path / "boxes.json").read_text())["pictures"]) == 1
     assert written_files(printed) == [str(tmp_path / "boxes.json")]
+
+
+@pytest.fixture
+def folder(photo, tmp_path):
+    """Three pictures, each with a red square at another place."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, name in enumerate("abc"):
+        picture = Image.new("RGB", (160, 120), (100, 100, 100))
+        picture.paste((230, 20, 20), (8 + 40 * number, 8, 28 + 40 * number, 28))
+        picture.save(folder / f"{name}.png")
+    return folder
+
+
+def untimed(file):
+    """A file of results without the times of the looks."""
+    text = file.read_text(encoding="utf-8")
+    return re.sub(r'"seconds": [\d.]+|,[\d.]+$', "", text, flags=re.M)
+
+
+@pytest.mark.parametrize("kind", ["json", "csv", "geojson", "coco.json"])
+def test_a_folder_that_was_interrupted_continues(run, folder, tmp_path, agent, monkeypatch, kind):
+    find_all, calls = agent.find_all, []
+
+    def counted(picture, *arguments, **options):
+        calls.append(picture)
+        if stopped and len(calls) == 3:
+            raise KeyboardInterrupt
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", counted)
+    stopped, parts, whole = False, tmp_path / f"parts.{kind}", tmp_path / f"whole.{kind}"
+    assert run("find", folder, "--out", whole)[0] == 0
+    calls.clear()
+    stopped = True
+    draw = ("--draw", "scanpath")
+    assert run("find", folder, "--out", parts, *draw)[0] == 130
+    stopped = False
+    calls.clear()
+    code, printed = run("find", folder, "--out", parts, *draw)
+    assert code == 0
+    assert calls == [str(folder / "c.png")]
+    assert "continuing: 2 of 3 pictures were looked at before" in printed.out
+    assert "3 pictures: 3 looked at" in printed.out
+    assert untimed(parts) == untimed(whole)
+    assert len(written_files(printed)) == 4  # the figures, too
+    assert {path.name for path in tmp_path.iterdir()} == {"my photo.png", "photos", "parts", parts.name, whole.name}
+
+
+def test_only_what_is_as_before_counts_as_finished(run, folder, tmp_path, agent, monkeypatch):
+    """With other options, and after a picture has changed, it is looked at again."""
+    find_all, calls = agent.find_all, []
+
+    def stopping(picture, *arguments, **options):
+        calls.append(picture)
+        if picture.endswith("c.png"):
+            raise KeyboardInterrupt
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", stopping)
+    command = ("find", folder, "--out", tmp_path / "boxes.json")
+    for more, seen in (((), "abc"), ((), "c"), (("--passes", 1), "abc"), (("--passes", 1, "--workers", 1), "c")):
+        calls.clear()
+        assert run(*command, *more)[0] == 130
+        assert [name[-5] for name in calls] == list(seen)
+    (folder / "a.png").write_bytes((folder / "b.png").read_bytes())
+    calls.clear()
+    assert run(*command, "--passes", 1)[0] == 130
+    assert [name[-5] for name in calls] == ["a", "c"]
+
+
+@pytest.mark.slow
+def test_processes_share_the_pictures_of_a_folder(folder, tmp_path, capsys):
+    from semfov.cli.main import main
+
+    detector = write_network(tmp_path / "colours.onnx")
+    (folder / "d.png").write_bytes(b"no picture")
+    common = ["find", str(folder), "--agent", "raw", "--detector", str(detector), "--how", "fovea", "--shifts", "2"]
+    for workers in ("1", "2"):
+        assert main([*common, "--workers", workers, "--out", str(tmp_path / f"{workers}.json")]) == 1
+        assert "4 pictures: 3 looked at; 1 skipped" in capsys.readouterr().out
+    assert untimed(tmp_path / "1.json") == untimed(tmp_path / "2.json")
 
 
 def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, evidence, tmp_path):

@@ -14,7 +14,7 @@ from semfov import Detections, Grid, Scanpath
 from semfov.decision import Decision
 from semfov.detection import Objects
 from semfov.paths import ZoomPath
-from semfov.report import Pool, write_page, zoom_data
+from semfov.report import write_page, zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, on_lattice
@@ -124,5 +124,5 @@ def large_picture() -> torch.Tensor:
 def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path: Path) -> Path:
     """The page of a large picture whose names are `hostile`."""
     settings = {"detector": {"name": hostile}}
-    data = zoom_data(zoom_path, large_picture, pool := Pool(), name=hostile, settings=settings)
-    return write_page(tmp_path / "large.html", hostile, [data], pool)
+    data = zoom_data(zoom_path, large_picture, name=hostile, settings=settings)
+    return write_page(tmp_path / "large.html", hostile, [data])

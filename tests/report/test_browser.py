@@ -11,7 +11,7 @@ from itertools import combinations
 
 import pytest
 
-from semfov.report import Pool, episode_data, write_page, zoom_data
+from semfov.report import episode_data, write_page, zoom_data
 from semfov.viz.style import overlay_colours
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
@@ -34,13 +34,12 @@ def chromium():
 
 @pytest.fixture
 def path(scanpath, image, hostile, tmp_path):
-    pool = Pool()
     views = [image * share for share in (0.3, 0.6, 0.9)]
     timed = replace(scanpath, seconds=tuple({"detect": 0.1 * number} for number in (1, 2, 3)))
     settings = {"sensor": {"sigma": 20, "reference": 640, "growth": 2}, "detector": {"name": "none"}}
     names = (hostile, "another")
-    episodes = [episode_data(timed, image, views, pool, name=name, settings=settings) for name in names]
-    return write_page(tmp_path / "page.html", f"search for {hostile}", episodes, pool)
+    episodes = [episode_data(timed, image, views, name=name, settings=settings) for name in names]
+    return write_page(tmp_path / "page.html", f"search for {hostile}", episodes)
 
 
 @pytest.fixture
@@ -262,7 +261,7 @@ def test_names_of_a_run_are_shown_and_not_run(chromium, run_page, hostile):
 def test_names_that_are_not_escaped_run(chromium, hostile, tmp_path):
     """Without this, the tests above could pass with harmless names."""
     page, told = watched(chromium)
-    page.goto(write_page(tmp_path / "page.html", "t", [], Pool(), sections=hostile).as_uri())
+    page.goto(write_page(tmp_path / "page.html", "t", [], sections=hostile).as_uri())
     assert told.count("dialog: taken") >= 2
     page.close()
 
@@ -321,11 +320,10 @@ def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
 
 
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
-    pool = Pool()
-    large = zoom_data(zoom_path, large_picture, pool, name="large.jpg")
-    small = episode_data(scanpath, image, [image] * 3, pool, name="small.jpg")
+    large = zoom_data(zoom_path, large_picture, name="large.jpg")
+    small = episode_data(scanpath, image, [image] * 3, name="small.jpg")
     page, told = watched(chromium)
-    page.goto(write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}], pool).as_uri())
+    page.goto(write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}]).as_uri())
     for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
         page.locator("#episode").select_option(index=number)
         assert page.locator(".large:visible > h3:first-child").all_inner_texts() == visible

@@ -12,18 +12,17 @@ from PIL import Image
 
 from semfov.decision import Decision
 from semfov.report.curves import curves_html, table_html
-from semfov.report.episode import Pool, episode_data
+from semfov.report.episode import episode_data
 from semfov.report.page import write_page
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
 @pytest.fixture
 def page(scanpath, image, hostile, tmp_path):
-    pool = Pool()
     timed = replace(scanpath, seconds=({"detect": 0.1, "choose": 0.001},) * 3)
-    data = episode_data(timed, image, [image * 0.5] * 3, pool, name=hostile)
+    data = episode_data(timed, image, [image * 0.5] * 3, name=hostile)
     sections = table_html([[hostile, "1"], [hostile, hostile]], hostile)
-    return write_page(tmp_path / "page.html", hostile, [data], pool, sections=sections).read_text(encoding="utf-8")
+    return write_page(tmp_path / "page.html", hostile, [data], sections=sections).read_text(encoding="utf-8")
 
 
 def decoded(data, *shape):
@@ -46,8 +45,8 @@ def test_names_are_never_interpreted_as_markup(kind, hostile, request):
 
 
 def test_names_are_not_interpreted_as_placeholders_of_the_template(scanpath, image, tmp_path):
-    data = episode_data(scanpath, image, [image] * 3, pool := Pool(), name="{{program}}")
-    page = write_page(tmp_path / "page.html", "{{data}}", [data], pool).read_text(encoding="utf-8")
+    data = episode_data(scanpath, image, [image] * 3, name="{{program}}")
+    page = write_page(tmp_path / "page.html", "{{data}}", [data]).read_text(encoding="utf-8")
     assert "<title>{{data}}</title>" in page
     assert data_of(page)["episodes"][0]["name"] == "{{program}}"
 
@@ -101,20 +100,20 @@ def test_the_page_contains_fixations_detections_and_pictures(page, scanpath, ima
 
 
 def test_an_episode_that_was_not_timed_has_no_times(scanpath, image):
-    data = episode_data(scanpath, image, [image] * 3, Pool(), name="replayed")
+    data = episode_data(scanpath, image, [image] * 3, name="replayed")
     assert [each["seconds"] for each in data["fixations"]] == [None] * 3
 
 
 def test_the_number_of_classes_can_be_limited(scanpath, image):
-    data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, Pool(), name="few", classes=1)
+    data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, name="few", classes=1)
     assert [each["label"] for each in data["maps"]] == [scanpath.classes[2], "background"]
 
 
 def test_values_that_are_not_finite_become_null(scanpath, image, tmp_path):
     values = scanpath.values.clone()
     values[0, 3] = -torch.inf
-    data = episode_data(replace(scanpath, values=values), image, [image] * 3, pool := Pool(), name="-inf")
-    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    data = episode_data(replace(scanpath, values=values), image, [image] * 3, name="-inf")
+    page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
     assert data_of(page)["episodes"][0]["fixations"][0]["values"][3] is None
 
 
@@ -142,15 +141,15 @@ def test_the_legend_of_many_curves_lists_only_some_of_them(hostile):
 def test_classes_of_the_same_name_have_separate_entries(scanpath, image):
     """A detector may use one name for several classes."""
     twins = replace(scanpath, classes=("background", "N/A", "cup", "N/A"))
-    data = episode_data(twins, image, [image] * 3, Pool(), name="twins")
+    data = episode_data(twins, image, [image] * 3, name="twins")
     labels = [each["label"] for each in data["maps"]]
     assert labels[0] == "cup"
     assert sorted(labels) == ["N/A", "N/A (2)", "background", "cup"]
 
 
 def test_a_page_without_pictures_says_so(scanpath, tmp_path):
-    data = episode_data(scanpath, None, None, pool := Pool(), name="in the dark")
-    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    data = episode_data(scanpath, None, None, name="in the dark")
+    page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
     assert data_of(page)["pictures"] == []
     assert "not recorded" in page
 
@@ -159,8 +158,8 @@ def test_the_head_shows_photograph_settings_and_outcome(scanpath, image, hostile
     """It is also shown without JavaScript."""
     settings = {"detector": {"name": hostile}, "sensor": {"sigma": 50.0, "reference": 640.0, "growth": 1.0}}
     decided = replace(scanpath, decision=Decision("found", 0.97, 6), ending="decision")
-    data = episode_data(decided, image, [image] * 3, pool := Pool(), name="a.jpg", settings=settings)
-    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    data = episode_data(decided, image, [image] * 3, name="a.jpg", settings=settings)
+    page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
     texts = Elements(page).texts
     assert {"a.jpg", hostile, "fovea of 50 px in 640, growth 1"} <= set(texts)
     (told,) = [text for text in texts if "found after" in text and "{" not in text]
@@ -173,13 +172,13 @@ def test_the_page_contains_the_outcome(scanpath, image):
     decision = Decision("found", 0.97, 6, torch.tensor([1.0, 2.0, 30.25, 40.0]))
     presence = torch.tensor([0.25, 0.5, 0.97])
     searched = replace(scanpath, decision=decision, ending="decision", presence=presence)
-    data = episode_data(searched, image, [image] * 3, Pool(), name="sought")
+    data = episode_data(searched, image, [image] * 3, name="sought")
     assert data["outcome"] == {"why": searched.why_it_ended(), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
     assert data["presence"] == [0.25, 0.5, 0.97]
     assert data["outcome"]["why"] != replace(searched, decision=Decision("absent", 0.1)).why_it_ended() != ""
     for ending in ("box", "worth", "shifts", "cells"):
         ended = replace(scanpath, ending=ending)
-        data = episode_data(ended, image, [image] * 3, Pool(), name="other")
+        data = episode_data(ended, image, [image] * 3, name="other")
         assert data["outcome"] == {"why": ended.why_it_ended(), "cell": None, "box": None}
         assert data["outcome"]["why"].endswith(".")
     assert replace(scanpath, ending=None).why_it_ended() == ""

@@ -13,7 +13,7 @@ from PIL import Image
 from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects
 from semfov.errors import InputError
-from semfov.report import Pool, episode_data, page_html, zoom_data
+from semfov.report import episode_data, page_html, zoom_data
 from semfov.report.zoom import LISTED, SHOWN
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
@@ -36,24 +36,24 @@ def test_the_page_loads_nothing_from_elsewhere(zoom_page):
 def test_pictures_are_in_the_markup_alone(zoom_page):
     page = zoom_page.read_text(encoding="utf-8")
     assert page.count("data:image/jpeg;base64,") == 4
-    assert data_of(page)["pictures"] == [None] * 4
+    assert data_of(page)["pictures"] == []
 
 
 def test_each_look_shows_the_pixels_of_its_window(zoom_path, large_picture):
-    data = zoom_data(zoom_path, large_picture, pool := Pool(), name="field")
+    data = zoom_data(zoom_path, large_picture, name="field")
     assert [look["box"] for look in data["looks"]] == [[0, 0, 400, 300], [0, 0, 200, 200], [200, 100, 400, 300]]
     for look in data["looks"]:
         x1, y1, x2, y2 = look["box"]
-        seen = pixels(pool.pictures[look["view"]])
+        seen = pixels(look["view"])
         # The resolution is that of the detector's input.
         assert seen.shape[1] == round((x2 - x1) * look["magnification"])
         assert seen[..., 0].mean() == pytest.approx((x1 + x2 - 1) / 2 / 399, abs=0.02)
         assert seen[..., 1].mean() == pytest.approx((y1 + y2 - 1) / 2 / 299, abs=0.02)
-    assert pixels(pool.pictures[data["image"]]).shape == (300, 400, 3)
+    assert pixels(data["image"]).shape == (300, 400, 3)
 
 
 def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, hostile):
-    shifted = zoom_data(zoom_path, large_picture, Pool(), name="field")["looks"]
+    shifted = zoom_data(zoom_path, large_picture, name="field")["looks"]
     for look, glance in zip(shifted, zoom_path.glances, strict=True):
         x1, y1 = look["box"][:2]
         (seen,) = look["detections"]
@@ -65,7 +65,7 @@ def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, host
         (hostile, 0.8),
         (hostile, 0.2),
     ]
-    explored = zoom_data(replace(zoom_path, target=None, decision=None), large_picture, Pool(), name="field")
+    explored = zoom_data(replace(zoom_path, target=None, decision=None), large_picture, name="field")
     assert explored["looks"][2]["detections"][0]["label"] == "cat"
 
 
@@ -88,7 +88,7 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
 
 
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
-    looks = zoom_data(zoom_path, large_picture, Pool(), name="field")["looks"]
+    looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
     assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]
     assert looks[0]["status"] == "Look 0 of 2, at the whole picture. Objects that it brought: none."
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
@@ -98,11 +98,11 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     path = replace(
         zoom_path, closer=(CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=2),), ending="decision"
     )
-    data = zoom_data(path, large_picture, pool := Pool(), name="field")
+    data = zoom_data(path, large_picture, name="field")
     assert data["decision"].endswith("0.93. A closer look confirmed the target.")
     assert [look["closer"] is None for look in data["looks"]] == [True, True, False]
     assert "It is a closer look: the target is there with a probability of 0.88." in data["looks"][2]["status"]
-    texts = " ".join(Elements(page_html("field", [data], pool)).texts)
+    texts = " ".join(Elements(page_html("field", [data])).texts)
     assert texts.count("Closer look probability 0.88 that the target is there") == 1
 
 
@@ -122,15 +122,14 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     data = zoom_data(
         replace(zoom_path, candidates=objects, decision=None, glances=glances),
         large_picture,
-        pool := Pool(),
         name="crowd",
     )
-    page = page_html("crowd", [data], pool)
+    page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
     assert f"<p>{many - SHOWN} less confident detections are left out.</p>" in page
     assert page.count("0.90</td>") == 1
     one = replace(zoom_path, decision=None, candidates=objects[torch.arange(LISTED + 1)])
-    page = page_html("crowd", [zoom_data(one, large_picture, pool := Pool(), name="crowd")], pool)
+    page = page_html("crowd", [zoom_data(one, large_picture, name="crowd")])
     assert "<p>1 less confident object is left out.</p>" in page
 
 
@@ -155,9 +154,9 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
 def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, ending, told):
     nothing = zoom_path.candidates.above(1)
     path = replace(zoom_path, target=1, decision=decision, candidates=nothing, ending=ending)
-    data = zoom_data(path, large_picture, pool := Pool(), name="field.png")
+    data = zoom_data(path, large_picture, name="field.png")
     assert re.search(told, data["decision"])
-    page = page_html("t", [data], pool)
+    page = page_html("t", [data])
     assert page.index(data["decision"]) < page.index("<main>")
     texts = Elements(page).texts
     assert {"field.png", "400 × 300 px", "windows of 100 × 100 px at magnifications 0.25, 0.5, 1"} <= set(texts)
@@ -166,15 +165,14 @@ def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, dec
 
 
 def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpath, image):
-    pool = Pool()
-    small = episode_data(scanpath, image, [image * 0.5] * 3, pool, name="small.jpg")
-    large = zoom_data(zoom_path, large_picture, pool, name="large.jpg")
+    small = episode_data(scanpath, image, [image * 0.5] * 3, name="small.jpg")
+    large = zoom_data(zoom_path, large_picture, name="large.jpg")
     for episodes in ([small, large], [large, small]):
-        page = page_html("both", episodes, pool)
+        page = page_html("both", episodes)
         elements = Elements(page)
         data = data_of(page)
         assert [each["name"] for each in data["episodes"]] == [each["name"] for each in episodes]
-        assert data["pictures"] == [*pool.pictures[:2], *[None] * 4]
+        assert data["pictures"] == [small["image"], small["fixations"][0]["view"]]
         assert len(elements.of("large")) == 1
         (views,) = [attributes for _, attributes in elements.found if attributes.get("id") == "episode-views"]
         assert "hidden" not in views
@@ -187,6 +185,6 @@ def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpat
 
 def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_picture):
     with pytest.raises(InputError, match="picture: expected the picture of the record, 400 × 300 px"):
-        zoom_data(zoom_path, large_picture[:, :200], Pool(), name="other")
+        zoom_data(zoom_path, large_picture[:, :200], name="other")
     with pytest.raises(InputError, match="at least one look"):
-        zoom_data(replace(zoom_path, glances=()), large_picture, Pool(), name="other")
+        zoom_data(replace(zoom_path, glances=()), large_picture, name="other")

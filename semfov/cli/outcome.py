@@ -1,0 +1,133 @@
+"""What is kept of a look at a picture: texts, rows of results, figures, and its part of a page."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
+from semfov.cli.results import kind_of, result_row
+from semfov.cli.sources import PictureSource
+from semfov.cli.text import looks_text, outcome_text
+from semfov.paths import GazeRecord, Scanpath, ZoomPath
+from semfov.report import episode_data, zoom_data
+from semfov.viz.animation import film_of
+from semfov.viz.belief import plot_belief_bars, plot_belief_strip
+from semfov.viz.scanpath import plot_foveated_strip, plot_scanpath
+from semfov.viz.semantic import plot_semantic_map
+from semfov.viz.style import save_figure
+
+
+@dataclass(frozen=True)
+class PictureOutcome:
+    """What is kept of a look at a picture; everything but the figures are JSON values.
+
+    Attributes:
+        ended: how it ended, for counting.
+        text: lines to print.
+        row: its part of the file of results (`semfov.cli.results.result_row`); None without such a file.
+        episode: its part of the page (`semfov.report`); None without a page.
+        names: names of the files of the figures.
+        figures: the files of the figures by name.
+    """
+
+    ended: str
+    text: str
+    row: dict[str, Any] | None = None
+    episode: dict[str, Any] | None = None
+    names: tuple[str, ...] = ()
+    figures: Mapping[str, bytes] = field(default_factory=dict)
+
+    def kept(self) -> dict[str, Any]:
+        """The JSON values, from which `PictureOutcome(**kept)` makes the outcome again without its figures."""
+        return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
+
+
+def drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
+    """The figures to draw: those that are named, or the usual ones if the output is a folder."""
+    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
+    return usual if options.draw is None else options.draw
+
+
+def picture_outcome(
+    record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
+) -> PictureOutcome:
+    """Make what the options ask for of a record.
+
+    Args:
+        record: the record.
+        source: the picture.
+        options: the options.
+        seconds: time that it took.
+        settings: settings of the eye (`Eye.settings`).
+
+    Returns:
+        The outcome.
+    """
+    drawings = drawings_of(options)
+    views: list[Tensor] = []
+    if isinstance(record, Scanpath) and (options.report or {"views", "animation"} & set(drawings)):
+        views = record.views()
+    text = outcome_text(record, source.name, seconds)
+    row = episode = None
+    if options.out is not None:
+        row = result_row(record, source.name, seconds, kind_of(options.out), source.file)
+    if options.report is not None:
+        name = Path(source.name).name
+        if isinstance(record, Scanpath):
+            episode = episode_data(record, record.image, views, name=name, boxes=source.boxes)
+        else:
+            # A scene has no more pixels than the record keeps.
+            whole = source.file if source.scene is None else source.scene.image
+            episode = zoom_data(record, whole if isinstance(record, ZoomPath) else None, name=name, settings=settings)
+    figures = draw_episode(record, source.boxes, views, drawings)
+    return PictureOutcome(
+        ended="looked at" if record.decision is None else record.decision.outcome,
+        text=f"{text}\n{looks_text(record)}" if options.looks else text,
+        row=row,
+        episode=episode,
+        names=tuple(figures),
+        figures=figures,
+    )
+
+
+def draw_episode(
+    record: GazeRecord, boxes: Tensor | None, views: list[Tensor], wanted: Sequence[Drawing]
+) -> dict[str, bytes]:
+    """Draw the wanted figures and the animation of an episode.
+
+    Args:
+        record: the record.
+        boxes: true boxes of the target, if they are known.
+        views: foveated views of a scanpath.
+        wanted: names of the figures; those that a record of this kind has not are left out.
+
+    Returns:
+        The files by name.
+    """
+    if not wanted:
+        return {}
+    figures: dict[str, Callable[[], Any]] = {"scanpath": record.plot}
+    if isinstance(record, Scanpath):
+        figures["scanpath"] = lambda: plot_scanpath(record, boxes=boxes)
+        figures["views"] = lambda: plot_foveated_strip(record, views)
+        if record.target is not None:
+            figures["belief"] = lambda: plot_belief_strip(record)
+            figures["belief_bars"] = lambda: plot_belief_bars(record)
+        else:
+            figures["map"] = lambda: plot_semantic_map(record)
+    names = ["map" if name == "belief" and "map" in figures else name for name in wanted]
+    with tempfile.TemporaryDirectory() as folder:
+        drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
+        if "animation" in wanted:
+            path = Path(folder) / "animation.gif"
+            if isinstance(record, Scanpath):
+                drawn += film_of(record, views=views, boxes=boxes).save(path)
+            else:
+                drawn.append(Path(record.animate(path)))
+        return {path.name: path.read_bytes() for path in drawn}

@@ -1,0 +1,93 @@
+"""Pictures that a command names: files, those of folders, or an embedded scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from semfov.agent import ActivePerception, How, PictureLike
+from semfov.belief.grid import Grid
+from semfov.data.large import picture_size
+from semfov.data.sources import Picture, is_video, picture_files
+from semfov.errors import check
+from semfov.head import Flat, Panorama
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """A picture to look at.
+
+    Attributes:
+        name: its name in texts.
+        file: its file; None for an embedded scene.
+        scene: the embedded scene.
+    """
+
+    name: str
+    file: Path | None = None
+    scene: Picture | None = None
+
+    @property
+    def boxes(self) -> Tensor | None:
+        """True boxes of the target in an embedded scene."""
+        return None if self.scene is None else self.scene.boxes
+
+    def opened(self, how: How) -> PictureLike:
+        """The picture, or for a head the scene that it is a picture of."""
+        picture = str(self.file) if self.scene is None else self.scene.image
+        if how != "head":
+            return picture
+        width, height = picture_size(picture)
+        return Panorama(picture) if width == 2 * height else Flat(picture)
+
+    def version(self) -> list[object]:
+        """What changes with the file: its name, size and time of change."""
+        if self.file is None:
+            return [self.name]
+        told = self.file.stat()
+        return [str(self.file.resolve()), told.st_size, told.st_mtime_ns]
+
+
+def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
+    """The pictures that are named, those of folders in the order of their names.
+
+    Args:
+        pictures: files and folders.
+
+    Returns:
+        The pictures; none stands for an embedded scene.
+
+    Raises:
+        InputError: one is a video or an address.
+        DataError: one does not exist, or a folder has no pictures.
+    """
+    found: list[PictureSource] = []
+    for name in pictures:
+        path = Path(name)
+        check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
+        check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
+        found += [PictureSource(str(each), each) for each in picture_files(path)]
+    return found
+
+
+def start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
+    """A random first cell off the target of an embedded scene; None for other pictures.
+
+    Args:
+        agent: the agent.
+        source: the picture.
+        seed: seed of the draw.
+
+    Returns:
+        The number of the cell.
+    """
+    if source.scene is None or source.boxes is None:
+        return None
+    grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))
+    free = (~grid.footprint(source.boxes).any(0)).nonzero()[:, 0]
+    generator = torch.Generator().manual_seed(seed)
+    return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
