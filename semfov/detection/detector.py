@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -39,6 +40,7 @@ class Detector(nn.Module, ABC):
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
         faint: confidence from which on a candidate is a hint of where to zoom in (`semfov.zoom.hints`).
+        least: score from which on a detection counts: two of three are right.
         digest: sha256 of the weights, `""` for random weights.
 
     A detector that proposes the whole canvas as one box:
@@ -66,6 +68,7 @@ class Detector(nn.Module, ABC):
         stride: int | None = None,
         stretch: bool = False,
         faint: float = FAINT,
+        least: float = LEAST,
         digest: str = "",
     ) -> None:
         super().__init__()
@@ -81,7 +84,7 @@ class Detector(nn.Module, ABC):
         self.fill = fill
         self.stride = stride
         self.stretch = stretch
-        self.faint = faint
+        self.faint, self.least = faint, least
         self.digest = digest
 
     @abstractmethod

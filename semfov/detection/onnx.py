@@ -81,6 +81,7 @@ class OnnxDetector(Detector):
             stride=stride,
             stretch=preprocessing.stretch,
             faint=family.faint,
+            least=family.least,
             digest=digest,
         )
         fixed = None not in session.shape[2:]

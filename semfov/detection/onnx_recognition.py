@@ -8,6 +8,7 @@ from torch import Tensor
 
 from semfov.detection import onnx_heads as heads
 from semfov.detection.detector import FAINT
+from semfov.detection.objects import LEAST
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import InputError
@@ -34,12 +35,14 @@ class DetectionHead:
         preprocessing: preprocessing with which the family is trained.
         background: background policy for its scores.
         faint: confidence from which on its candidates are hints (`semfov.detection.Detector`).
+        least: score from which on its detections count.
     """
 
     decode: Callable[[Outputs, Canvas], Candidates]
     preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
     faint: float = FAINT
+    least: float = LEAST
 
 
 @dataclass(frozen=True)
@@ -217,7 +220,7 @@ HEADS: dict[str, DetectionHead] = {
     "nanodet": DetectionHead(_level_maps, _NANODET),
     # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
     # some score, which would dilute that of the best one if only their shares counted.
-    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02),
+    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
     "detr": DetectionHead(
         lambda outputs, canvas: heads.decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
