@@ -121,7 +121,7 @@ class Example:
         """The photograph at its own resolution, through a named sensor, `(3, H, W)`."""
         fovea = named_sensor(sensor)
         state = fovea.open(self.image[None], torch.full((2,), max(self.frame) / self.eye.reference))
-        return fovea.look(state, fixation[None])[0]
+        return fovea.picture(state, fixation[None])[0]
 
     def pictures(self, rows: int, columns: int, width: float) -> tuple[Figure, list[Axes]]:
         """A figure with places for the photograph, each `width` inches wide."""
@@ -287,7 +287,7 @@ def saliency_example(example: Example) -> Figure:
     state, points = seen_by(example.eye.sensor, example.eye.reference, example.image, grid.centres)
     visited, cells = torch.zeros(1, len(grid), dtype=torch.bool), [int(example.scanpath.cells[0])]
     for _ in range(LOOKS):
-        view = example.eye.sensor.look(state, points[cells[-1]][None])
+        view = example.eye.sensor.picture(state, points[cells[-1]][None])
         saliency = model(view)
         visited[0, cells[-1]] = True
         values = cell_saliency(saliency, grid.columns, grid.rows, reduction)

@@ -7,9 +7,10 @@ from typing import Any
 from torch import Tensor, nn
 
 from semfov.data.inputs import ImageLike, PointLike, as_image, as_points
+from semfov.detection.crops import merge_crops
 from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
-from semfov.detection.placement import Placement
+from semfov.detection.detector import Detector, check_images
+from semfov.detection.placement import Placement, letterbox
 from semfov.errors import check, check_shape
 from semfov.sensor.base import Sensor
 from semfov.sensor.glimpse import glimpse, window_around
@@ -38,8 +39,8 @@ class Eye(nn.Module):
     settings of the sensor are scaled from an image whose longer side is `reference` to the canvas.
 
     Args:
-        sensor: `Foveation`, `LogPolar` or any other `semfov.sensor.Sensor`, with settings in pixels of an image whose
-            longer side is `reference`.
+        sensor: `Foveation`, `LogPolar`, `MultiScaleFovea` or any other `semfov.sensor.Sensor`, with settings in pixels
+            of an image whose longer side is `reference`.
         detector: any detector.
         reference: longer side, in pixels, of the image that the settings of the sensor are for; 640 for those of
             `semfov.sensor.SENSORS`.
@@ -77,9 +78,24 @@ class Eye(nn.Module):
         if not (isinstance(image, Tensor) and image.ndim == 4 and image.is_floating_point()):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
-        canvas, placement = self.detector.fit(image)
+        canvas, placement = self.fit(image)
         scale = canvas.new_tensor(placement.scale) * (max(placement.size) / self.reference)
         return View(canvas, placement, self.sensor.open(canvas, scale))
+
+    def fit(self, image: Tensor) -> tuple[Tensor, Placement]:
+        """Fit an image into the canvas of the sensor, which is the detector's input unless the sensor says otherwise.
+
+        Args:
+            image: `(1, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            The canvas `(1, 3, h, w)`, and the placement of the image on it.
+        """
+        size = self.sensor.canvas_size((image.shape[-1], image.shape[-2]), self.reference)
+        if size is None:
+            return self.detector.fit(image)
+        check_images(image)
+        return letterbox(image, size, stretch=True)
 
     def foveated(self, view: View, fixations: PointLike) -> Tensor:
         """Apply the sensor at fixations.
@@ -89,12 +105,27 @@ class Eye(nn.Module):
             fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
 
         Returns:
-            `(F, 3, h, w)`, one canvas for each fixation.
+            `(F, 3, h, w)`, one canvas for each fixation; `(F·L, 3, h, w)` of a sensor with L crops.
 
         Raises:
             InputError: the shape of `fixations` is wrong.
         """
         return self.sensor.look(view.state, view.placement.points_to_canvas(_points(fixations, view)))
+
+    def pictures(self, view: View, fixations: PointLike) -> Tensor:
+        """Compute what is seen from fixations as pictures of the canvas, for figures and environments.
+
+        Args:
+            view: the opened image.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+
+        Returns:
+            `(F, 3, h, w)`, one for each fixation.
+
+        Raises:
+            InputError: the shape of `fixations` is wrong.
+        """
+        return self.sensor.picture(view.state, view.placement.points_to_canvas(_points(fixations, view)))
 
     def detect(self, view: View, fixations: Tensor, canvases: Tensor) -> Detections:
         """Detect objects in foveated canvases.
@@ -102,14 +133,23 @@ class Eye(nn.Module):
         Args:
             view: the opened image.
             fixations: `(F, 2)`, as `(x, y)` in pixels of the image.
-            canvases: `(F, 3, h, w)`, from `foveated`.
+            canvases: `(F, 3, h, w)` or `(F·L, 3, h, w)`, from `foveated`.
 
         Returns:
-            The detections, a batch of F, boxes in pixels of the image.
+            The detections, a batch of F, boxes in pixels of the image. Those of several crops are merged by
+            `semfov.detection.crops.merge_crops`.
         """
         gaze = view.placement.points_to_canvas(fixations)
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
-        return self.detector.detect(canvases, view.placement, back=back)
+        if self.sensor.crops == 1:
+            return self.detector.detect(canvases, view.placement, back=back)
+        seen = self.detector.detect(canvases)
+        height, width = canvases.shape[-2:]
+        frame = seen.boxes.new_tensor([0, 0, width, height]).expand(len(canvases), 1, 4)
+        size = view.canvas.shape[-1], view.canvas.shape[-2]
+        seen = replace(seen, boxes=back(seen.boxes))
+        found = merge_crops(seen, back(frame)[:, 0], self.sensor.crops, width, size, self.detector.selection.limit)
+        return replace(found, boxes=view.placement.boxes_to_image(found.boxes))
 
     def look(self, view: View, fixations: PointLike) -> Detections:
         """Look from fixations: apply the sensor, then detect.

@@ -194,6 +194,52 @@ KNOWN = {
 """Numbers that no table has, each with the reason; those that are settings are written here by the code."""
 
 
+_SMALL = "(?:one|two|three|four|five|six|seven|eight|nine|ten)"
+IN_WORDS = re.compile(
+    r"(?:more|less|fewer) than half\b"
+    r"|\b(?:about|almost|nearly|only) (?:half|a third|a quarter|a fifth|a tenth|twice)\b"
+    r"|\b(?:two thirds|three quarters|a third|a quarter|a fifth|a tenth) of\b"
+    rf"|\b{_SMALL} (?:in|of|out of) {_SMALL}\b"
+    rf"|\b{_SMALL} times as (?:many|much|long|fine|often|fast)\b",
+    re.IGNORECASE,
+)
+"""Shares and ratios in words."""
+
+SHARES = {
+    "docs/results.md": {
+        "more than half of the detections": (_OBJECTS[-1], _DETECTIONS[-1]),
+        "one in ten at the fovea": (_OBJECTS[0], _DETECTIONS[0]),
+        "about half of val2017": "2,693 of 5,000 photographs, in the annotations of COCO",
+    },
+    "docs/detectors.md": {
+        "One in five photographs is held out": "a rule",
+        "one in three if there are fewer": "a rule",
+    },
+    "docs/words.md": {"a tenth of the gain": ("0.023", "0.217")},
+    "docs/decisions/closer_looks.md": {
+        "a third of the photograph": "a setting",
+        "a third of the window": "it follows from the setting",
+    },
+    "docs/sensors.md": {
+        "a fifth of the picture": ("142.3", 640),
+        "almost nine times as fine": ("166.0", "19.0"),
+        "a fifth of the pixels": (_RINGS * _WEDGES, 640 * 480),
+        "almost twice as many objects": ("0.312", "0.159"),
+    },
+    "docs/pan-tilt.md": {"a tenth of its field of view": "a rule"},
+    "docs/guides/live.md": {"three quarters of its width": "how the videos were made", "four times as long": "a rule"},
+    "docs/measurements/human.md": {
+        "a fifth of the NSS difference": ("0.365", "1.739"),
+        "a quarter together with VOCUS2": ("0.446", "1.739"),
+    },
+    "docs/measurements/words.md": {"a tenth of the gain": ("0.023", "0.217"), "A tenth of the weights": "a setting"},
+    "docs/measurements/zoom.md": {"One of four boxes": ("0.250", 1)},
+}
+"""What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""
+
+VALUES = {"half": 0.5, "third": 1 / 3, "quarter": 0.25, "quarters": 0.75, "fifth": 0.2, "tenth": 0.1, "twice": 2}
+
+
 @cache
 def text_of(page):
     return (ROOT / page).read_text(encoding="utf-8")
@@ -365,6 +411,33 @@ def test_every_number_of_a_sentence_is_in_a_table_or_has_a_reason(page):
     lost = numbers_without_a_table(page)
     told = "\n".join(f"  {numbers}: {sentence}" for numbers, sentence in lost)
     assert not lost, f"{page}: numbers that no table of the page or of a linked page has:\n{told}"
+
+
+def in_words(text):
+    """The value of a share or ratio in words, such as 0.9 of `nine in ten`."""
+    said = text.lower().split()
+    named = next((VALUES[word] for word in said if word in VALUES), None)
+    counts = [IN_DIGITS[word] for word in said if word in NUMERALS]
+    return named if named is not None else counts[0] / counts[1] if len(counts) == 2 else counts[0]
+
+
+@pytest.mark.parametrize("page", STRICT + OTHERS)
+def test_every_share_in_words_is_that_of_its_numbers_or_has_a_reason(page):
+    plain = " ".join(" ".join(HIDDEN.sub(" ", paragraph).split()) for paragraph in paragraphs(page))
+    listed = SHARES.get(page, {})
+    assert [phrase for phrase in listed if phrase not in plain] == []
+    for phrase, made_of in listed.items():
+        if isinstance(made_of, str):
+            continue
+        tables = [text_of(name) for name in (page, *COMPANIONS.get(page, []))]
+        told = [number for number in made_of if isinstance(number, str)]
+        assert all(any(number in text for text in tables) for number in told), phrase
+        share = float(made_of[0]) / float(made_of[1])
+        assert share == pytest.approx(in_words(phrase), rel=0.15), phrase
+    rest = plain
+    for phrase in listed:
+        rest = rest.replace(phrase, " ")
+    assert IN_WORDS.findall(rest) == []
 
 
 @pytest.mark.parametrize("page", KNOWN)

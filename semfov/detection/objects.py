@@ -183,14 +183,45 @@ def merge_looks(
         Objects, most confident first.
     """
     enough = (scores >= score).nonzero()[:, 0]
+    parts = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
+    kept = enough[unlike(*parts, iou=iou, inside=inside, around=around)]
+    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept])
+
+
+def unlike(
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    looks: Tensor,
+    cut: Tensor,
+    sharpness: Tensor,
+    *,
+    iou: float = 0.5,
+    inside: float = 0.8,
+    around: float | None = None,
+) -> Tensor:
+    """One box of each object, by the rule of `merge_looks`.
+
+    Args:
+        boxes: `(M, 4)`, in picture pixels.
+        scores: `(M,)`, scores.
+        labels: `(M,)`, classes.
+        looks: `(M,)`, number of the look of each box.
+        cut: `(M,)`, boolean, boxes that the border of their look cuts.
+        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+        around: width of a picture whose left and right borders meet; None for others.
+
+    Returns:
+        Indices of the boxes, most confident first.
+    """
     # Stable sorts, the last key first.
-    order = enough[scores[enough].argsort(descending=True, stable=True)]
+    order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    box, value, label, cut, number = boxes[order], scores[order], labels[order], cut[order], looks[order]
-    kept = _unlike(box, label, cut, number, iou, inside, around)
-    kept = kept[value[kept].argsort(descending=True, stable=True)]
-    return Objects(box[kept], value[kept], label[kept], number[kept])
+    kept = order[_unlike(boxes[order], labels[order], cut[order], looks[order], iou, inside, around)]
+    return kept[scores[kept].argsort(descending=True, stable=True)]
 
 
 def _unlike(

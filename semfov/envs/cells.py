@@ -185,7 +185,7 @@ class CellGazes(Gazes):
         left, top = view.placement.offset
         wide, high = (round(n * s) for n, s in zip(view.placement.size, view.placement.scale, strict=True))
         point = self.points(torch.tensor([row]))
-        return self.scenery.eye.foveated(view, point)[..., top : top + high, left : left + wide]
+        return self.scenery.eye.pictures(view, point)[..., top : top + high, left : left + wide]
 
     def _all_or(self, rows: Tensor) -> Belief:
         """The belief of some rows, without a copy where these are all."""

@@ -57,7 +57,7 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
         fixations: random fixations in each photograph, or windows of a mosaic at each magnification.
         levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
         width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
-            with the fovea.
+            with the fovea. A sensor with steps of acuity has its own levels, one for each step.
         minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
             (0: no level does).
         shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
@@ -95,6 +95,10 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
         """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
         if self.mosaics:
             return [n - 0.5 for n in range(1, self.levels)]
+        own = self.sensor.kind.borders(self.sensor.whole())
+        if own is not None:
+            # Farther away than the longer side there is hardly anything.
+            return [edge / self.sensor.reference for edge in own if edge < self.sensor.reference]
         step = self.width / 100.0 * self.sensor.fovea
         return [step * n for n in range(1, self.levels)]
 

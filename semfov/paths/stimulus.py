@@ -24,9 +24,9 @@ LONGEST = 1280
 class Stimulus:
     """A photograph for figures, and the canvas from which foveated views are made, both as bytes.
 
-    The canvas is the photograph fitted into the detector's input. A view is computed on request, by applying the
-    sensor of the eye to the canvas. A stimulus from a file has no sensor, so the sensor is made from its settings
-    (`sensor_of`).
+    The canvas is the photograph fitted into the detector's input, or into the canvas of the sensor. A view is computed
+    on request, by applying the sensor of the eye to the canvas. A stimulus from a file has no sensor, so the sensor is
+    made from its settings (`sensor_of`).
 
     Attributes:
         photograph: `(3, h, w)` uint8, RGB, longer side at most `LONGEST` pixels.
@@ -64,7 +64,7 @@ class Stimulus:
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
-            canvas, placement = eye.detector.fit(image)
+            canvas, placement = eye.fit(image)
             return cls(reduced_copy(image[0]), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
 
     @classmethod
@@ -107,7 +107,7 @@ class Stimulus:
     def views(self, fixations: Tensor) -> list[Tensor]:
         """Foveated views of the photograph, as the detector received them, without the border of the canvas.
 
-        They equal the result of `Eye.foveated` up to the rounding to bytes.
+        They equal the result of `Eye.pictures` up to the rounding to bytes.
 
         Args:
             fixations: `(n, 2)`, as `(x, y)` in pixels of the image.
@@ -132,7 +132,7 @@ class Stimulus:
             state = sensor.open(canvas, canvas.new_tensor(self.placement.scale) * larger)
             # One at a time: all views of a large canvas at once would take gigabytes.
             for point in self.placement.points_to_canvas(fixations.to(canvas)):
-                view = sensor.look(state, point[None])[0]
+                view = sensor.picture(state, point[None])[0]
                 yield view[:, top : top + height, left : left + width].float().cpu().clone()
 
 

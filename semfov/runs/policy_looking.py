@@ -78,6 +78,8 @@ class PolicyLooking(Looking):
 
     def attention(self, index: int) -> Tensor:
         """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""
+        crops = self.eye.sensor.crops
+        check(crops == 1, "sensor", "one view in a look, from which class templates are computed", f"{crops} crops")
         templates, found = self.models.templates, []
         assert templates is not None
         with one_thread(), torch.inference_mode():

@@ -105,7 +105,7 @@ def saliency_table(
         state, fixations = seen_by(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
         return torch.cat(
-            [saliency_of_cells(model, sensor.look(state, point[None]), grid, saliency) for point in fixations]
+            [saliency_of_cells(model, sensor.picture(state, point[None]), grid, saliency) for point in fixations]
         )
 
 

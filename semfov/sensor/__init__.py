@@ -6,6 +6,7 @@ from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation, foveate
 from semfov.sensor.glimpse import Glimpse, glimpse
 from semfov.sensor.log_polar import LogPolar, from_log_polar, log_polar
+from semfov.sensor.multi_scale import MultiScaleFovea
 from semfov.sensor.named import SENSORS, NamedSensor, named_sensor, sensor_of
 from semfov.sensor.perspective import Perspective, perspective
 from semfov.sensor.pyramid import Bands, gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
@@ -21,6 +22,7 @@ __all__ = [
     "Foveation",
     "Glimpse",
     "LogPolar",
+    "MultiScaleFovea",
     "NamedSensor",
     "Perspective",
     "RandomFoveation",

@@ -17,6 +17,10 @@ class Sensor(nn.Module, ABC):
     on the fixation, once for each image. `look` computes the views for many fixations. Where a sensor moves pixels, as
     a magnifying glass does, `boxes_to_canvas` maps the boxes that the detector found in a view back to the canvas.
 
+    A sensor may show several crops in a look, as `MultiScaleFovea` does. It then says how many `crops` there are, and
+    `picture` composes them into one picture. One that reads the picture at another resolution than the detector's input
+    gives the `canvas_size`.
+
     A sensor that commands can select by name (`semfov.sensor.SENSORS`) also has a `kind` and the `names` of its
     settings, from which it can be made again. If its acuity falls off from a fovea, it tells the `width` of that.
 
@@ -74,8 +78,38 @@ class Sensor(nn.Module, ABC):
             gaze: fixations `(F, 2)`, `(x, y)` in pixels of the canvas, inside or outside.
 
         Returns:
-            Views `(F, 3, h, w)` for the detector.
+            Views `(F, 3, h, w)` for the detector; `(F·L, 3, h, w)` of a sensor with L crops, those of a fixation
+            together, the finest first.
         """
+
+    @property
+    def crops(self) -> int:
+        """Number of views of a fixation, each of which the detector sees as a picture of its own."""
+        return 1
+
+    def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int] | None:
+        """Tell the size of the canvas that the sensor takes.
+
+        Args:
+            size: `(width, height)` of the picture.
+            reference: longer side of the image that the sensor's settings are for.
+
+        Returns:
+            `(width, height)`, to which the picture is stretched; None for the detector's input.
+        """
+        return None
+
+    def picture(self, state: Any, gaze: Tensor) -> Tensor:
+        """Compute the views as pictures of the canvas, for figures, saliency and environments.
+
+        Args:
+            state: the canvas as `open` prepared it.
+            gaze: fixations `(F, 2)`.
+
+        Returns:
+            `(F, 3, H, W)`.
+        """
+        return self.look(state, gaze)
 
     def boxes_to_canvas(self, state: Any, gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes from the views to the canvas; they stay as they are unless the sensor moves pixels.
@@ -83,10 +117,10 @@ class Sensor(nn.Module, ABC):
         Args:
             state: the canvas as `open` prepared it.
             gaze: fixations `(F, 2)`.
-            boxes: boxes `(F, N, 4)` in pixels of the views.
+            boxes: boxes `(F, N, 4)` in pixels of the views; `(F·L, N, 4)` of a sensor with L crops.
 
         Returns:
-            Boxes `(F, N, 4)` in pixels of the canvas.
+            The boxes in pixels of the canvas.
         """
         return boxes
 
@@ -129,6 +163,18 @@ class Sensor(nn.Module, ABC):
             InputError: the sensor has no fovea.
         """
         raise InputError(f"sensor: expected a sensor with a fovea, got {cls.__name__}, which has none")
+
+    @classmethod
+    def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:
+        """List the distances from the fixation at which acuity changes, of a sensor with steps of acuity.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            Ascending distances in pixels of the image that the settings are for; None for a sensor without steps.
+        """
+        return None
 
     @classmethod
     def describe(cls, settings: Mapping[str, Any]) -> str:

@@ -8,8 +8,9 @@ from semfov.errors import InputError, check, lookup
 from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.log_polar import LogPolar
+from semfov.sensor.multi_scale import MultiScaleFovea
 
-SensorName = Literal["published", "published-narrow", "gradual", "log-polar"]
+SensorName = Literal["published", "published-narrow", "gradual", "log-polar", "multi-scale"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ SENSORS: dict[SensorName, NamedSensor] = {
     "published-narrow": _foveation(50.0, 1.0, published=True),
     "gradual": _foveation(100.0, 2.0),
     "log-polar": NamedSensor(LogPolar, {"fovea": 60.0, "spacing": 1.0, "pooling": 1.0}),
+    "multi-scale": NamedSensor(MultiScaleFovea, {"side": 160, "scales": 4}),
 }
 """The named sensors; lengths are in pixels of an image whose longer side is 640.
 
@@ -67,6 +69,8 @@ SENSORS: dict[SensorName, NamedSensor] = {
 - `gradual`: the window of each coarser band is twice as wide, so that acuity falls off slowly. The recommended agent
   has this sensor.
 - `log-polar`: receptors on rings, further apart with eccentricity. No models are shipped for it.
+- `multi-scale`: four square crops of 160, 320, 640 and 1280 px, each of which the detector sees at 160 × 160 px, as in
+  SemBA. No models are shipped for it.
 """
 
 

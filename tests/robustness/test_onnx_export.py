@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from semfov import DirichletBelief, FovealObservationModel, Foveation, Grid, acquisition, fusion
 from semfov.gaze import select_fixation
 from semfov.observation import FoldedObservationModel
-from semfov.sensor import LogPolar
+from semfov.sensor import LogPolar, MultiScaleFovea
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript", reason="torch exports ONNX with it")
@@ -60,7 +60,10 @@ def seeded(*shape: int) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(len(shape)))
 
 
-@pytest.mark.parametrize(("sensor", "tolerance"), [(Foveation(15.0, levels=3), 2e-6), (LogPolar(15.0), 2e-4)])
+@pytest.mark.parametrize(
+    ("sensor", "tolerance"),
+    [(Foveation(15.0, levels=3), 2e-6), (LogPolar(15.0), 2e-4), (MultiScaleFovea(16, 3), 2e-6)],
+)
 def test_exported_sensor_equals_torch(sensor, tolerance, tmp_path):
     inputs = seeded(1, 3, 48, 64), torch.tensor([[40.2, 30.5]])
     (view,) = run(sensor.eval(), inputs, tmp_path / "sensor.onnx")

@@ -2,7 +2,7 @@
 
 import torch
 
-from semfov.sensor import Foveation, Glimpse, LogPolar, Perspective, RandomFoveation
+from semfov.sensor import Foveation, Glimpse, LogPolar, MultiScaleFovea, Perspective, RandomFoveation
 from tests.base_tester import GraphTester, TensorTester
 from tests.small import rand
 
@@ -35,6 +35,17 @@ class TestLogPolar(GraphTester):
 
     def make(self):
         return LogPolar(9.0)
+
+    def inputs(self):
+        return rand(2, 3, 48, 64), GAZES
+
+
+class TestMultiScaleFovea(GraphTester):
+    batched = (0, 1)
+    differentiable = (0, 1)
+
+    def make(self):
+        return MultiScaleFovea(16, 3)
 
     def inputs(self):
         return rand(2, 3, 48, 64), GAZES

@@ -79,7 +79,9 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
     with pytest.raises(InputError, match="a sensor with a fovea, got Dimmed, which has none"):
         config.fovea  # noqa: B018
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"the settings of a Foveation or a LogPolar, got \{'kind': 'dimmed'"):
+    with pytest.raises(
+        InputError, match=r"the settings of a Foveation or a LogPolar or a MultiScaleFovea, got \{'kind': 'dimmed'"
+    ):
         sensor_of({"kind": "dimmed", "share": 0.5})
 
 
@@ -131,6 +133,17 @@ def test_an_observation_model_is_fitted_and_used(home):
     assert model.edges.tolist() == pytest.approx([0.5 * 60 / 640, 60 / 640])
     chosen = "--belief.model", str(home / "fom/colours.safetensors")
     assert search(searching(home, "calibrated", ["predictive-calibrated"], *chosen)) == 0
+
+
+def test_the_levels_of_a_multi_scale_fovea_are_its_scales(home):
+    network = ["--detector.name", str(home / "colours.onnx")]
+    crops = ["--sensor.name", "multi-scale", "--sensor.settings.side", "64", "--sensor.settings.scales", "3"]
+    assert fit_fom(given(home, "scales", *network, *crops, "--fixations", "2", "--holdout", "4")) == 0
+    model = FovealObservationModel.from_pretrained(home / "scales/colours.safetensors")
+    assert model.metadata["sensor"] == {"kind": "multi-scale", "side": 64, "scales": 3, "reference": 640}
+    assert model.edges.tolist() == pytest.approx([32 / 640, 64 / 640, 128 / 640])
+    chosen = "--belief.model", str(home / "scales/colours.safetensors")
+    assert search(searching(home, "by_scales", ["predictive-calibrated", "vocus2"], *crops, *chosen)) == 0
 
 
 def test_a_folder_of_models_keeps_its_sensor(home, tmp_path):

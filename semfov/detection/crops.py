@@ -1,0 +1,66 @@
+"""Detections in several crops of a picture around one point, merged into one set."""
+
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.detection.objects import unlike
+
+_BORDER = 2.0
+"""Boxes that come this near to a border of their crop, in the detector's pixels, are cut by it."""
+
+
+def merge_crops(
+    seen: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
+) -> Detections:
+    """Merge the detections in the crops of each fixation.
+
+    A crop shows its inside more sharply than every wider crop. So a box that lies in a finer crop, without being cut
+    by its border, is left out of the wider ones, whether the finer crop has a box there or not. Of the others, two
+    boxes of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole
+    box is kept rather than a cut one, and otherwise the one in the finer crop.
+
+    Args:
+        seen: detections in the crops, a batch of F·L, boxes in pixels of the picture.
+        windows: `(F·L, 4)`, the squares that the crops show, in pixels of the picture; finest first.
+        crops: number of crops of a fixation, L.
+        side: side of a crop in the detector's pixels.
+        size: `(width, height)` of the picture, whose border cuts no object.
+        limit: largest number of boxes of a fixation.
+
+    Returns:
+        A batch of F, boxes cut to the picture.
+
+    >>> boxes = torch.tensor([[[6.0, 6, 14, 14]], [[6.0, 6, 14, 15]]])
+    >>> seen = Detections(boxes, torch.tensor([[[0.2, 0.8]], [[0.1, 0.9]]]), torch.ones(2, 1, dtype=torch.bool))
+    >>> windows = torch.tensor([[2.0, 2, 18, 18], [-6, -6, 26, 26]])
+    >>> merge_crops(seen, windows, 2, 16, (40, 40), 100).boxes
+    tensor([[[ 6.,  6., 14., 14.]]])
+    """
+    found = []
+    for first in range(0, len(seen.mask), crops):
+        rows = slice(first, first + crops)
+        number, row = seen.mask[rows].nonzero(as_tuple=True)
+        boxes, scores, window = seen.boxes[rows][number, row], seen.scores[rows][number, row], windows[rows]
+        limits = boxes.new_tensor([*size, *size], dtype=boxes.dtype)
+        boxes = torch.minimum(boxes.clamp(min=0), limits)
+        own = boxes.detach()
+        whole = _whole(own, window, limits[:2], side)
+        sharper = torch.arange(crops, device=number.device) < number[:, None]
+        left = (own[:, 2:] > own[:, :2]).all(-1) & ~(whole & sharper).any(-1)
+        index = left.nonzero()[:, 0]
+        value, label = scores[index, 1:].detach().max(-1)
+        cut = ~whole[index, number[index]]
+        parts = (own[index], value, label, number[index], cut, -number[index])
+        kept = index[unlike(*(part.cpu() for part in parts))[:limit].to(index)]
+        found.append(Detections(boxes[kept][None], scores[kept][None], torch.ones_like(kept, dtype=torch.bool)[None]))
+    return found[0] if len(found) == 1 else Detections.stack(found)
+
+
+def _whole(boxes: Tensor, windows: Tensor, size: Tensor, side: int) -> Tensor:
+    """Tell which boxes `(N, 4)` are whole in which of the crops `(L, 4)`, `(N, L)`."""
+    low, high = windows[:, :2], windows[:, 2:]
+    border = _BORDER * (high - low) / side
+    near = torch.where(low > 0, low + border, -torch.inf)
+    far = torch.where(high < size, high - border, torch.inf)
+    return ((boxes[:, None, :2] > near) & (boxes[:, None, 2:] < far)).all(-1)

@@ -1,0 +1,206 @@
+"""The multi-scale fovea: square crops around the fixation, each twice as wide as the one before, all of one size."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape, check_whole
+from semfov.sensor.base import Sensor, fixations
+from semfov.sensor.glimpse import windows_at
+
+Planes = tuple[Tensor, ...]
+"""Planes of all squares of 2^l pixels that touch an image, with a black border, finest scale first."""
+
+
+@dataclass(frozen=True)
+class MultiScaleCanvas:
+    """A canvas that `MultiScaleFovea.open` has prepared.
+
+    Attributes:
+        means: means of squares at every scale.
+        size: `(width, height)` of the canvas.
+    """
+
+    means: Planes
+    size: tuple[int, int]
+
+
+class MultiScaleFovea(Sensor):
+    r"""A sensor of several square crops around the fixation, each of which the detector sees as a picture of its own.
+
+    Crop l of L covers :math:`side \cdot 2^l` pixels and is reduced to `side` pixels. Its pixel i is the mean of the
+    picture over a square of :math:`s = 2^l` pixels, and the picture is black outside:
+
+    .. math:: c_i = \frac{1}{s} \int_{a + i s}^{a + (i + 1) s} I(u) \, du, \qquad a = g + ½ - \frac{side \cdot s}{2}
+
+    along x and along y, for a fixation g. Where the edges of the crop lie between pixels, this is the average of blocks
+    of pixels (OpenCV's `INTER_AREA`); elsewhere it is linear interpolation between such averages.
+
+    It is the sensor of Luzio, Bernardino and Moreno, "Cost-efficient multi-scale fovea for semantic-based visual search
+    attention" (arXiv 2604.03836), whose crops are 160, 320, 640 and 1280 pixels wide. Their code
+    (vislab-tecnico-lisboa/SemBA) reduces the crops by bilinear interpolation without averaging, and uses the boxes of
+    all crops as they are. The averages are our choice, and so is the merging (`semfov.detection.crops.merge_crops`).
+
+    The crops are taken from the picture in its reference size (`Eye(…, reference=640)`) and not from the detector's
+    input, so a larger reference shows finer detail for the same number of the detector's pixels.
+
+    Args:
+        side: side of each crop as the detector sees it, in pixels.
+        scales: number of crops, L.
+
+    Raises:
+        InputError: a setting is out of its range.
+
+    >>> sensor = MultiScaleFovea(32, 3)
+    >>> sensor(torch.rand(2, 3, 48, 64), torch.tensor([20.0, 30.0])).shape
+    torch.Size([2, 3, 3, 32, 32])
+    """
+
+    kind = "multi-scale"
+    names = ("side", "scales")
+
+    def __init__(self, side: float = 160, scales: float = 4) -> None:
+        super().__init__()
+        for name, value, most in (("side", side, 4096), ("scales", scales, 16)):
+            whole = int(value) if float(value).is_integer() else value
+            check_whole(whole, name, 1, most)
+        self.side, self.scales = int(side), int(scales)
+
+    @property
+    def crops(self) -> int:
+        """Number of pictures that the detector sees in a look, L."""
+        return self.scales
+
+    def means(self, image: Tensor) -> Planes:
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: `(B, C, H, W)`.
+
+        Returns:
+            Planes of squares at every scale, finest first.
+        """
+        check_shape(image, "image", None, None, None, None)
+        check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
+        # A border of one pixel is black; it stands for everything that is farther outside.
+        found = [F.pad(image, (1, 1, 1, 1))]
+        for scale in range(self.scales - 1):
+            step = 2**scale
+            wider = F.pad(found[-1], (step, step, step, step))
+            wider = (wider[..., step:] + wider[..., :-step]) / 2
+            found.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
+        return tuple(found)
+
+    def forward(self, image: Tensor | Planes, gaze: Tensor) -> Tensor:
+        """Compute the crops around fixations.
+
+        Args:
+            image: `(B, C, H, W)`, or its `means`.
+            gaze: fixations `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` for one
+                fixation of each image, or `(B, G, 2)` for G of each.
+
+        Returns:
+            Crops `(B, L, C, side, side)`, or `(B, G, L, C, side, side)` for G fixations, finest first.
+
+        Raises:
+            InputError: a shape does not fit, or the gaze is not finite.
+        """
+        means = image if isinstance(image, tuple) else self.means(image)
+        fixation, many = fixations(gaze, means[0])
+        result = torch.stack([self._crop(plane, fixation, scale) for scale, plane in enumerate(means)], 2)
+        return result if many else result[:, 0]
+
+    def windows(self, gaze: Tensor) -> Tensor:
+        """Compute the squares that the crops cover.
+
+        Args:
+            gaze: fixations `(..., 2)`.
+
+        Returns:
+            `(..., L, 4)`, `(x1, y1, x2, y2)`, edges between pixels.
+        """
+        reduced = 0.5 ** torch.arange(self.scales, dtype=gaze.dtype, device=gaze.device)
+        points = gaze[..., None, :].expand(*gaze.shape[:-1], self.scales, 2)
+        return windows_at(points, reduced.expand(points.shape[:-1]), (self.side, self.side))
+
+    def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int]:
+        """Tell the size of the canvas: that of the picture with its longer side at the reference."""
+        width, height = (max(1, round(length * reference / max(size))) for length in size)
+        return width, height
+
+    def open(self, canvas: Tensor, scale: Tensor) -> MultiScaleCanvas:
+        """Compute the means of a canvas. Crops are in pixels of the canvas, whatever the scale."""
+        return MultiScaleCanvas(self.means(canvas), (canvas.shape[-1], canvas.shape[-2]))
+
+    def look(self, state: MultiScaleCanvas, gaze: Tensor) -> Tensor:
+        """Compute the crops `(F·L, 3, side, side)` around fixations `(F, 2)`, those of a fixation together."""
+        return self(state.means, gaze[None])[0].flatten(0, 1)
+
+    def picture(self, state: MultiScaleCanvas, gaze: Tensor) -> Tensor:
+        """Compose the crops into pictures `(F, 3, H, W)` in which each place is shown by its finest crop."""
+        crops = self(state.means, gaze[None])[0]
+        fixation, _ = fixations(gaze, crops)
+        windows = self.windows(fixation[:, 0])
+        x, y = (torch.arange(n, dtype=crops.dtype, device=crops.device) + 0.5 for n in state.size)
+        shown = crops.new_zeros(len(crops), crops.shape[2], state.size[1], state.size[0])
+        for scale in reversed(range(self.scales)):
+            low, side = windows[:, scale, :2], self.side * 2**scale
+            across, down = (2 * (place - low[:, axis, None]) / side - 1 for axis, place in enumerate((x, y)))
+            where = torch.stack(torch.broadcast_tensors(across[:, None, :], down[:, :, None]), -1)
+            seen = F.grid_sample(crops[:, scale], where, "bilinear", "border", align_corners=False)
+            shown = torch.where((where.abs() <= 1).all(-1)[:, None], seen, shown)
+        return shown
+
+    def boxes_to_canvas(self, state: MultiScaleCanvas, gaze: Tensor, boxes: Tensor) -> Tensor:
+        """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
+        windows = self.windows(gaze.to(boxes)).flatten(0, 1)[:, None]
+        unit = (windows[..., 2:] - windows[..., :2]).repeat(1, 1, 2) / self.side
+        return boxes * unit + windows[..., :2].repeat(1, 1, 2)
+
+    def settings(self) -> dict[str, Any]:
+        """List the settings that the views depend on."""
+        return {"kind": self.kind, "side": self.side, "scales": self.scales}
+
+    @classmethod
+    def width(cls, settings: Mapping[str, Any]) -> float:
+        """Tell half the side of the finest crop."""
+        return float(settings["side"]) / 2
+
+    @classmethod
+    def borders(cls, settings: Mapping[str, Any]) -> list[float]:
+        """List where acuity changes: at half the side of each crop."""
+        return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
+
+    def extra_repr(self) -> str:
+        """Write the settings, for `repr`.
+
+        Returns:
+            The settings as text.
+        """
+        return f"side={self.side}, scales={self.scales}"
+
+    def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
+        """Crops `(B, G, C, side, side)` of one scale, from the means of its squares."""
+        step = 2**scale
+        # Squares that start before 1 - step or after the last pixel show nothing: they are the border of the plane.
+        first = fixation + 0.5 - self.side * step / 2 + step
+        sizes = plane.shape[-1], plane.shape[-2]
+        reach = torch.tensor([float(n + self.side * step) for n in sizes], dtype=first.dtype, device=first.device)
+        first = torch.minimum(torch.maximum(first, -reach), reach)
+        whole = first.detach().floor()
+        share = first - whole
+        taken = torch.arange(self.side, device=plane.device) * step
+        places = []
+        for axis, length in enumerate(sizes):
+            start = whole[..., axis, None].long() + taken
+            places.append([(start + more).clamp(0, length - 1) for more in (0, 1)])
+        # Rows first: they are contiguous in memory.
+        planes, image = plane.transpose(1, 2), torch.arange(len(plane), device=plane.device)[:, None, None]
+        x, y = share[..., 0, None, None, None], share[..., 1, None, None, None]
+        lines = planes[image, places[1][0]] * (1 - y) + planes[image, places[1][1]] * y
+        columns = [each[..., None, None, :].expand(*lines.shape[:-1], self.side) for each in places[0]]
+        return (lines.gather(-1, columns[0]) * (1 - x) + lines.gather(-1, columns[1]) * x).transpose(-3, -2)
