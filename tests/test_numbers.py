@@ -22,6 +22,7 @@ from semfov.agents.head import CONFIRM
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
 from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
 from semfov.live.fovea import RATE
@@ -29,7 +30,6 @@ from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import Retina
 from semfov.zoom.export import OPSET
-from semfov.zoom.hints import FAINT
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]

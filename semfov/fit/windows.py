@@ -186,7 +186,8 @@ def look(task: tuple[str, int]) -> bytes:
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
     """Read the results of the looks at all mosaics."""
-    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store)) for n in range(len(mosaics))]
+    least = eye.detector.least
+    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store), least) for n in range(len(mosaics))]
 
 
 def fit_zoom(config: FitZoomConfig) -> None:

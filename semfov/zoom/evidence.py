@@ -45,8 +45,8 @@ class GlimpseEvidence(Pretrained):
     It answers two questions about a part w of the window and a class t, and one about the whole picture. Small
     networks answer them. They are fitted on mosaics of photographs with annotated boxes.
 
-    - Does a closer look at w show t with a score of 0.3 or more? The log odds depend on the strongest hint of t in w,
-      and on that of every other class, because some classes occur together:
+    - Does a closer look at w show t with a score of 0.3 or more (`detector.least`)? The log odds depend on the
+      strongest hint of t in w, and on that of every other class, because some classes occur together:
 
       .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
                 \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
