@@ -4,8 +4,9 @@
       --fit.root train --fit.annotations instances_train.json
 
 Every sensor gets an observation model of its own, fitted to the same photographs (`--fit`), and target evidence of its
-own if `--learned` says so. Then it searches and explores the same other photographs (`--data`). The detector must take
-pictures of any size. To continue a stopped run, give the same command again.
+own if `--learned` says so. Then it searches and explores the same other photographs (`--data`). `--fixations 0` fits
+nothing, and measures only what raw scores tell. The detector must take pictures of any size. To continue a stopped run,
+give the same command again.
 """
 
 import sys
@@ -38,6 +39,7 @@ from semfov.io.files import clean, write_text
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.presence import area_under_roc
 from semfov.observation import FovealObservationModel
+from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, ProtocolConfig, ScenesConfig, SensorConfig
 from semfov.runs.looks import one_thread
@@ -54,7 +56,7 @@ class Candidate(NamedTuple):
     Attributes:
         sensor: name of the sensor.
         side: side of the detector's input in pixels.
-        settings: settings of the sensor that differ from those of its name.
+        settings: fields of `SensorConfig` that differ from those of its name.
     """
 
     sensor: str
@@ -69,11 +71,16 @@ CANDIDATES = {
     "gradual, 416": Candidate("gradual", 416),
     "log-polar, 320": Candidate("log-polar", 320),
     "sharp, 320": Candidate("gradual", 320, {"sigma": 1e4}),
+    "multi-scale, 4 × 160 of 1920 px": Candidate("multi-scale", 320, {"reference": 1920.0}),
 }
-"""What is compared. A Gaussian window of 10,000 px is flat, so the sharp sensor shows the same from everywhere."""
+"""What is compared; the last one is for pictures of at least 1920 px, and left out unless it is asked for.
+
+A Gaussian window of 10,000 px is flat, so the sharp sensor shows the same from everywhere.
+"""
 
 _SHIFTS = (1, 5, 15)
 _ANSWERS = ("all classes", "without background")
+_SCORE, _OVERLAP = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -84,10 +91,10 @@ class SensorsConfig(ScenesConfig):
         data: the photographs to search and to explore.
         fit: the photographs to fit the observation models to.
         detector: the detector; each sensor sets its `input_size`, which is not padded less than to a square.
-        sensor: ignored but for `reference`, the longer side in pixels of the images that the sensors are for.
+        sensor: ignored.
         belief: the belief; its columns and rows are the cells.
         protocol: the protocol of searches and explorations.
-        fixations: random fixations in each photograph of the fit.
+        fixations: random fixations in each photograph of the fit (0: no observation model is fitted).
         learned: number of the photographs of the fit from which target evidence is learned, from looks from every cell
             (0: none is learned).
         steps: training steps of the target evidence.
@@ -102,18 +109,18 @@ class SensorsConfig(ScenesConfig):
 
     fit: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(starts=5, shifts=15))
-    fixations: Count = 4
+    fixations: Whole = 4
     learned: Whole = 0
     steps: Count = 250
     classes: Count = 8
-    candidates: tuple[str, ...] = tuple(CANDIDATES)
+    candidates: tuple[str, ...] = tuple(CANDIDATES)[:-1]
     out: Path = Path("runs/sensors")
 
     def settings(self, name: str) -> dict[str, Any]:
         """Settings that the fit and the runs of a candidate have in common."""
         candidate = CANDIDATES[lookup(name, CANDIDATES, "candidate")]
         detector = replace(self.detector, input_size=candidate.side, stride=None)
-        sensor = SensorConfig(candidate.sensor, reference=self.sensor.reference, **candidate.settings)  # type: ignore[arg-type]
+        sensor = SensorConfig(candidate.sensor, **candidate.settings)  # type: ignore[arg-type]
         where = {"cache": self.cache, "workers": self.workers, "scheduler": self.scheduler}
         return {"detector": detector, "sensor": sensor, **where}
 
@@ -127,7 +134,8 @@ def compare_sensors(config: SensorsConfig) -> None:
     check(config.protocol.shifts >= _SHIFTS[-1], "protocol.shifts", f"{_SHIFTS[-1]} or more", config.protocol.shifts)
     rows = [_row(config, name) for name in config.candidates]
     head = ["sensor", "detector's pixels", "ms", *(f"{p}, CP@{n}" for p in policies(config)[1:] for n in _SHIFTS)]
-    head += ["area, 1 look", "area, 5 looks", *(f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS)]
+    head += [f"{what}, {looks}" for what in ("area", "recall") for looks in ("1 look", "5 looks")]
+    head += [f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS]
     text = "\n".join(table([head, *rows])) + "\n"
     write_text(config.out / "summary.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
@@ -137,11 +145,12 @@ def compare_sensors(config: SensorsConfig) -> None:
 def _row(config: SensorsConfig, name: str) -> list[str]:
     """The row of a sensor."""
     shared, folder = config.settings(name), config.folder(name)
-    fitting = FitObservationConfig(data=config.fit, fixations=config.fixations, out=folder / "fit", **shared)
-    file = model_path(fitting, config.detector.name)
-    if not file.is_file():
-        fit_fom(fitting)
-    belief, searchers = replace(config.belief, model=str(file)), policies(config)
+    belief, searchers, mapping = config.belief, policies(config), "random-raw"
+    model = None
+    if config.fixations:
+        file, mapping = _observation(config, name), "random-calibrated"
+        belief = replace(belief, model=str(file))
+        model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
     if config.learned:
         belief = replace(belief, target_model=str(_evidence(config, name)))
     common = {"data": config.data, "protocol": config.protocol, "store": config.store, **shared}
@@ -150,31 +159,42 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
     found = _curves(
         search, name, lambda records: performance(records, searchers, config.protocol.shifts, "all targets")
     )
-    explore = ExploreRun(ExploreConfig(policies=("random-calibrated",), out=folder / "explore", **common))
-    known = {
-        answer: _curves(explore, name, lambda r, a=answer: success(r, ["random-calibrated"], a)) for answer in _ANSWERS
-    }
-    model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
-    areas = presence(search, model, config.classes)
+    explore = ExploreRun(ExploreConfig(policies=(mapping,), out=folder / "explore", **common))
+    known = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
+    five = five_looks(search, model, config.classes)
     pixels, seconds = cost(search.eye, search.scenes[0].image)
     return [
         name,
         f"{pixels:,}",
         f"{1e3 * seconds:.0f}",
         *(percent(*_at(found[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
-        *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(areas.value, areas.error, strict=True)),
-        *(percent(*_at(known[answer]["random-calibrated"], _SHIFTS[-1])) for answer in _ANSWERS),
+        *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(five.value, five.error, strict=True)),
+        *(percent(*_at(known[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
     ]
 
 
 def policies(config: SensorsConfig) -> tuple[str, ...]:
     """The searchers that are compared, the random one first."""
-    return (
-        "random",
-        "non-predictive-raw",
-        "non-predictive-calibrated",
-        *(["target-evidence"] if config.learned else []),
+    calibrated, learned = (
+        ["non-predictive-calibrated"] * bool(config.fixations),
+        ["target-evidence"] * bool(config.learned),
     )
+    return ("random", "non-predictive-raw", *calibrated, *learned)
+
+
+def _observation(config: SensorsConfig, name: str) -> Path:
+    """File of the observation model of a sensor, which is fitted unless it is there."""
+    fitting = FitObservationConfig(
+        data=config.fit,
+        fixations=config.fixations,
+        name="observation",
+        out=config.folder(name),
+        **config.settings(name),
+    )
+    file = model_path(fitting, "")
+    if not file.is_file():
+        fit_fom(fitting)
+    return file
 
 
 def _evidence(config: SensorsConfig, name: str) -> Path:
@@ -184,10 +204,11 @@ def _evidence(config: SensorsConfig, name: str) -> Path:
         columns=config.belief.columns,
         rows=config.belief.rows,
         steps=config.steps,
-        out=config.folder(name) / f"evidence-{config.learned}",
+        name=f"evidence-{config.learned}",
+        out=config.folder(name) / "evidence",
         **config.settings(name),
     )
-    file = model_path(fitting, config.detector.name)
+    file = model_path(fitting, "")
     if not file.is_file():
         fit_search(fitting)
     return file
@@ -204,40 +225,53 @@ def _at(curve: Curve, shift: int) -> tuple[float, float]:
     return float(curve.mean[shift]), float(curve.over_images[shift])
 
 
-def presence(run: SearchRun, model: FovealObservationModel, classes: int) -> Bootstrap:
-    """How well looks tell whether a class is in a photograph, by its largest calibrated score.
+def five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
+    """What is seen in one look from the middle, and in that and four looks around it.
+
+    The area tells how well the largest score of a class says whether it is in a photograph. An object is found by a
+    detection of its class with a score of 0.1 that overlaps it by half.
 
     Args:
         run: the finished looks from every cell.
-        model: the observation model.
+        model: observation model that calibrates the scores for the area; None takes raw scores.
         classes: largest number of present classes of a photograph, and of absent ones.
 
     Returns:
-        Areas under the ROC `(2,)`, of one look from the cell in the middle, and of that and four looks around it; the
-        samples are of photographs.
+        `(4,)`: area under the ROC after one look and after five, recall after one look and after five; the samples are
+        of photographs.
     """
     scores, there, groups = [], [], []
+    objects = torch.zeros(len(run.scenes), 3)
     for index in range(len(run.scenes)):
-        chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
-        if not chosen:
-            continue
-        grid = run.grid(index)
-        width, height = grid.extent.tolist()
-        places = [(0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)]
-        cells = grid.cell_of(torch.tensor([[x * width, y * height] for x, y in places]))
+        grid, annotation = run.grid(index), run.scenes.annotation(index)
+        places = grid.extent * torch.tensor([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+        cells = grid.cell_of(places)
         seen = run.detections(index)[cells]
-        distance = grid.box_distance(seen.boxes, grid.centres[cells])
-        told = replace(seen, scores=model.calibrate(seen.scores, distance))
-        highest = highest_score(told, torch.tensor(chosen))
+        boxes, labels = annotation.boxes[~annotation.crowd], annotation.labels[~annotation.crowd]
+        overlap = torch.stack([box_iou(boxes, each) for each in seen.boxes])
+        hits = (overlap >= _OVERLAP) & (seen.labels[:, None] == labels[:, None])
+        hits = (hits & (seen.confidence >= _SCORE)[:, None]).any(-1)
+        objects[index] = torch.stack([hits[0].sum(), hits.any(0).sum(), torch.tensor(len(boxes))])
+        chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
+        if model is not None:
+            distance = grid.box_distance(seen.boxes, grid.centres[cells])
+            seen = replace(seen, scores=model.calibrate(seen.scores, distance))
+        highest = highest_score(seen, torch.tensor(chosen, dtype=torch.int64))
         scores.append(torch.stack([highest[0], highest.amax(0)], -1))
         there.append(present)
-        groups += [index] * len(chosen)
-    score, label = torch.cat(scores), torch.cat(there)
+        groups.append(torch.full((len(chosen),), index))
+    score, label, group = torch.cat(scores), torch.cat(there), torch.cat(groups)
+    of_scene = [(group == index).nonzero()[:, 0] for index in range(len(run.scenes))]
 
-    def areas(cases: Tensor) -> Tensor:
-        return torch.tensor([area_under_roc(score[cases, looks], label[cases]) for looks in range(2)])
+    def measure(drawn: Tensor) -> Tensor:
+        cases = torch.cat([of_scene[index] for index in drawn.tolist()])
+        told, found = label[cases], objects[drawn].sum(0)
+        areas = torch.full((2,), torch.nan)
+        if told.any() and not told.all():
+            areas = torch.tensor([area_under_roc(score[cases, looks], told) for looks in range(2)])
+        return torch.cat([areas, found[:2] / found[2]])
 
-    return Bootstrap.of(areas, groups, samples=200)
+    return Bootstrap.of(measure, range(len(run.scenes)), samples=200)
 
 
 def _classes(scenes: Scenes, index: int, classes: int, seed: int) -> tuple[list[int], Tensor]:
