@@ -50,7 +50,7 @@ from semfov.runs.setup import plain
 from semfov.runs.tables import percent, table
 
 
-class Candidate(NamedTuple):
+class SensorChoice(NamedTuple):
     """A sensor with a size of the detector's input.
 
     Attributes:
@@ -65,13 +65,13 @@ class Candidate(NamedTuple):
 
 
 CANDIDATES = {
-    "published, 320": Candidate("published", 320),
-    "multi-scale, 4 × 160": Candidate("multi-scale", 320),
-    "gradual, 320": Candidate("gradual", 320),
-    "gradual, 416": Candidate("gradual", 416),
-    "log-polar, 320": Candidate("log-polar", 320),
-    "sharp, 320": Candidate("gradual", 320, {"sigma": 1e4}),
-    "multi-scale, 4 × 160 of 1920 px": Candidate("multi-scale", 320, {"reference": 1920.0}),
+    "published, 320": SensorChoice("published", 320),
+    "multi-scale, 4 × 160": SensorChoice("multi-scale", 320),
+    "gradual, 320": SensorChoice("gradual", 320),
+    "gradual, 416": SensorChoice("gradual", 416),
+    "log-polar, 320": SensorChoice("log-polar", 320),
+    "sharp, 320": SensorChoice("gradual", 320, {"sigma": 1e4}),
+    "multi-scale, 4 × 160 of 1920 px": SensorChoice("multi-scale", 320, {"reference": 1920.0}),
 }
 """What is compared; the last one is for pictures of at least 1920 px, and left out unless it is asked for.
 

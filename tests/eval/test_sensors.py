@@ -33,7 +33,10 @@ def given(home, out, *more):
 
 
 def test_sensors_are_compared_with_models_of_their_own(home, monkeypatch, capsys):
-    chosen = {"crops": sensors.Candidate("multi-scale", 64, CROPS), "log-polar": sensors.Candidate("log-polar", 64)}
+    chosen = {
+        "crops": sensors.SensorChoice("multi-scale", 64, CROPS),
+        "log-polar": sensors.SensorChoice("log-polar", 64),
+    }
     monkeypatch.setattr(sensors, "CANDIDATES", chosen)
     fit = ["--fit.root", str(home / "photographs"), "--fit.annotations", str(home / "photographs/instances.json")]
     small = ["--belief.columns", "4", "--belief.rows", "4", "--protocol.starts", "1", "--candidates", '["crops"]']
