@@ -51,6 +51,7 @@ from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
 from semfov.runs.command import run_command
 from semfov.runs.presets import label
+from semfov.runs.workers import shared_processes
 
 END = "<!-- end -->"
 PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{END}", re.DOTALL)
@@ -61,9 +62,10 @@ def results(config: ResultsConfig) -> None:
     """Run the experiments and write the pages."""
     runs = experiments(config)
     chosen = list(runs) if config.only is None else [lookup(name, runs, "experiment") for name in config.only]
-    for name in chosen:
-        print(f"\n== {name}")
-        HANDLERS[type(runs[name])](runs[name])
+    with shared_processes():
+        for name in chosen:
+            print(f"\n== {name}")
+            HANDLERS[type(runs[name])](runs[name])
     pages = (config.page, config.tables)
     texts = [read_page(page) for page in pages]
     kept: list[str] = []
@@ -161,8 +163,8 @@ BELIEVED = ["belief", "NLL", "ECE", "mean probability", "share that hold it"]
 """Columns of the tables of runs that the pages show."""
 
 HANDLERS: dict[type, Callable[[Any], None]] = {
-    SearchConfig: search,
-    ExploreConfig: explore,
+    SearchConfig: partial(search, pictures=False),
+    ExploreConfig: partial(explore, pictures=False),
     DecideConfig: search_and_decide,
     CalibrationConfig: judge_beliefs,
     ThresholdLooksConfig: look_at_thresholds,

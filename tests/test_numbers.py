@@ -19,9 +19,11 @@ import torch
 
 from semfov import FovealObservationModel
 from semfov.agents.head import CONFIRM
+from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
 from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
 from semfov.live.fovea import RATE
@@ -29,7 +31,6 @@ from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import Retina
 from semfov.zoom.export import OPSET
-from semfov.zoom.hints import FAINT
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
@@ -119,6 +120,7 @@ KNOWN = {
     },
     "docs/zoom.md": {
         f"confidence of {FAINT}": "code",
+        f"probability {LIKELY} on": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
         "75 MB": "a sixteenth, a sixty-fourth and so on of what the sentence gives",
@@ -168,7 +170,7 @@ KNOWN = {
         "0.4 frames": "an example",
     },
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
-    "docs/command.md": {f"from score {LEAST}": "code"},
+    "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code"},
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
     "docs/guides/environments.md": {
         "version 1.0": "of Gymnasium",
@@ -186,12 +188,62 @@ KNOWN = {
         "40 of the fitting": "videos of the table",
         "20 frames": "videos of the table",
     },
-    "docs/guides/records.md": {f"which is {LEAST} unless": "code", f"begin at {FAINTEST}": "code"},
+    "docs/guides/records.md": {
+        f"which is {LEAST} unless": "code",
+        f"begin at {FAINTEST}": "code",
+        f"is {LIKELY}. After": "code",
+    },
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
     "docs/guides/index.md": {"ROS 2": "a name"},
     "docs/decisions/tempering.md": {f"{len(COCO_CLASSES) + 1} components": "code"},
 }
 """Numbers that no table has, each with the reason; those that are settings are written here by the code."""
+
+
+_SMALL = "(?:one|two|three|four|five|six|seven|eight|nine|ten)"
+IN_WORDS = re.compile(
+    r"(?:more|less|fewer) than half\b"
+    r"|\b(?:about|almost|nearly|only) (?:half|a third|a quarter|a fifth|a tenth|twice)\b"
+    r"|\b(?:two thirds|three quarters|a third|a quarter|a fifth|a tenth) of\b"
+    rf"|\b{_SMALL} (?:in|of|out of) {_SMALL}\b"
+    rf"|\b{_SMALL} times as (?:many|much|long|fine|often|fast)\b",
+    re.IGNORECASE,
+)
+"""Shares and ratios in words."""
+
+SHARES = {
+    "docs/results.md": {
+        "more than half of the detections": (_OBJECTS[-1], _DETECTIONS[-1]),
+        "one in ten at the fovea": (_OBJECTS[0], _DETECTIONS[0]),
+        "about half of val2017": "2,693 of 5,000 photographs, in the annotations of COCO",
+    },
+    "docs/detectors.md": {
+        "One in five photographs is held out": "a rule",
+        "one in three if there are fewer": "a rule",
+    },
+    "docs/words.md": {"a tenth of the gain": ("0.023", "0.217")},
+    "docs/decisions/closer_looks.md": {
+        "a third of the photograph": "a setting",
+        "a third of the window": "it follows from the setting",
+    },
+    "docs/sensors.md": {
+        "a fifth of the picture": ("142.3", 640),
+        "almost nine times as fine": ("166.0", "19.0"),
+        "a fifth of the pixels": (_RINGS * _WEDGES, 640 * 480),
+        "almost twice as many objects": ("0.312", "0.159"),
+    },
+    "docs/pan-tilt.md": {"a tenth of its field of view": "a rule"},
+    "docs/guides/live.md": {"three quarters of its width": "how the videos were made", "four times as long": "a rule"},
+    "docs/measurements/human.md": {
+        "a fifth of the NSS difference": ("0.365", "1.739"),
+        "a quarter together with VOCUS2": ("0.446", "1.739"),
+    },
+    "docs/measurements/words.md": {"a tenth of the gain": ("0.023", "0.217"), "A tenth of the weights": "a setting"},
+    "docs/measurements/zoom.md": {"One of four boxes": ("0.250", 1)},
+}
+"""What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""
+
+VALUES = {"half": 0.5, "third": 1 / 3, "quarter": 0.25, "quarters": 0.75, "fifth": 0.2, "tenth": 0.1, "twice": 2}
 
 
 @cache
@@ -365,6 +417,33 @@ def test_every_number_of_a_sentence_is_in_a_table_or_has_a_reason(page):
     lost = numbers_without_a_table(page)
     told = "\n".join(f"  {numbers}: {sentence}" for numbers, sentence in lost)
     assert not lost, f"{page}: numbers that no table of the page or of a linked page has:\n{told}"
+
+
+def in_words(text):
+    """The value of a share or ratio in words, such as 0.9 of `nine in ten`."""
+    said = text.lower().split()
+    named = next((VALUES[word] for word in said if word in VALUES), None)
+    counts = [IN_DIGITS[word] for word in said if word in NUMERALS]
+    return named if named is not None else counts[0] / counts[1] if len(counts) == 2 else counts[0]
+
+
+@pytest.mark.parametrize("page", STRICT + OTHERS)
+def test_every_share_in_words_is_that_of_its_numbers_or_has_a_reason(page):
+    plain = " ".join(" ".join(HIDDEN.sub(" ", paragraph).split()) for paragraph in paragraphs(page))
+    listed = SHARES.get(page, {})
+    assert [phrase for phrase in listed if phrase not in plain] == []
+    for phrase, made_of in listed.items():
+        if isinstance(made_of, str):
+            continue
+        tables = [text_of(name) for name in (page, *COMPANIONS.get(page, []))]
+        told = [number for number in made_of if isinstance(number, str)]
+        assert all(any(number in text for text in tables) for number in told), phrase
+        share = float(made_of[0]) / float(made_of[1])
+        assert share == pytest.approx(in_words(phrase), rel=0.15), phrase
+    rest = plain
+    for phrase in listed:
+        rest = rest.replace(phrase, " ")
+    assert IN_WORDS.findall(rest) == []
 
 
 @pytest.mark.parametrize("page", KNOWN)

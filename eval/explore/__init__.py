@@ -18,11 +18,11 @@ from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
 
 
-def explore(config: ExploreConfig) -> None:
-    """Run a scene exploration experiment and write its tables, figures and records."""
+def explore(config: ExploreConfig, *, pictures: bool = True) -> None:
+    """Run an exploration experiment and write its tables and records, and with `pictures` its figures and its page."""
     run = ExploreRun(with_models(config))
     finish(run, "exploring")
-    exploration_report(run)
+    exploration_report(run, pictures=pictures)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -35,8 +35,8 @@ ANSWERS = {
 """Ways to count answers: the field of the records, and a description."""
 
 
-def exploration_report(run: ExploreRun) -> None:
-    """Write all output of a finished run, and print the tables."""
+def exploration_report(run: ExploreRun, *, pictures: bool = True) -> None:
+    """Write all output of a finished run, or all but its figures and its page, and print the tables."""
     records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
@@ -46,17 +46,18 @@ def exploration_report(run: ExploreRun) -> None:
     summary = exploration_summary(curves, run.config.protocol.shifts, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
     written = write_files(run, "eval.explore", tables, records, seconds)
-    written += [draw_exploration_curves(run, curves[answer], answer) for answer in ANSWERS]
-    written.append(
-        write_run_report(
-            run,
-            records,
-            curves,
-            titles={name: title for name, (_, title) in ANSWERS.items()},
-            label="cells with the right class (%)",
-            shifts=EXPLORATION_SHIFTS,
+    if pictures:
+        written += [draw_exploration_curves(run, curves[answer], answer) for answer in ANSWERS]
+        written.append(
+            write_run_report(
+                run,
+                records,
+                curves,
+                titles={name: title for name, (_, title) in ANSWERS.items()},
+                label="cells with the right class (%)",
+                shifts=EXPLORATION_SHIFTS,
+            )
         )
-    )
     announce(summary, written)
 
 

@@ -196,6 +196,8 @@ class ResultsConfig(Settings):
         fit_annotations: their annotation file, in the COCO instances format.
         yolox: ONNX file of YOLOX-nano (None: the published file).
         limit: use only this many photographs, the first ones, for a trial.
+        few: number of photographs, the first ones, for the experiments at every score threshold and for those with an
+            expectation over drawn looks, of which there are many or which take long.
         study: number of photographs for the studies of settings, which compute new looks for every setting of sensor
             and detector.
         only: names of the experiments to run (None: all); for the others the pages show the results of earlier runs,
@@ -216,6 +218,7 @@ class ResultsConfig(Settings):
     fit_annotations: Path | None = None
     yolox: Path | None = None
     limit: Count | None = None
+    few: Count = 100
     study: Count = 30
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
@@ -248,20 +251,21 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         settings = detector(name, config)
         work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
         common: dict[str, Any] = {"data": data, "detector": settings, **work}
-        seek, tour = partial(SearchConfig, **common, scanpaths=0), partial(ExploreConfig, **common)
+        seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
         for fovea in FOVEAE:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
             yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
             yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=PUBLISHED_EXPLORATION)
-        yield from _thresholds(name, settings, common)
+        few = {**common, "data": replace(data, limit=min(config.few, config.limit or config.few))}
+        yield from _thresholds(name, settings, few)
         sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
         yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
         if name == "nano":
             # One start: an expectation takes ten times as long as the published decision.
-            seen: dict[str, Any] = {"sensor": sensor, "belief": belief}
-            yield "expected-search", seek(**seen, protocol=ProtocolConfig(1), policies=EXPECTED)
+            seen: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
+            yield "expected-search", SearchConfig(**seen, protocol=ProtocolConfig(1), policies=EXPECTED)
             once = ProtocolConfig(1, shifts=20)
-            yield "expected-explore", tour(**seen, protocol=once, policies=EXPECTED_EXPLORATION)
+            yield "expected-explore", ExploreConfig(**seen, protocol=once, policies=EXPECTED_EXPLORATION)
         yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
@@ -296,7 +300,7 @@ def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> 
     for threshold in SCORE_THRESHOLDS:
         # Without a name, the observation model is the one that was fitted at the threshold.
         own = {**common, "detector": replace(settings, threshold=threshold), "sensor": sensor}
-        seek = SearchConfig(**own, scanpaths=0, policies=tuple(p for p in PUBLISHED if p != "vocus2"))
+        seek = SearchConfig(**own, policies=tuple(p for p in PUBLISHED if p != "vocus2"))
         tour = ExploreConfig(**own, policies=PUBLISHED_EXPLORATION[:4])
         yield at_threshold("search", threshold, name), seek
         yield at_threshold("explore", threshold, name), tour
@@ -310,7 +314,7 @@ def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
     few: dict[str, Any] = {"data": data, "detector": nano, **work}
     few["sensor"] = SensorConfig(name="published")
     for title, study in STUDIES.items():
-        base = ExploreConfig(**few) if study.explores else SearchConfig(**few, scanpaths=0)
+        base = ExploreConfig(**few) if study.explores else SearchConfig(**few)
         if study.model is not None:
             base = replace(base, belief=BeliefConfig(model=f"{nano.name}-{study.model}"))
         for label, changes in study.settings.items():

@@ -19,11 +19,11 @@ from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish
 
 
-def search(config: SearchConfig) -> None:
-    """Run a visual search experiment and write its tables, figures and records."""
+def search(config: SearchConfig, *, pictures: bool = True) -> None:
+    """Run a search experiment and write its tables and records, and with `pictures` its figures and its page."""
     run = SearchRun(with_models(config))
     finish(run, "searching")
-    search_report(run)
+    search_report(run, pictures=pictures)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -40,8 +40,8 @@ AVERAGES = {
 }
 
 
-def search_report(run: SearchRun) -> None:
-    """Write all output of a finished run, and print the tables."""
+def search_report(run: SearchRun, *, pictures: bool = True) -> None:
+    """Write all output of a finished run, or all but its figures and its page, and print the tables."""
     records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
@@ -51,18 +51,19 @@ def search_report(run: SearchRun) -> None:
     summary = search_summary(curves, expected, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
     written = write_files(run, "eval.search", tables, records, seconds)
-    written += [draw_search_curves(run, curves["all targets"], expected), *draw_searches(run, records)]
-    written.append(
-        write_run_report(
-            run,
-            records,
-            curves,
-            titles=AVERAGES,
-            label="targets found (%)",
-            shifts=SEARCH_SHIFTS,
-            others={"random, by formula": expected},
+    if pictures:
+        written += [draw_search_curves(run, curves["all targets"], expected), *draw_searches(run, records)]
+        written.append(
+            write_run_report(
+                run,
+                records,
+                curves,
+                titles=AVERAGES,
+                label="targets found (%)",
+                shifts=SEARCH_SHIFTS,
+                others={"random, by formula": expected},
+            )
         )
-    )
     announce(summary, written)
 
 

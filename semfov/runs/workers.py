@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextvars import ContextVar
 from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -87,7 +88,7 @@ def run_tasks(
                     yield task, function(task)
                     bar.update()
             else:
-                yield from _in_processes(function, tasks, processes, (setup, settings), title, bar)
+                yield from _in_processes(_Job(function, setup, settings), tasks, processes, title, bar)
             return
         job = _Job(function, setup, settings, package_digest())
         if isinstance(processes, Executor):
@@ -96,11 +97,29 @@ def run_tasks(
             yield from _on_cluster(processes, job, tasks, title, bar)
 
 
+@contextmanager
+def shared_processes() -> Iterator[None]:
+    """Keep the processes of this machine for all calls of `run_tasks` in the block.
+
+    Otherwise they start and end with each call, and a process takes seconds to import the libraries.
+    """
+    with ExitStack() as pools:
+        before = _shared.set((pools, {}))
+        try:
+            yield
+        finally:
+            _shared.reset(before)
+
+
 class _Job(Generic[_Task, Result]):
-    """A function with its setup, for workers that no initializer prepares."""
+    """A function with its setup, for workers that may have had other jobs; `code` is checked if it is given."""
 
     def __init__(
-        self, function: Callable[[_Task], Result], setup: Callable[..., None], settings: tuple[object, ...], code: str
+        self,
+        function: Callable[[_Task], Result],
+        setup: Callable[..., None],
+        settings: tuple[object, ...],
+        code: str | None = None,
     ) -> None:
         self.function, self.setup, self.settings, self.code = function, setup, settings, code
         self.folder = Path.cwd()
@@ -108,7 +127,7 @@ class _Job(Generic[_Task, Result]):
     def __call__(self, task: _Task) -> Result:
         """Prepare the process unless its last task has, and run the task; threads of a worker take turns."""
         with _turn:
-            if package_digest() != self.code:
+            if self.code is not None and package_digest() != self.code:
                 raise SemfovError("a worker has another version of semfov; install the same version on all machines")
             wanted = (self.setup, self.settings)
             if _ready != [wanted]:
@@ -156,29 +175,42 @@ def _results(
             future.cancel()
 
 
+_shared: ContextVar[tuple[ExitStack, dict[int, Executor]] | None] = ContextVar("shared processes", default=None)
+"""The processes that are kept, by their number, and what ends them (`shared_processes`)."""
+
+
 def _in_processes(
-    function: Callable[[_Task], Result],
-    tasks: Sequence[_Task],
-    processes: int,
-    preparation: tuple[Callable[..., None], tuple[object, ...]],
-    title: str,
-    bar: Bar,
+    job: Callable[[_Task], Result], tasks: Sequence[_Task], processes: int, title: str, bar: Bar
 ) -> Iterator[tuple[_Task, Result]]:
+    shared = _shared.get()
+    try:
+        if shared is None:
+            with _started(min(processes, len(tasks))) as pool:
+                yield from _results(pool, job, tasks, bar, _deaf_children())
+        else:
+            pools, kept = shared
+            if processes not in kept:
+                kept[processes] = pools.enter_context(_started(processes))
+            yield from _results(kept[processes], job, tasks, bar, _deaf_children())
+    except BrokenProcessPool:
+        raise SemfovError(
+            f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
+            "continues where this one stopped, or add --workers 1 to use a single process"
+        ) from None
+
+
+@contextmanager
+def _started(processes: int) -> Iterator[Executor]:
+    """Processes of this machine, which end with the block, and at once if it fails."""
     before = multiprocessing.active_children()
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(tasks)), context, _prepare, preparation) as pool:
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _prepare) as pool:
         try:
-            yield from _results(pool, function, tasks, bar, _deaf_children())
-        except BaseException as error:
+            yield pool
+        except BaseException:
             # Running tasks may be killed: their files are written atomically, either completely or not at all.
             for child in set(multiprocessing.active_children()) - set(before):
                 child.terminate()
-            if not isinstance(error, BrokenProcessPool):
-                raise
-            raise SemfovError(
-                f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
-                "continues where this one stopped, or add --workers 1 to use a single process"
-            ) from None
+            raise
 
 
 def _on_cluster(
@@ -219,11 +251,10 @@ def _deaf_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _prepare(setup: Callable[..., None], settings: tuple[object, ...]) -> None:
+def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_outlive_nobody, daemon=True).start()
-    setup(*settings)
 
 
 def _leave(*_: object) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -105,6 +106,14 @@ def test_studies_use_the_fit_set_and_results_use_the_listed_photographs(tmp_path
         assert run.data.ids == (None if study else config.ids)
     ids = (ROOT / config.ids).read_text().split()
     assert len(set(ids)) == len(ids) == 300
+
+
+def test_a_trial_limits_every_experiment_on_the_listed_photographs(tmp_path):
+    config = ResultsConfig(root=tmp_path / "val", annotations=tmp_path / "v.json")
+    limits = {run.data.limit for run in experiments(replace(config, limit=7)).values()}
+    assert limits == {7}
+    assert {run.data.limit for run in experiments(replace(config, limit=200)).values()} == {200, 100}
+    assert {run.data.limit for run in experiments(config).values()} == {None, 100}
 
 
 def test_published_experiments_have_the_published_sensor_and_model(runs):
@@ -351,6 +360,7 @@ def test_every_threshold_has_a_model_of_its_own_and_the_same_sensor(runs):
         run = runs[name]
         assert (run.sensor.name, run.belief.model) == ("published", None)
         assert run.detector.threshold == float(name.split("-")[2])
+        assert run.data.limit == 100
     for name in ("nano", "tiny"):
         looks = runs[f"looks-threshold-{name}"]
         assert looks.thresholds == SCORE_THRESHOLDS

@@ -1,5 +1,6 @@
 """Tasks in executors: results come back wherever they run, also from a cluster that loses workers or its scheduler."""
 
+import multiprocessing
 import operator
 import os
 import signal
@@ -21,7 +22,7 @@ from semfov.runs import cluster, workers
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ScenesConfig
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
-from semfov.runs.workers import run_tasks
+from semfov.runs.workers import run_tasks, shared_processes
 
 ROOT = Path(__file__).parents[2]
 
@@ -118,6 +119,44 @@ def test_workers_of_another_version_are_refused(monkeypatch):
     monkeypatch.setattr(workers, "package_digest", lambda: next(digests))
     with ThreadPoolExecutor(1) as pool, pytest.raises(SemfovError, match="another version of semfov"):
         results(operator.neg, [1, 2], pool)
+
+
+SETTING = []
+
+
+def set_to(value):
+    SETTING[:] = [value]
+
+
+def process_and_setting(_):
+    return os.getpid(), *SETTING
+
+
+def with_setting(value):
+    return results(process_and_setting, range(4), 2, setup=set_to, settings=(value,))
+
+
+@pytest.mark.slow
+def test_shared_processes_stay_for_other_settings_and_end_with_the_block():
+    with shared_processes():
+        first, second = with_setting("one"), with_setting("two")
+        kept = {child.pid for child in multiprocessing.active_children()}
+    assert {setting for _, setting in first.values()} == {"one"}
+    assert {setting for _, setting in second.values()} == {"two"}
+    used = {process for process, _ in [*first.values(), *second.values()]}
+    assert used <= kept
+    assert len(kept) == 2
+    assert os.getpid() not in used
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.slow
+def test_shared_processes_end_at_once_if_the_block_fails():
+    with pytest.raises(ZeroDivisionError), shared_processes():  # noqa: PT012
+        results((1).__truediv__, [1, 2, 3], 2)
+        assert len(multiprocessing.active_children()) == 2
+        results((1).__truediv__, [0, 1, 2], 2)
+    assert multiprocessing.active_children() == []
 
 
 def free_port():
