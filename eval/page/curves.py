@@ -47,7 +47,7 @@ def per_image(records: list[ResultRecord], last: int, field: str = "right") -> F
     return np.stack([means[scene] for scene in sorted(means)])
 
 
-def curve(records: list[ResultRecord], last: int) -> Curve:
+def averaged(records: list[ResultRecord], last: int) -> Curve:
     """Mean measure after 0..`last` gaze shifts, with its standard errors over images and over repetitions."""
     return curve_of(records, partial(curve_of_record, last=last))
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from eval.page.curves import curve, records_of
+from eval.page.curves import averaged, records_of
 from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
 from eval.page.findings import LAST, TESTED
 from eval.page.origin import missing
@@ -78,7 +78,8 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     curves = {
-        policy: curve(records_of(folder, policy, commonest=figure.kind == "search"), last) for policy in figure.policies
+        policy: averaged(records_of(folder, policy, commonest=figure.kind == "search"), last)
+        for policy in figure.policies
     }
     return (
         {policy: each.mean for policy, each in curves.items()},

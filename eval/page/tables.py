@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.page import paper
-from eval.page.curves import behind, curve, paired_difference, points, policies_of, records_of, spans
+from eval.page.curves import averaged, behind, paired_difference, points, policies_of, records_of, spans
 from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
 from semfov.metrics.search import random_search
@@ -49,13 +49,13 @@ def beside_paper(runs: Runs) -> list[str]:
 
 def performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
-    found = curve(records_of(folder, policy, commonest=True), shifts)
+    found = averaged(records_of(folder, policy, commonest=True), shifts)
     return percent(found.mean[shifts], found.over_images[shifts])
 
 
 def largest_error(folder: Path, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
-    found = curve(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
+    found = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
     return f"{100 * found.over_repetitions.max():.3f}"
 
 
@@ -85,7 +85,7 @@ def study_table(title: str, runs: Runs) -> list[str]:
         for choice in study.policies:
             policy = name_of(choice, "exploration" if study.explores else "search")
             head = [label, *([policy] if several else [])]
-            found = curve(records_of(folder, policy), max(study.shifts))
+            found = averaged(records_of(folder, policy), max(study.shifts))
             rows.append([*head, *(percent(found.mean[n], found.over_images[n]) for n in study.shifts)])
     return table(rows)
 
