@@ -8,8 +8,10 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Tests are rewritten and start many processes: bytecode that is kept halves the time to collect them.
 unexport PYTHONDONTWRITEBYTECODE
 
+NUMERIC := tests/belief tests/decision tests/head tests/observation tests/sensor tests/zoom
+
 .DEFAULT_GOAL := help
-.PHONY: help setup search test lab test-all test-quick coverage mutation docs lint types constraints clean
+.PHONY: help setup search test lab test-all test-quick gpu coverage mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
@@ -17,6 +19,7 @@ help:
 	@echo "make lab         the tests of studies, fits for studies, benchmarks and the site"
 	@echo "make test-quick  the tests that take no more than a second each"
 	@echo "make test-all    all of these, with the tests that repeat others at length"
+	@echo "make gpu         on a machine with a GPU: the tests that use one, and a page of benchmarks"
 	@echo "make coverage    the tests, and which lines and branches they reach"
 	@echo "make mutation    change the library's formulas one by one, and list the changes that no test notices (hours)"
 	@echo "make docs        set up, then build the site in build/site"
@@ -43,8 +46,10 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
+# Numbers are computed a second time as on a processor without AVX, on one thread: other processors round otherwise.
 test: lint types
 	$(PYTEST) -m "not lab and not long"
+	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(PYTEST) -m "not lab and not long and not slow" $(NUMERIC)
 
 # Some of these tests build the site.
 lab: $(STAMP)
@@ -55,6 +60,11 @@ test-all: lint types
 
 test-quick: $(STAMP)
 	$(PYTEST) -m "not slow and not long"
+
+gpu: $(STAMP)
+	$(BIN)/python -c "import sys, torch; sys.exit(None if torch.cuda.is_available() else 'no GPU that torch can use')"
+	$(BIN)/python -m pytest -m "not long" -k cuda
+	$(BIN)/python -m benchmarks.pyramid --device cuda | tee benchmarks/results/gpu.md
 
 # Of the processes that tests start, too.
 coverage: $(STAMP)

@@ -114,7 +114,7 @@ class ActivePerception(nn.Module):
         """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
 
         Args:
-            name: a detector that models are shipped for, `yolov3-tiny` or `yolox-nano`.
+            name: a detector with shipped models: `yolov3-tiny`, `yolox-nano`, `nanodet-plus-m-1.5x` (with `weights=`).
             sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
             growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.

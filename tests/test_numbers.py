@@ -19,9 +19,11 @@ import torch
 
 from semfov import FovealObservationModel
 from semfov.agents.head import CONFIRM
+from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
 from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
 from semfov.live.fovea import RATE
@@ -29,7 +31,6 @@ from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import Retina
 from semfov.zoom.export import OPSET
-from semfov.zoom.hints import FAINT
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
@@ -119,6 +120,7 @@ KNOWN = {
     },
     "docs/zoom.md": {
         f"confidence of {FAINT}": "code",
+        f"probability {LIKELY} on": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
         "75 MB": "a sixteenth, a sixty-fourth and so on of what the sentence gives",
@@ -168,7 +170,7 @@ KNOWN = {
         "0.4 frames": "an example",
     },
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
-    "docs/command.md": {f"from score {LEAST}": "code"},
+    "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code"},
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
     "docs/guides/environments.md": {
         "version 1.0": "of Gymnasium",
@@ -186,7 +188,11 @@ KNOWN = {
         "40 of the fitting": "videos of the table",
         "20 frames": "videos of the table",
     },
-    "docs/guides/records.md": {f"which is {LEAST} unless": "code", f"begin at {FAINTEST}": "code"},
+    "docs/guides/records.md": {
+        f"which is {LEAST} unless": "code",
+        f"begin at {FAINTEST}": "code",
+        f"is {LIKELY}. After": "code",
+    },
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
     "docs/guides/index.md": {"ROS 2": "a name"},
     "docs/decisions/tempering.md": {f"{len(COCO_CLASSES) + 1} components": "code"},

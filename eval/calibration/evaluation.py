@@ -32,7 +32,8 @@ def judge_calibration(config: CalibrationConfig) -> None:
 def judge_scores(config: CalibrationConfig) -> None:
     """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
     settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    samples = sampler.all()
     model = make_observation(config.model, sampler.foveal_eye)
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)

@@ -20,15 +20,20 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER
 from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects
 from semfov.episode import Stopwatch
-from semfov.observation.matching import match
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_zoom_observation
-from semfov.runs.window_looking import LEAST_CONFIDENCE, TileSize, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.window_looking import (
+    LEAST_CONFIDENCE,
+    TileSize,
+    WindowLooking,
+    WindowLookingConfig,
+    found_in,
+    right_boxes,
+)
 from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.gist import FOUND
@@ -199,7 +204,7 @@ class ZoomRun(WindowLooking, SceneRun):
             "objects": len(annotation.boxes),
             "found": counts,
             "boxes": len(objects),
-            "right": right_boxes(objects, annotation),
+            "right": int((right_boxes(objects, annotation) > 0).sum()),
             "windows": [list(glance.window.fixation) for glance in seen],
         }
 
@@ -240,15 +245,6 @@ class ZoomRun(WindowLooking, SceneRun):
                     }
                 )
         return records
-
-
-def right_boxes(objects: Objects, annotation: Annotation) -> int:
-    """Number of boxes that show an annotated object of their class (IoU 0.5); each object counts for one box."""
-    right = 0
-    for label in objects.labels.unique().tolist():
-        there = annotation.boxes[annotation.labels == label]
-        right += int((match(objects.boxes[objects.labels == label], there, torch.ones(len(there)).long()) > 0).sum())
-    return right
 
 
 def without_cut(glance: Glance) -> Glance:

@@ -213,7 +213,8 @@ class _Episode:
         self.agent, self.image, self.grid, self.strategy, self.target = agent, image, grid, strategy, target
         self.limits, self.verifier, self.outcome = limits, verifier, outcome
         mapper = agent.exploring.observer
-        self.trace = Trace(grid, agent.classes, target, None if mapper is strategy.observer else mapper)
+        beside, least = None if mapper is strategy.observer else mapper, agent.eye.detector.least
+        self.trace = Trace(grid, agent.classes, target, beside, least)
         self.stimulus = Stimulus.of(agent.eye, image)
         self.ended: int = 0
         self.limit: Ending | None = None

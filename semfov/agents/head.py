@@ -282,6 +282,7 @@ class HeadAgent(nn.Module):
                 views=views,
                 target=target,
                 classes=self.classes,
+                least=self.eye.detector.least,
                 actions=tuple(step.action for step in steps),
                 seconds=tuple(step.seconds for step in steps),
                 detections=tuple(step.detections for step in steps),

@@ -15,10 +15,13 @@ from semfov.data.large import LargePicture, picture_size
 from semfov.decision import check_thresholds
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
+from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import Turn, look_by_look
@@ -26,12 +29,15 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import merge
+from semfov.zoom.objects import merge, probable_objects
 from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, usual_slices
 
 USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
+
+LIKELY = 0.5
+"""Default for the least probability of the objects that a record counts."""
 
 NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
@@ -168,8 +174,12 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         batch: int = 1,
         worth: float = NEW_OBJECTS,
+        least: float | None = None,
     ) -> ZoomPath:
         """Find all objects of a class, of several or of all classes.
+
+        With fitted evidence the scores of objects are the probabilities that box and class are right
+        (`semfov.zoom.certainty`).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
@@ -180,6 +190,8 @@ class ZoomAgent(nn.Module):
             on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
+            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
+                takes 0.3.
 
         Returns:
             The looks and the objects.
@@ -192,13 +204,15 @@ class ZoomAgent(nn.Module):
         limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
+        if least is not None:
+            check_number(least, "least", 0, 1)
         glances, one = self._open(picture), targets[0] if len(targets) == 1 else None
         turns: Iterator[Turn[Any]]
         if self.evidence is None:
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
             turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence)
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence, least)
         ending: Ending | None = None
         with torch.inference_mode():
             for turn in turns:
@@ -217,6 +231,7 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         batch: int = 1,
         worth: float = NEW_OBJECTS,
+        least: float | None = None,
     ) -> ZoomPath:
         """Find all objects of all classes; see `find_all`.
 
@@ -227,6 +242,8 @@ class ZoomAgent(nn.Module):
             on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
+            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
+                takes 0.3.
 
         Returns:
             The looks and the objects.
@@ -236,7 +253,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
-        return self.find_all(picture, None, batch=batch, worth=worth, **limits)
+        return self.find_all(picture, None, batch=batch, worth=worth, least=least, **limits)
 
     def _open(self, picture: _Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
@@ -306,7 +323,7 @@ def search_windows(
     deciding = WindowDecisions(evidence, target, close_up, confirm=confirm, give_up=give_up, closer=closer)
     ending: Ending | None = None
     for turn in look_for(glances, evidence, target, confirm=float("inf")):
-        path.add(turn)
+        path.add(turn, counting=False)
         ending = limits.reached(len(seen), path.record)
         deciding.see(turn, len(seen), last=turn.ahead == 0 or limits.room(len(seen)) <= 1)
         while ending is None and deciding.candidate is not None:
@@ -350,6 +367,44 @@ def search_slices(
     return replace(path.record(ending or "windows"), decision=decision)
 
 
+def least_of(certainty: Certainty | None) -> float:
+    """The default of `least`: of probabilities where there is a certainty, else of scores."""
+    return LEAST if certainty is None else LIKELY
+
+
+def window_objects(
+    glances: Sequence[Glance],
+    lattice: Lattice,
+    target: int | Sequence[int] | None,
+    certainty: Certainty | None,
+    belief: ZoomBelief | None,
+    promised: float,
+    *,
+    latest: bool = False,
+) -> tuple[Objects, tuple[float, float] | None]:
+    """The objects of some looks, and the number of those that no look has shown, with its variance.
+
+    Args:
+        glances: the looks, the overview first.
+        lattice: lattice of the picture.
+        target: class 1..K, several, or None for all (`semfov.zoom.merge`).
+        certainty: gives objects probabilities; None leaves them their scores.
+        belief: belief after the looks; None expects no further objects.
+        promised: number of objects that the looks after the first were expected to find.
+        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
+
+    Returns:
+        The objects, and the number and its variance; None without a certainty.
+    """
+    if certainty is None:
+        return merge(glances, target), None
+    # A belief about objects of any class says nothing about those of several.
+    several = target is not None and not isinstance(target, int)
+    remaining = 0.0 if belief is None or several else belief.remaining()
+    given = {"remaining": remaining, "promised": promised}
+    return probable_objects(glances, lattice, target, certainty, **given, latest=latest)
+
+
 class _Windows:
     """The looks of an episode so far, of which records are made.
 
@@ -365,9 +420,13 @@ class _Windows:
         target: int | None,
         targets: tuple[int, ...] = (),
         evidence: GlimpseEvidence | None = None,
+        least: float | None = None,
     ) -> None:
         self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
         self.certainty = None if evidence is None else evidence.certainty
+        self.least = least_of(self.certainty) if least is None else least
+        self.belief: ZoomBelief | None = None
+        self.promised = 0.0
         self.seen: list[Glance] = []
         self.values: list[float] = []
         self.picture = glances.view.picture if isinstance(glances, LiveGlances) else None
@@ -378,13 +437,19 @@ class _Windows:
         """A reduced copy of the picture; None for stored looks."""
         return None if self.picture is None else reduced_copy(self.picture)
 
-    def add(self, turn: Turn[Any]) -> None:
-        """Keep a look."""
+    def add(self, turn: Turn[Any], *, counting: bool = True) -> None:
+        """Keep a look; in a search its value is no number of objects, and none are counted that no look has shown."""
+        if counting:
+            self.promised += turn.worth if self.seen else 0.0
+            self.belief = turn.belief
         self.seen.append(turn.glance)
         self.values.append(turn.worth)
 
     def record(self, ending: Ending | None = None) -> ZoomPath:
         """The record so far."""
+        objects, unseen = window_objects(
+            self.seen, self.glances.lattice, self.targets or self.target, self.certainty, self.belief, self.promised
+        )
         return ZoomPath(
             lattice=self.glances.lattice,
             classes=self.classes,
@@ -392,8 +457,9 @@ class _Windows:
             targets=self.targets,
             glances=tuple(self.seen),
             values=tuple(self.values),
-            candidates=merge(self.seen, self.targets or self.target),
-            certainty=self.certainty,
+            candidates=objects,
+            unseen=unseen,
+            least=self.least,
             ending=ending,
             photograph=self.photograph,
             source=self.source,

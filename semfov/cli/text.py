@@ -38,11 +38,7 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
 def _headline(record: GazeRecord) -> str:
     if record.decision is not None:
         return decision_text(record, record.decision)
-    expected = record.expected
-    number = f"{sum(expected.values()):.1f}"
-    if len(expected) > 1 and record.targets:
-        number = ", ".join(f"{count:.1f} {name}" for name, count in expected.items())
-    return f"{record.objects_in_words()}; expected number {number}"
+    return record.objects_in_words()
 
 
 def decision_text(record: GazeRecord, decision: Decision) -> str:

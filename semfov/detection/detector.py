@@ -8,11 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
 from semfov.errors import InputError, check, check_pixels, check_whole
+
+FAINT = 0.002
+"""Confidence from which on a candidate is a hint, unless the head has another one."""
 
 _LARGEST = 65_536  # largest side of a canvas in pixels
 
@@ -35,6 +39,8 @@ class Detector(nn.Module, ABC):
         fill: value of the canvas's padding.
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
+        faint: confidence from which on a candidate is a hint of where to zoom in (`semfov.zoom.hints`).
+        least: score from which on a detection counts: two of three are right.
         digest: sha256 of the weights, `""` for random weights.
 
     A detector that proposes the whole canvas as one box:
@@ -61,6 +67,8 @@ class Detector(nn.Module, ABC):
         fill: float = 0.5,
         stride: int | None = None,
         stretch: bool = False,
+        faint: float = FAINT,
+        least: float = LEAST,
         digest: str = "",
     ) -> None:
         super().__init__()
@@ -76,6 +84,7 @@ class Detector(nn.Module, ABC):
         self.fill = fill
         self.stride = stride
         self.stretch = stretch
+        self.faint, self.least = faint, least
         self.digest = digest
 
     @abstractmethod

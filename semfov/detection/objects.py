@@ -14,7 +14,7 @@ from semfov.detection.overlaps import intersection, neighbours, survivors
 from semfov.errors import InputError, check, check_number, check_shape
 
 LEAST = 0.3
-"""Score from which on objects are shown, printed, drawn and counted, unless another one is given."""
+"""Score from which on objects are shown, printed, drawn and counted, unless the detector or the user gives another."""
 
 FAINTEST = 0.05
 """Score from which on boxes are merged into candidates."""

@@ -80,6 +80,8 @@ class OnnxDetector(Detector):
             fill=preprocessing.fill,
             stride=stride,
             stretch=preprocessing.stretch,
+            faint=family.faint,
+            least=family.least,
             digest=digest,
         )
         fixed = None not in session.shape[2:]

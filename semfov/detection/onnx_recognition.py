@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from semfov.detection import onnx_heads as heads
+from semfov.detection.detector import FAINT
+from semfov.detection.objects import LEAST
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import InputError
@@ -32,11 +34,15 @@ class DetectionHead:
         decode: function from the outputs by name, in the model's order, and the canvas `(width, height)` to all boxes.
         preprocessing: preprocessing with which the family is trained.
         background: background policy for its scores.
+        faint: confidence from which on its candidates are hints (`semfov.detection.Detector`).
+        least: score from which on its detections count.
     """
 
     decode: Callable[[Outputs, Canvas], Candidates]
     preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
+    faint: float = FAINT
+    least: float = LEAST
 
 
 @dataclass(frozen=True)
@@ -212,7 +218,9 @@ HEADS: dict[str, DetectionHead] = {
     "yolov8": DetectionHead(lambda outputs, canvas: heads.decode_yolov8(_first(outputs))),
     "picodet": DetectionHead(_level_maps, _IMAGENET),
     "nanodet": DetectionHead(_level_maps, _NANODET),
-    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET),
+    # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
+    # some score, which would dilute that of the best one if only their shares counted.
+    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
     "detr": DetectionHead(
         lambda outputs, canvas: heads.decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,

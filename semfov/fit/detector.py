@@ -88,7 +88,7 @@ def fit_detector(
     config = FitDetectorConfig(
         model=Path(model),
         data=DataConfig(Path(root), Path(annotations), limit, min_instances=0, max_target_area=None),
-        detector=DetectorConfig(**{"background": None, **given}),
+        detector=DetectorConfig(**given),
         out=Path(out),
         workers=workers,
         **{name: value for name, value in settings.items() if name in of_fit},

@@ -52,7 +52,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
     """
 
     model: Path | None = None
-    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(background=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
     columns: Side = 10
     rows: Side = 10
     max_target_area: Positive = 0.2

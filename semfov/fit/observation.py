@@ -6,6 +6,7 @@ import json
 import platform
 import sys
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +25,7 @@ from semfov.fit.settings import FovealFitConfig, NameConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
-from semfov.observation import fit_discriminative
+from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
@@ -65,6 +66,8 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
             published, without shrinkage (None: shrinkage everywhere).
         holdout: one in every n photographs is held out for the evaluation.
         iou: least overlap (IoU) at which a detection counts as showing an object.
+        most: number of detections that are in memory at most, about; they are drawn evenly from all. The discriminative
+            fit and the report are from these, the published fits are from all.
         seed: seed of the fixations.
         shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
         out: folder for the model, the report and the figures.
@@ -83,6 +86,7 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
     enough: Whole | None = None
     holdout: Annotated[int, Range(2, 10**9)] = 10
     iou: Share = 0.5
+    most: Count = 1_000_000
     shard: Count = 32
     out: Path = Path("runs/fit_fom")
 
@@ -104,22 +108,27 @@ def fit_fom(config: FitObservationConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     kind = MosaicSettings if config.mosaics else SampleSettings
     settings = kind.of(config)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    samples = sampler.drawn(config.most)
     held_out = samples.scene % config.holdout == 0
     if not held_out.any() or held_out.all():
         raise DataError(
             f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
             "detections in all; give more photographs"
         )
-    model = fit_model(config, sampler, samples[~held_out])
+    statistics = statistics_of(
+        config, sampler, (part[part.scene % config.holdout != 0] for part in sampler.parts())
+    )  # fmt: skip
+    model = fit_model(config, sampler, statistics, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
-    misses = count_misses(sampler.scenes, samples, fitted_on, model.edges, sampler.cells)
+    counts = (count_misses(sampler.scenes, part, fitted_on, model.edges, sampler.cells) for part in sampler.parts())
+    misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
-    written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
+    written = write_report(config, model, fit_all(config, sampler, statistics, model), samples[held_out])
     print("written:")
     for file in [path, *written]:
         print(f"  {file}")
@@ -136,27 +145,30 @@ class Looker(Protocol):
     scenes: Scenes
 
 
-def fit_model(config: FitObservationConfig, sampler: Looker, samples: Samples) -> FovealObservationModel:
+def fit_model(
+    config: FitObservationConfig, sampler: Looker, statistics: DirichletStatistics, samples: Samples
+) -> FovealObservationModel:
     """Fit the model with the method in the settings.
 
     Args:
         config: the settings.
         sampler: the source of the detections.
-        samples: the labelled detections to fit on.
+        statistics: sufficient statistics of the labelled detections to fit on (`statistics_of`).
+        samples: the detections themselves, or some of them, for the discriminative fit.
 
     Returns:
         The model.
     """
     if config.method != "discriminative":
-        return fit_published(config, sampler, samples, config.method)
-    start = fit_published(config, sampler, samples, "newton", expected="empirical")
+        return fit_published(config, sampler, statistics, config.method)
+    start = fit_published(config, sampler, statistics, "newton", expected="empirical")
     return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
 def fit_published(
     config: FitObservationConfig,
     sampler: Looker,
-    samples: Samples,
+    statistics: DirichletStatistics,
     method: Method,
     **options: Any,
 ) -> FovealObservationModel:
@@ -167,7 +179,7 @@ def fit_published(
     Args:
         config: the settings.
         sampler: the source of the detections.
-        samples: the labelled detections to fit on.
+        statistics: sufficient statistics of the detections to fit on (`statistics_of`).
         method: method of the maximum-likelihood fit.
         options: further options of `FovealObservationModel.fit`.
 
@@ -180,38 +192,50 @@ def fit_published(
         # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
         return model.fit(
-            statistics_of(model, samples),
+            statistics,
             method=method,
             minimum=config.minimum,
             shrinkage=config.shrinkage,
             enough=config.enough,
             **options,
             **sampler.eye.settings(),
-            samples=len(samples),
+            samples=int(statistics.count.sum()),
             data=sampler.scenes.fingerprint,
             fixations=config.fixations,
             seed=config.seed,
         ).eval()
 
 
-def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletStatistics:
-    """Compute the sufficient statistics of samples by class and level."""
+def statistics_of(config: FitObservationConfig, sampler: Looker, parts: Iterable[Samples]) -> DirichletStatistics:
+    """Sum the sufficient statistics of detections by class and level, part by part.
+
+    Args:
+        config: the settings.
+        sampler: the source of the detections.
+        parts: the labelled detections.
+
+    Returns:
+        The statistics, which do not depend on how the detections are divided into parts.
+    """
+    model = FovealObservationModel.identity(sampler.eye.detector.classes, config.edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
-    return statistics.update(samples.scores, (samples.labels, model.level(samples.distance)))
+    for part in parts:
+        statistics.update(part.scores, (part.labels, model.level(part.distance)))
+    return statistics
 
 
 def fit_all(
-    config: FitObservationConfig, sampler: Looker, samples: Samples, model: FovealObservationModel
+    config: FitObservationConfig, sampler: Looker, statistics: DirichletStatistics, model: FovealObservationModel
 ) -> dict[str, FovealObservationModel]:
     """Fit the models that the report compares: raw scores, the published estimators, and the requested model."""
     edges, classes = config.edges, sampler.eye.detector.classes
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
-        models[f"Dirichlet, {method}"] = fit_published(config, sampler, samples, method)
-    models["Dirichlet with class prior"] = fit_published(config, sampler, samples, "newton", prior=True)
-    models["the same, tempered 0.1"] = fit_published(config, sampler, samples, "newton", prior=True, tempering=0.1)
+        models[f"Dirichlet, {method}"] = fit_published(config, sampler, statistics, method)
+    models["Dirichlet with class prior"] = fit_published(config, sampler, statistics, "newton", prior=True)
+    models["the same, tempered 0.1"] = fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
     if config.method == "discriminative":
         models["discriminative"] = model
     return models
@@ -224,8 +248,7 @@ def write_report(
     config: FitObservationConfig,
     model: FovealObservationModel,
     models: _Models,
-    samples: Samples,
-    held_out: torch.Tensor,
+    judged: Samples,
 ) -> list[Path]:
     """Evaluate the models on held-out samples, print the tables, and write the report.
 
@@ -233,13 +256,11 @@ def write_report(
         config: the settings.
         model: the fitted model.
         models: all models to compare, the fitted one last.
-        samples: all labelled detections.
-        held_out: `(M,)` boolean, which of them are held out.
+        judged: the held-out detections.
 
     Returns:
         The files that were written.
     """
-    judged = samples[held_out]
     with torch.inference_mode():
         predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
         likelihood = {
@@ -248,7 +269,7 @@ def write_report(
         }
     figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
     by_level = figures_by_level(model, predictions, judged)
-    text = report_markdown(config, model, figures, likelihood, by_level, len(samples) - len(judged))
+    text = report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))

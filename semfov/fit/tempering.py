@@ -69,7 +69,8 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
     settings = SampleSettings.of(config)
-    sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    samples = sampler.all()
     model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = tempering_report(hits)

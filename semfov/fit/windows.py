@@ -60,7 +60,8 @@ class FitZoomConfig(FitConfig, WorkConfig):
         detector: the detector.
         holdout: one in every n photographs is held out.
         mosaics: number of training mosaics of 4 × 4 photographs.
-        far: number of training mosaics of 8 × 6 photographs, in which objects are half as large.
+        far: number of training mosaics of 8 × 6 photographs, in which objects are half as large, and largest number of
+            those of 12 × 12 photographs of half the size, for fitting the certainty.
         crowded: number of training mosaics of 4 × 4 photographs of the third that hold most objects, for fitting the
             number of objects of any class.
         judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
@@ -118,7 +119,7 @@ DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms",
 VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
 """Settings that the verification depends on."""
 
-COUNTING = ("searched", "judged", "passes", "tile", "seed")
+COUNTING = ("searched", "far", "judged", "passes", "tile", "seed")
 """Settings that the certainty depends on."""
 
 SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
@@ -143,14 +144,15 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         classes: names of the detector's classes.
 
     Returns:
-        The mosaics: `near`, `far` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of held-out
-        photographs, and `searched` to fit decisions on.
+        The mosaics: `near`, `far`, `small` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of
+        held-out photographs, and `searched` to fit decisions on.
     """
     kept, held = split_photographs(config.data, classes, config.holdout)
     tile = config.tile, config.tile * 3 // 4
     return {
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
         "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
+        "small": Mosaics(kept, 12, 12, tile=(tile[0] // 2, tile[1] // 2), count=config.far, seed=config.seed + 7),
         "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
         "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
@@ -186,7 +188,8 @@ def look(task: tuple[str, int]) -> bytes:
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
     """Read the results of the looks at all mosaics."""
-    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store)) for n in range(len(mosaics))]
+    least = eye.detector.least
+    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store), least) for n in range(len(mosaics))]
 
 
 def fit_zoom(config: FitZoomConfig) -> None:
@@ -353,7 +356,10 @@ def fit_counts(
 ) -> list[str]:
     """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
     prepare_worker()
-    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "far", "small", "judged")}
+    # These mosaics have three and nine times as many photographs.
+    opened["far"] = opened["far"][: max(1, config.searched // 5)]
+    opened["small"] = opened["small"][: max(1, config.searched // 10)]
     lines = certainty_again(model, mosaics, opened, passes=config.passes)
     model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     return lines

@@ -2,29 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import islice
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice, product
 
 import torch
 from torch import Tensor
 
 from semfov.data.mosaics import Mosaics
-from semfov.detection.objects import LEAST
 from semfov.metrics.calibration import BinarySums
-from semfov.observation.matching import match
 from semfov.runs.progress import track
+from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
-from semfov.zoom.certainty import fit_certainty
+from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.objects import merge
+from semfov.zoom.glances import Glance
+from semfov.zoom.objects import merge_with_facts, probable_objects
 from semfov.zoom.search import find_everything
+
+_AFTER = (3, 6, 12, 24)
+"""Numbers of looks after which objects are taken."""
+_SCALES = tuple(0.05 * 1.25**n for n in range(16))
+_STRENGTHS = tuple(2.0**n for n in range(-2, 9))
+
+
+@dataclass(frozen=True)
+class MosaicExploration:
+    """An exploration of a mosaic.
+
+    Attributes:
+        looks: the stored looks at the mosaic.
+        target: class 1..K whose objects were looked for; None for all classes.
+        glances: the looks.
+        remaining: after each look, the number of objects that further looks are expected to find.
+        promised: after each look, the number of objects that the looks after the first were expected to find.
+        facts: facts about the objects after some of the looks, `(n, 14)`.
+        right: which of them are right, `(n,)` boolean.
+    """
+
+    looks: StoredGlances
+    target: int | None
+    glances: list[Glance]
+    remaining: list[float]
+    promised: list[float]
+    facts: Tensor
+    right: Tensor
+
+    def outcome(self, certainty: Certainty, number: int) -> tuple[float, float]:
+        """The sums of the probabilities of the objects after the first look, and after a number of them."""
+        lattice = self.looks.lattice
+        return tuple(  # type: ignore[return-value]
+            float(probable_objects(self.glances[:n], lattice, self.target, certainty)[0].scores.sum())
+            for n in (1, number)
+        )
 
 
 @torch.inference_mode()
-def judged_objects(
+def mosaic_explorations(
     model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> tuple[Tensor, Tensor]:
-    """Explore mosaics, and compare the objects with the annotated ones.
+) -> Iterator[MosaicExploration]:
+    """Explore mosaics, for objects of all classes and for those of the most frequent class of each.
 
     Args:
         model: the evidence that guides the explorations.
@@ -33,17 +70,104 @@ def judged_objects(
         passes: number of passes of the detector in each.
         title: label of the progress bar.
 
-    Returns:
-        Scores of the objects `(n,)`, and whether the box and the class of each are right `(n,)`.
+    Yields:
+        Each exploration.
     """
-    scores, right = [torch.zeros(0)], [torch.zeros(0, dtype=torch.bool)]
     for index, looks in enumerate(track(opened, title, "mosaic")):
-        objects = merge([turn.glance for turn in islice(find_everything(looks, model), passes)])
-        looks.save()
         annotation = mosaics.annotation(index)
-        scores.append(objects.scores)
-        right.append(match(objects.boxes, annotation.boxes.to(objects.boxes), annotation.labels) == objects.labels)
-    return torch.cat(scores), torch.cat(right)
+        for target in (None, int(annotation.labels.bincount().argmax())):
+            glances: list[Glance] = []
+            remaining, promised = [], [0.0]
+            for turn in islice(find_everything(looks, model, target), passes):
+                glances.append(turn.glance)
+                remaining.append(turn.belief.remaining())
+                promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
+            facts, right = [], []
+            for number in sorted({min(n, len(glances)) for n in (*_AFTER, passes)}):
+                objects, told = merge_with_facts(glances[:number], looks.lattice, target)
+                hits = right_boxes(objects, annotation)
+                facts.append(told[hits >= 0])
+                right.append(hits[hits >= 0] > 0)
+            yield MosaicExploration(looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right))
+        looks.save()
+
+
+def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> Certainty:
+    """Fit the probability of objects by maximum likelihood, with Newton's method in float64.
+
+    A weak prior (half an object for and against without any facts, and small weights) keeps the result finite where
+    all objects are right or all wrong.
+
+    Args:
+        facts: `(n, 14)`, facts about objects.
+        right: `(n,)` boolean, whether box and class of each are right.
+        ridge: strength of the prior of the weights.
+        steps: largest number of Newton steps.
+
+    Returns:
+        The certainty; it expects no objects that no look has shown.
+
+    >>> torch.manual_seed(0)
+    <torch._C.Generator object at ...>
+    >>> facts, truth = torch.randn(20_000, len(FACTS)), Certainty(-1.0, (0.5,) * len(FACTS))
+    >>> fitted = fit_certainty(facts, torch.rand(20_000) < truth.probability(facts))
+    >>> round(fitted.offset, 1), {round(weight, 1) for weight in fitted.weights}
+    (-1.0, {0.5})
+    """
+    none = torch.zeros(2, len(FACTS), dtype=torch.float64)
+    inputs = torch.cat([facts.double(), none])
+    inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
+    there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
+    weight = torch.ones(len(inputs), dtype=torch.float64)
+    weight[-2:] = 0.5
+    prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
+    prior[0] = 1e-6
+    found = torch.zeros_like(prior)
+    for _ in range(steps):
+        chance = (inputs @ found).sigmoid()
+        gradient = inputs.T @ (weight * (there - chance)) - prior * found
+        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
+        step = torch.linalg.solve(curvature, gradient).clamp(-2, 2)
+        found = found + step
+        if float(step.abs().max()) < 1e-9:
+            break
+    offset, *weights = found.tolist()
+    return Certainty(offset, tuple(weights))
+
+
+def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> Certainty:
+    """Fit how many objects further looks show to what they showed, by maximum likelihood over a grid.
+
+    Args:
+        certainty: the probability of objects.
+        explored: explorations.
+
+    Returns:
+        The certainty with scale and strength.
+    """
+    cases = []
+    for each in explored:
+        numbers = [n for n in _AFTER if n < len(each.glances)]
+        if not numbers:
+            continue
+        last = each.outcome(certainty, len(each.glances))[1]
+        for number in numbers:
+            first, now = each.outcome(certainty, number)
+            case = each.remaining[number - 1], each.promised[number - 1], max(now - first, 0.0), max(last - now, 0.0)
+            cases.append(case)
+    if not cases:
+        return certainty
+    remaining, promised, shown, more = torch.tensor(cases, dtype=torch.float64).unbind(-1)
+
+    def likelihood(scale: float, strength: float) -> float:
+        """Log likelihood of the negative binomial distribution, for numbers that need not be whole."""
+        shape, rate = strength * scale + shown, strength + promised
+        odds = remaining / (remaining + rate)
+        terms = torch.lgamma(shape + more) - torch.lgamma(shape) - torch.lgamma(more + 1)
+        return float((terms + shape * (1 - odds).log() + more * odds.clamp(min=1e-12).log()).sum())
+
+    scale, strength = max(product(_SCALES, _STRENGTHS), key=lambda pair: likelihood(*pair))
+    return Certainty(certainty.offset, certainty.weights, scale, strength)
 
 
 def certainty_again(
@@ -53,31 +177,43 @@ def certainty_again(
     *,
     passes: int,
 ) -> list[str]:
-    """Fit the certainty of a model on the mosaics `searched`, and evaluate it on those `judged`.
+    """Fit the certainty of a model on the mosaics `searched`, `far` and `small`, and evaluate it on those `judged`.
+
+    Pictures differ in how far the evidence can be believed, so mosaics of several kinds are needed.
 
     Args:
         model: the model; its certainty is replaced.
         mosaics: the mosaics by kind.
-        opened: the stored looks by kind.
+        opened: the stored looks by kind; of a kind, the first mosaics.
         passes: number of passes of the detector in each mosaic.
 
     Returns:
         Lines of the report in Markdown.
     """
-    seen = {
-        kind: judged_objects(model, mosaics[kind], opened[kind], passes=passes, title=title)
-        for kind, title in (("searched", "exploring"), ("judged", "exploring held-out mosaics"))
-    }
-    model.certainty = fit_certainty(*seen["searched"])
-    scores, right = seen["judged"]
-    chances, sure = model.certainty.probability(scores), scores >= LEAST
-    error = BinarySums.of(chances, right).ece
-    offset, slope = model.certainty
+    *kinds, held_out = (
+        list(mosaic_explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
+        for kind, title in (
+            ("searched", "exploring"),
+            ("far", "exploring far mosaics"),
+            ("small", "exploring small photographs"),
+            ("judged", "exploring held-out mosaics"),
+        )
+    )
+    known = [each for kind in kinds for each in kind]
+    fitted = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
+    model.certainty = fit_unseen(fitted, known)
+    facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
+    chances = model.certainty.probability(facts)
+    sure, error = chances >= 0.5, BinarySums.of(chances, right).ece
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, model.certainty.weights, strict=True))
     return [
-        f"Probability of an object: logit p = {offset:.3f} + {slope:.3f} logit s, fitted on {len(seen['searched'][0])} "
-        f"objects. Of {len(scores)} objects in mosaics of held-out photographs {int(right.sum())} are right and "
+        f"Probability of an object, fitted on {sum(len(each.right) for each in known)} objects: offset "
+        f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
+        f"strength {model.certainty.strength:g}.",
+        "",
+        f"Of {len(right)} objects in mosaics of held-out photographs {int(right.sum())} are right and "
         f"{float(chances.sum()):.0f} are expected; the expected calibration error is {error:.3f}. Of the "
-        f"{int(sure.sum())} from score {LEAST:g} on, {int(right[sure].sum())} are right and "
+        f"{int(sure.sum())} from probability 0.5 on, {int(right[sure].sum())} are right and "
         f"{float(chances[sure].sum()):.0f} expected.",
         "",
     ]

@@ -8,7 +8,7 @@ import torch
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.runs.progress import track
-from semfov.runs.window_looking import LEAST_CONFIDENCE, found_in
+from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -76,7 +76,7 @@ def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store
     passes: dict[float, float] = {}
     for value in track(PATIENCES, "choosing patience", "value"):
         model.patience = value
-        passes[value] = mean_passes(model, opened, slots)
+        passes[value] = mean_passes(model, opened, slots, eye.detector.least)
         for glances in opened:
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)
@@ -117,21 +117,24 @@ def mean_recall(
     return found / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
 
 
-def mean_passes(model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]]) -> float:
+def mean_passes(
+    model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]], least: float
+) -> float:
     """Compute the mean number of passes until a look at a photograph that shows the target.
 
     Args:
         model: the evidence that guides the search.
         glances: looks at each mosaic.
         slots: windows of the photographs of each mosaic.
+        least: score with which a look shows a class.
 
     Returns:
         The mean over mosaics and over the classes that any of their photographs shows.
     """
     counts = []
     for looks, photographs in zip(glances, slots, strict=True):
-        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= LEAST_CONFIDENCE
+        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= least
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
-            path = look_for(looks, model, target, slices=photographs)
+            path = look_for(looks, model, target, confirm=least, slices=photographs)
             counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
     return sum(counts) / max(len(counts), 1)

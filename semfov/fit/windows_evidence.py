@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
+from semfov.detection.objects import LEAST
 from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
-from semfov.runs.window_looking import LEAST_CONFIDENCE
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.gist import FOUND, Gist
@@ -48,11 +48,13 @@ class ZoomExample:
         lattice: the lattice of windows over the mosaic.
         labels: `(M,)`, classes of its objects.
         looks: the looks, the overview first.
+        least: score with which a look shows a class.
     """
 
     lattice: Lattice
     labels: Tensor
     looks: tuple[WindowResult, ...]
+    least: float = LEAST
 
 
 def closer_windows(
@@ -104,14 +106,14 @@ def windows_of(mosaics: Mosaics, index: int, lattice: Lattice) -> list[Window]:
     return [*half_steps(lattice), *(around(lattice, slot) for slot in slots)]
 
 
-def example_of(mosaics: Mosaics, index: int, glances: Glances) -> ZoomExample:
-    """Look at all windows of a mosaic and collect the results."""
+def example_of(mosaics: Mosaics, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:
+    """Look at all windows of a mosaic and collect the results; a look shows a class with a score of `least`."""
     annotation = mosaics.annotation(index)
     looks = [
         WindowResult(glance.window, glance.gist, glance.show, found_by(glance, annotation))
         for glance in glances.see(windows_of(mosaics, index, glances.lattice))
     ]
-    return ZoomExample(glances.lattice, annotation.labels, tuple(looks))
+    return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
                 if look.level > 0 and before < 0:
                     continue
                 slot = closer.window.within is not None
-                rows.append((pooled, summary, steps, closer.show >= LEAST_CONFIDENCE, before, slot, number))
+                rows.append((pooled, summary, steps, closer.show >= example.least, before, slot, number))
     columns: list[Any] = [*zip(*rows, strict=True)]
     whole = [torch.tensor(columns[place]) for place in (2, 4, 5, 6)]
     return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
@@ -289,8 +291,8 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """
     shown = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (
-        (shown >= LEAST_CONFIDENCE).nonzero()[:, 0] + 1,
-        ((shown >= 0.02) & (shown < LEAST_CONFIDENCE)).nonzero()[:, 0] + 1,
+        (shown >= example.least).nonzero()[:, 0] + 1,
+        ((shown >= 0.02) & (shown < example.least)).nonzero()[:, 0] + 1,
     )
     targets = torch.cat([_some(sure, 8), _some(faint, 4)])
     if not len(targets):

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.agents.windows import NEW_OBJECTS, ZoomAgent
+from semfov.agents.windows import NEW_OBJECTS, ZoomAgent, least_of, window_objects
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.decision import Decision
@@ -19,7 +19,7 @@ from semfov.zoom.closer import closer_window, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.glances import Glance, LiveGlances, Window
-from semfov.zoom.objects import merge, without_replaced
+from semfov.zoom.objects import without_replaced
 from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, usual_slices
 
@@ -148,6 +148,16 @@ class WindowPerception(FramePerception):
         places = {look.frame: place for place, look in enumerate(self._kept)}
         closer = () if self._decisions is None else self._decisions.looks
         shown = without_replaced(seen, glances.lattice) if self.forgetting.rate else seen
+        certainty = None if self.evidence is None else self.evidence.certainty
+        objects, unseen = window_objects(
+            shown,
+            glances.lattice,
+            self.targets or self.target,
+            certainty,
+            None if self._last is None or self.searches else self._last.belief,
+            sum(look.value for look in self._kept[1:] if not look.closely and math.isfinite(look.value)),
+            latest=self.forgetting.rate > 0,
+        )
         return WindowMoment(
             lattice=glances.lattice,
             classes=self.classes,
@@ -157,8 +167,9 @@ class WindowPerception(FramePerception):
             number=self._number,
             glances=tuple(seen),
             values=tuple(look.value for look in self._kept),
-            candidates=merge(shown, self.targets or self.target),
-            certainty=None if self.evidence is None else self.evidence.certainty,
+            candidates=objects,
+            unseen=unseen,
+            least=least_of(certainty),
             closer=tuple(replace(look, number=places[look.number]) for look in closer if look.number in places),
             next_window=self._next(glances),
             photograph=reduced_copy(picture),

@@ -76,7 +76,7 @@ class Record(Conversion):
         target: class index 1..K that was searched for; None for all classes.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count.
+        least: score from which on objects count; where scores are probabilities (`measure`), the probability.
         photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
         source: file of the picture; None if it does not come from a file.
 
@@ -102,6 +102,11 @@ class Record(Conversion):
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
         return None if self.target is None else self.classes[self.target]
+
+    @property
+    def measure(self) -> str:
+        """What `least` is compared with, in a word: `score`, or `probability`."""
+        return "score"
 
     @property
     @abstractmethod
@@ -189,7 +194,7 @@ class Record(Conversion):
         labels = self.objects.labels
         names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought()]
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
-        return f"{', '.join(names) or every} from score {self.least:g}"
+        return f"{', '.join(names) or every} from {self.measure} {self.least:g}"
 
     @abstractmethod
     def describe(self) -> str:
@@ -225,7 +230,7 @@ class Record(Conversion):
             )
         ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
-        return f"objects from score {self.least:g}: {', '.join([*named, *more]) or 'none'}"
+        return f"objects from {self.measure} {self.least:g}: {', '.join([*named, *more]) or 'none'}"
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the looks and the objects on the picture.

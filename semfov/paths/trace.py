@@ -7,6 +7,7 @@ import torch
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
+from semfov.detection.objects import LEAST
 from semfov.episode import Step
 from semfov.paths.scanpath import Scanpath
 
@@ -20,6 +21,7 @@ class Trace:
         target: class 1..K that is searched for; None for exploration.
         beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
             about all classes itself.
+        least: score from which on objects count.
 
     Attributes:
         steps: the steps, in order.
@@ -32,8 +34,15 @@ class Trace:
         scanpath = trace.scanpath()
     """
 
-    def __init__(self, grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None) -> None:
-        self.grid, self.classes, self.target, self.beside = grid, classes, target, beside
+    def __init__(
+        self,
+        grid: Grid,
+        classes: tuple[str, ...],
+        target: int | None,
+        beside: Observer | None,
+        least: float = LEAST,
+    ) -> None:
+        self.grid, self.classes, self.target, self.beside, self.least = grid, classes, target, beside, least
         self.steps: list[Step] = []
         self._maps: list[torch.Tensor] = []
         self._known: Belief | None = None
@@ -63,6 +72,7 @@ class Trace:
             grid=self.grid,
             classes=self.classes,
             target=target,
+            least=self.least,
             cells=torch.cat([step.cell for step in steps]),
             fixations=torch.cat([step.fixation for step in steps]),
             detections=tuple(step.detections for step in steps),

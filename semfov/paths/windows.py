@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -16,7 +16,6 @@ from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
-from semfov.zoom.certainty import Certainty
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 
@@ -50,7 +49,8 @@ TENSORS = {
 VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
     "windows": Array(WINDOW, "n"),
-    # Files of earlier versions have no certainty.
+    # Files of earlier versions have scores that are no probabilities, and some have a certainty.
+    "unseen": Maybe(pair(Number(low=0))),
     "certainty": Maybe(pair(Number())),
 }
 """JSON values of the files of looks at windows."""
@@ -81,8 +81,10 @@ class ZoomPath(GazeRecord):
         glances: looks in their order, the overview first. In a path from a file they have no gist.
         values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
             probability that the target is at the place.
-        certainty: probability that an object is there, by its score; None if it is not known.
-        candidates: objects merged from all looks (`semfov.zoom.merge`), of all scores from 0.05 on.
+        candidates: objects merged from all looks (`semfov.zoom.merge`). With a fitted certainty their scores are the
+            probabilities that box and class are right.
+        unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
+            no probabilities.
         detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
         closer: closer looks of a search, in their order; they are among the `glances`.
@@ -100,7 +102,7 @@ class ZoomPath(GazeRecord):
     glances: tuple[Glance, ...]
     values: tuple[float, ...]
     candidates: Objects = field()
-    certainty: Certainty | None = None
+    unseen: tuple[float, float] | None = None
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
@@ -117,17 +119,40 @@ class ZoomPath(GazeRecord):
 
     @property
     def expected(self) -> dict[str, float]:
-        """Expected number of objects by the name of their class: the sum of the probabilities of all candidates.
+        """Expected number of objects by the name of their class, those included that no look has shown yet.
 
-        Objects that no look has shown are not counted. Without a certainty it is the number of `objects`.
+        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
+        each class has its share of that sum. Without probabilities it is the number of `objects`.
         """
-        if self.certainty is None:
-            return super().expected
-        sums = torch.zeros(len(self.classes), dtype=torch.float64)
-        chances = self.certainty.probability(self.candidates.scores.double())
-        sums.index_add_(0, self.candidates.labels, chances)
-        labels = self._sought() or sums.nonzero()[:, 0].tolist()
-        return {self.classes[label]: float(sums[label]) for label in labels}
+        return super().expected if self.unseen is None else {name: mean for name, (mean, _) in self._numbers().items()}
+
+    @property
+    def expected_error(self) -> dict[str, float]:
+        """Standard deviation of the expected number of objects by the name of their class.
+
+        The candidates are independent (a Poisson-binomial distribution); what no look has shown has the distribution of
+        `semfov.zoom.certainty`. It is 0 without probabilities.
+        """
+        if self.unseen is None:
+            return dict.fromkeys(self.expected, 0.0)
+        return {name: variance**0.5 for name, (_, variance) in self._numbers().items()}
+
+    def _numbers(self) -> dict[str, tuple[float, float]]:
+        """Mean and variance of the number of objects of each class."""
+        more, spread = self.unseen or (0.0, 0.0)
+        chances, labels = self.candidates.scores.double(), self.candidates.labels
+        sums, spreads = torch.zeros(2, len(self.classes), dtype=torch.float64)
+        sums.index_add_(0, labels, chances)
+        spreads.index_add_(0, labels, chances * (1 - chances))
+        sought = list(self._sought() or sums.nonzero()[:, 0].tolist())
+        if not sought:
+            return {}
+        share = (sums[sought] + 1e-9) / (sums[sought] + 1e-9).sum()
+        means, variances = sums[sought] + share * more, spreads[sought] + share * spread
+        return {
+            self.classes[label]: (mean, variance)
+            for label, mean, variance in zip(sought, means.tolist(), variances.tolist(), strict=True)
+        }
 
     @property
     def passes(self) -> int:
@@ -146,21 +171,22 @@ class ZoomPath(GazeRecord):
             return f"{self.target_name}: {outcome} in {passes}"
         return f"{self.objects_in_words()} in {passes}"
 
+    @property
+    def measure(self) -> str:
+        """What `least` is compared with: `probability` where the scores of objects are that, otherwise `score`."""
+        return "score" if self.unseen is None else "probability"
+
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many are expected.
+        """Count the objects, by class where classes were searched for, and say how many are expected in all.
 
         Returns:
-            A phrase such as `about 3 × person (4 from score 0.3)`.
+            A phrase such as `41 × person from probability 0.5, about 47 ± 5 in all`.
         """
-        if self.certainty is None or not self._sought():
-            return super().objects_in_words()
-        seen, expected = self.objects.labels, self.expected
-        names = [
-            f"about {expected[self.classes[label]]:.0f} × {self.classes[label]} "
-            f"({int((seen == label).sum())} from score {self.least:g})"
-            for label in self._sought()
-        ]
-        return ", ".join(names)
+        told = super().objects_in_words()
+        if self.unseen is None:
+            return told
+        mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
+        return f"{told}, about {mean:.0f} ± {variance**0.5:.0f} in all"
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
@@ -224,9 +250,9 @@ class ZoomPath(GazeRecord):
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
         windows = [window_values(glance.window) for glance in self.glances]
-        certainty = None if self.certainty is None else list(self.certainty)
+        unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
-        return tensors, {"lattice": lattice, "windows": windows, "certainty": certainty}
+        return tensors, {"lattice": lattice, "windows": windows, "unseen": unseen}
 
     @classmethod
     def _fields(
@@ -234,6 +260,15 @@ class ZoomPath(GazeRecord):
     ) -> dict[str, Any]:
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
         objects = Objects(*(tensors[f"object_{name}"] for name in _OBJECTS))
+        unseen = record.get("unseen") and tuple(record["unseen"])
+        least: dict[str, float] = {}
+        if record.get("certainty"):
+            # A file of an earlier version: probabilities followed from the scores alone.
+            offset, slope = record["certainty"]
+            logits = torch.cat([objects.scores, objects.scores.new_tensor([shared["least"]])]).logit(1e-4)
+            *chances, limit = (offset + slope * logits).sigmoid().tolist()
+            objects, unseen = replace(objects, scores=objects.scores.new_tensor(chances)), (0.0, 0.0)
+            least = {"least": limit}
         looks, classes = shared["detections"], shared["classes"]
         for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
             fits = not len(values) or int(values.max()) < most
@@ -248,7 +283,8 @@ class ZoomPath(GazeRecord):
             ),
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,
-            "certainty": record.get("certainty") and Certainty(*record["certainty"]),
+            "unseen": unseen,
+            **least,
         }
 
 

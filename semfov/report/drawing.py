@@ -46,7 +46,7 @@ def record_html(record: Record) -> str:
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
-    key = f"Objects from score {record.least:g} are orange, and confirmed ones green."
+    key = f"Objects from {record.measure} {record.least:g} are orange, and confirmed ones green."
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
 
 

@@ -73,7 +73,7 @@ class DetectorConfig(Settings):
 
     name: str = "yolov3-tiny"
     weights: Path | None = None
-    background: BackgroundPolicy | None = "residual"
+    background: BackgroundPolicy | None = None
     threshold: Share = 0.02
     iou: Share = 0.5
     limit: Count = 100

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -240,6 +240,45 @@ class Sampler:
         """Store the samples of a shard."""
         self.store.write(self.digest(shard), samples.tensors())
 
+    def parts(self) -> Iterator[Samples]:
+        """The samples of one shard after another, so that not all are in memory.
+
+        Yields:
+            The samples of each shard, in the order of the photographs.
+
+        Raises:
+            DataError: the file of a shard is missing or damaged.
+        """
+        for shard in self.shards:
+            part = self.load(shard)
+            if part is None:
+                path = self.store.path(self.digest(shard))
+                raise DataError(f"{path} is missing or damaged; run the same command again")
+            yield part
+
+    def drawn(self, most: int) -> Samples:
+        """About so many detections, each drawn with the same probability, with all looks; all of them if they are less.
+
+        Args:
+            most: expected number of detections.
+
+        Returns:
+            The detections, in the order of the photographs.
+        """
+        share = most / max(sum(len(part) for part in self.parts()), 1)
+        if share >= 1:
+            return self.all()
+        return Samples.join(
+            [
+                part[torch.rand(len(part), generator=generator_for("detections", self.settings.seed, shard)) < share]
+                for shard, part in enumerate(self.parts())
+            ]
+        )
+
+    def all(self) -> Samples:
+        """The samples of all photographs in order."""
+        return Samples.join(list(self.parts()))
+
     def scenes_of(self, shard: int) -> range:
         """The photographs of a shard."""
         first = shard * self.settings.shard
@@ -275,8 +314,8 @@ def _run_shard(shard: int) -> bytes:
     return pack_tensors(_process["sampler"].sample(shard).tensors())
 
 
-def collect_samples(settings: SampleSettings, folder: Path, where: Where, title: str) -> tuple[Sampler, Samples]:
-    """Collect the labelled detections of all photographs in order; finished shards are read, the others computed.
+def collect_samples(settings: SampleSettings, folder: Path, where: Where, title: str) -> Sampler:
+    """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
 
     The result is the same to the last bit wherever the work is done, on processors of one kind.
 
@@ -287,10 +326,7 @@ def collect_samples(settings: SampleSettings, folder: Path, where: Where, title:
         title: label of the progress bar.
 
     Returns:
-        The sampler and the samples.
-
-    Raises:
-        DataError: the file of a shard is missing or damaged.
+        The sampler, which reads the samples.
     """
     sampler = settings.sampler(folder)
     todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
@@ -306,11 +342,4 @@ def collect_samples(settings: SampleSettings, folder: Path, where: Where, title:
     with closing(done):
         for shard, tensors in done:
             sampler.save(shard, Samples(**unpack_tensors(tensors)))
-    parts = []
-    for shard in sampler.shards:
-        part = sampler.load(shard)
-        if part is None:
-            path = sampler.store.path(sampler.digest(shard))
-            raise DataError(f"{path} is missing or damaged; run the same command again")
-        parts.append(part)
-    return sampler, Samples.join(parts)
+    return sampler

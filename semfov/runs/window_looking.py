@@ -11,8 +11,9 @@ from torch import Tensor
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
+from semfov.detection.objects import Objects
 from semfov.errors import DataError
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, match
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Range, Seed, Side, Whole
@@ -114,3 +115,36 @@ def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None
         return torch.zeros(len(annotation.boxes), dtype=torch.bool)
     hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
     return hits.any(0)
+
+
+def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -> Tensor:
+    """Compare objects with the annotated ones, class by class.
+
+    Each object in turn, the most confident first, is matched to the annotated object of its class that it overlaps
+    most among those not matched yet.
+
+    Args:
+        objects: M objects, the most confident first.
+        annotation: the annotated objects.
+        iou: least intersection over union of a match.
+
+    Returns:
+        `(M,)`: 1 for an object that matches an annotated one, 0 for one that does not, and -1 for one that matches none
+        but lies by half in an area that is annotated as a crowd of its class, which is neither.
+    """
+    found = torch.zeros(len(objects), dtype=torch.long)
+    for label in objects.labels.unique().tolist():
+        mine = (objects.labels == label).nonzero()[:, 0]
+        there = annotation.labels == label
+        single, crowd = (annotation.boxes[there & kind] for kind in (~annotation.crowd, annotation.crowd))
+        boxes = objects.boxes[mine]
+        hits = (match(boxes, single.to(boxes), torch.ones(len(single)).long(), iou=iou) > 0).long()
+        if len(crowd):
+            low = torch.maximum(boxes[:, None, :2], crowd[:, :2])
+            high = torch.minimum(boxes[:, None, 2:], crowd[:, 2:])
+            inside = (high - low).clamp(min=0).prod(-1) / (boxes[:, 2:] - boxes[:, :2]).prod(-1).clamp(min=1e-6)[
+                :, None
+            ]
+            hits[(hits == 0) & (inside >= 0.5).any(-1)] = -1
+        found[mine] = hits
+    return found

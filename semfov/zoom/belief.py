@@ -168,6 +168,11 @@ class ZoomBelief:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
         return torch.from_numpy(self._expected(level))
 
+    def remaining(self) -> float:
+        """Number of objects that looks are still expected to find: in each cell those of the level that finds most."""
+        levels = range(1, self.lattice.levels)
+        return float(np.maximum.reduce([self._expected(level) for level in levels]).sum()) if levels else 0.0
+
     def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""
         self._predict()

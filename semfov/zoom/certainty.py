@@ -1,72 +1,273 @@
-"""The probability that an object of a large picture is there, from its score; their sum is the expected number."""
+"""The probability that an object of a large picture is there, and how many objects no look has shown yet."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-_SMALLEST = 1e-4
+from semfov.detection.overlaps import intersection, neighbours
+from semfov.errors import check
+
+FACTS = (
+    "score",
+    "best",
+    "sharpest",
+    "shown",
+    "missed",
+    "cut",
+    "size",
+    "size squared",
+    "agreement",
+    "double",
+    "inside",
+    "around",
+    "octaves",
+    "rival",
+)
+"""Facts about an object, from which its probability is predicted (`object_facts`)."""
+
+_LEAST, _MOST = 0.01, 0.999
+_SMALLEST = 6.0
+"""Side in canvas pixels from which on a look should show an object."""
+_EDGE = 2.0
+"""Canvas pixels from the border of a window within which it may cut an object."""
 
 
-class Certainty(NamedTuple):
-    r"""A logistic regression from the score s of a merged object to the probability that its box and class are right.
+@dataclass(frozen=True)
+class Certainty:
+    r"""A logistic regression from facts f about an object to the probability that its box and class are right.
 
-    .. math:: \operatorname{logit} p = a + b \operatorname{logit} s
+    .. math:: \operatorname{logit} p = a + \sum_i b_i f_i
+
+    The number of objects that looks would still show is about :math:`c R`, where R is the number that the evidence
+    expects. The scale c is learned from the looks that were made: if they showed F new objects where the evidence
+    promised W, its distribution is a Gamma distribution, and the number is negative binomial:
+
+    .. math::
+        E[c] = \frac{k c_0 + F}{k + W}, \qquad
+        \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + W}
 
     Attributes:
         offset: a.
-        slope: b.
+        weights: b, one for each of `FACTS`.
+        scale: :math:`c_0`, the mean scale in the pictures of the fit.
+        strength: k, the promised objects after which the looks of a picture count as much as the pictures of the fit.
 
-    >>> Certainty(0.0, 1.0).probability(torch.tensor([0.2, 0.7]))
-    tensor([0.2000, 0.7000])
+    >>> certainty = Certainty.of([0.0, 1.0])
+    >>> certainty.probability(torch.eye(len(FACTS))[:2])
+    tensor([0.7311, 0.5000])
+    >>> Certainty.of([0.0, 1.0]).unseen(10.0, promised=5.0, shown=3.0)
+    (0.0, 0.0)
     """
 
     offset: float
-    slope: float
+    weights: tuple[float, ...]
+    scale: float = 0.0
+    strength: float = math.inf
 
-    def probability(self, scores: Tensor) -> Tensor:
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Self:
+        """Read a certainty from the numbers of a file.
+
+        Args:
+            numbers: a, b, :math:`c_0` and k. Files of earlier versions have a and the weight of the score alone.
+
+        Returns:
+            The certainty.
+
+        Raises:
+            InputError: there are more or fewer numbers.
+        """
+        if len(numbers) == 2:
+            return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
+        check(len(numbers) == len(FACTS) + 3, "certainty", f"2 or {len(FACTS) + 3} numbers", len(numbers))
+        offset, *weights, scale, strength = numbers
+        return cls(offset, tuple(weights), scale, strength)
+
+    @property
+    def numbers(self) -> list[float]:
+        """The numbers of a file, as `of` reads them."""
+        if math.isinf(self.strength):
+            return [self.offset, self.weights[0]]
+        return [self.offset, *self.weights, self.scale, self.strength]
+
+    def probability(self, facts: Tensor) -> Tensor:
         """The probabilities of objects.
 
         Args:
-            scores: `(...)`, their scores.
+            facts: `(M, 14)`, facts about them (`object_facts`).
 
         Returns:
-            `(...)`, in (0, 1).
+            `(M,)`, in (0, 1).
         """
-        return (self.offset + self.slope * scores.logit(_SMALLEST)).sigmoid()
+        return (self.offset + facts @ facts.new_tensor(self.weights)).sigmoid()
+
+    def unseen(self, expected: float, *, promised: float, shown: float) -> tuple[float, float]:
+        """How many objects further looks would show.
+
+        Args:
+            expected: R, the number of objects that the evidence expects further looks to show.
+            promised: W, the number that it expected of the looks after the first.
+            shown: F, the number that they have shown.
+
+        Returns:
+            The expected number, and its variance.
+        """
+        if math.isinf(self.strength):
+            return self.scale * expected, self.scale * expected
+        scale = (self.strength * self.scale + shown) / (self.strength + promised)
+        return scale * expected, scale * expected * (1 + expected / (self.strength + promised))
 
 
-def fit_certainty(scores: Tensor, right: Tensor, *, steps: int = 50) -> Certainty:
-    """Fit a certainty by maximum likelihood, with Newton's method in float64.
+def object_facts(
+    kept: Tensor,
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    looks: Tensor,
+    cut: Tensor,
+    windows: Tensor,
+    magnifications: Tensor,
+    size: tuple[int, int],
+    finest: float,
+    *,
+    latest: bool = False,
+) -> Tensor:
+    """List what the looks tell about each object.
 
-    A weak prior (half an object for and against, at a score of one half) keeps the result finite where all objects are
-    right or all wrong.
+    A look shows an object with a box of its class that overlaps it by half, or that the border of the window cuts and
+    of which four fifths lie in it. A look should show an object of 6 canvas pixels or more that lies in its window and
+    not at its border.
 
     Args:
-        scores: `(n,)`, scores of objects.
-        right: `(n,)` boolean, whether box and class of each are right.
-        steps: number of Newton steps.
+        kept: `(M,)`, indices of the boxes that were kept as objects.
+        boxes: `(L, 4)`, all boxes of all looks, in picture pixels.
+        scores: `(L,)`, their scores.
+        labels: `(L,)`, their classes.
+        looks: `(L,)`, number of the look of each box.
+        cut: `(L,)`, boolean, boxes that the border of their window cuts.
+        windows: `(N, 4)`, windows of the looks, in picture pixels.
+        magnifications: `(N,)`, in canvas pixels per picture pixel.
+        size: `(width, height)` of the picture, whose border cuts nothing.
+        finest: the largest magnification that a look can have.
+        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
 
     Returns:
-        The certainty.
-
-    >>> torch.manual_seed(0)
-    <torch._C.Generator object at ...>
-    >>> scores = torch.rand(20_000)
-    >>> fitted = fit_certainty(scores, torch.rand(20_000) < Certainty(-1.0, 0.5).probability(scores))
-    >>> round(fitted.offset, 1), round(fitted.slope, 1)
-    (-1.0, 0.5)
+        `(M, 14)`, the facts in the order of `FACTS`. `score`, `best` and `sharpest` are log odds: the score of the box
+        that was kept, the highest of all looks, and that of the sharpest look that shows or should show the object.
+        `shown` and `missed` are logarithms of one more than the number of looks that show it, and that should and do
+        not. `cut` is 1 for a cut box. `size` is the logarithm of its size on the canvas. `agreement` is the mean
+        overlap of other boxes with it, less 0.6. `double`, `inside` and `around` tell how far it overlaps a better
+        object of its class, lies in one, and contains one, times the score of that object; `rival` how far it overlaps
+        a better object of another class. `octaves` is the distance to the largest magnification.
     """
-    half = torch.tensor([0.5, 0.5], dtype=torch.float64)
-    logits = torch.cat([scores.double().logit(_SMALLEST), torch.zeros(2, dtype=torch.float64)])
-    there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
-    weight = torch.cat([torch.ones(len(scores), dtype=torch.float64), half])
-    inputs = torch.stack([torch.ones_like(logits), logits], -1)
-    found, ridge = torch.tensor([0.0, 1.0], dtype=torch.float64), 1e-3 * torch.eye(2, dtype=torch.float64)
-    start = found.clone()
-    for _ in range(steps):
-        chance = (inputs @ found).sigmoid()
-        gradient = inputs.T @ (weight * (there - chance)) - ridge @ (found - start)
-        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + ridge
-        found = found + torch.linalg.solve(curvature, gradient).clamp(-2, 2)
-    return Certainty(*found.tolist())
+    count = len(kept)
+    if not count:
+        return scores.new_zeros(0, len(FACTS))
+    corners, value, label, look, broken, view, scale = (
+        each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
+    )
+    chosen, scale = kept.numpy(), scale.astype(np.float32)
+    first, second, shared, area = _pairs(corners)
+    union = area[first] + area[second] - shared
+    overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    part = shared / np.maximum(area[second], 1e-6)
+    place = np.full(len(corners), -1)
+    place[chosen] = np.arange(count)
+    object_, same = place[first] >= 0, label[first] == label[second]
+    whole = object_ & same & (overlap >= 0.5)
+    shows = whole | (object_ & same & broken[second] & (part >= 0.8) & (look[first] != look[second]))
+
+    # The highest score of each object in each look.
+    best_of = np.zeros((count, len(view)), np.float32)
+    best_of[np.arange(count), look[chosen]] = value[chosen]
+    np.maximum.at(best_of, (place[first[shows]], look[second[shows]]), value[second[shows]])
+    seen_by, side = _visible(corners[chosen], view, scale, size, latest=latest)
+    shown = best_of > 0
+    usable = seen_by | shown
+    sharpness = np.where(usable, scale, 0)
+    sharpest = sharpness.max(1)
+    odds = _logit(best_of)
+    agree = whole & ~broken[second]
+    number = np.bincount(place[first[agree]], minlength=count)
+    agreement = np.bincount(place[first[agree]], overlap[agree], minlength=count) / np.maximum(number, 1)
+    best = odds.max(1)
+
+    # Among objects: the better one of a pair is the one with the higher best score.
+    pair = np.flatnonzero(object_ & (place[second] >= 0))
+    one, other = place[first[pair]], place[second[pair]]
+    worse = (best[other] > best[one]) | ((best[other] == best[one]) & (other < one))
+    pair, one, other = pair[worse], one[worse], other[worse]
+    weight, alike = 1 / (1 + np.exp(-best[other])), same[pair]
+    near = [each[pair] * weight for each in (overlap, shared / np.maximum(area[first], 1e-6), part)]
+    double, inside, around, rival = np.zeros((4, count), np.float32)
+    measures = (double, near[0], alike), (inside, near[1], alike), (around, near[2], alike), (rival, near[0], ~alike)
+    for into, values, which in measures:
+        np.maximum.at(into, one[which], values[which])
+
+    extent = (side + np.log2(sharpest) - 5) / 2
+    facts = [
+        _logit(value[chosen]),
+        best,
+        np.where(sharpness >= sharpest[:, None] * (1 - 1e-6), odds, -np.inf).max(1),
+        np.log1p(shown.sum(1)),
+        np.log1p((seen_by & ~shown).sum(1)),
+        broken[chosen],
+        extent,
+        extent**2,
+        np.where(number > 0, agreement - 0.6, 0),
+        double,
+        inside,
+        around,
+        np.maximum(math.log2(finest) - np.log2(sharpest), 0),
+        rival,
+    ]
+    return torch.from_numpy(np.stack(facts, -1).astype(np.float32))
+
+
+def _logit(scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    inside = np.clip(scores, _LEAST, _MOST)
+    odds: NDArray[np.float32] = np.log(inside / (1 - inside))
+    return odds
+
+
+def _pairs(
+    boxes: NDArray[np.float32],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """Pairs of boxes that overlap, in both orders, the areas that they share `(P,)`, and the areas of all `(L,)`."""
+    x1, y1, x2, y2 = np.ascontiguousarray(boxes.T)
+    order = x1.argsort(kind="stable")
+    one, other = neighbours(x1[order], x2[order])
+    one, other = order[one], order[other]
+    shared = intersection(x1, y1, x2, y2, one, other)
+    meets = shared > 0
+    one, other, shared = one[meets], other[meets], shared[meets]
+    area = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)
+    return np.concatenate([one, other]), np.concatenate([other, one]), np.concatenate([shared, shared]), area
+
+
+def _visible(
+    boxes: NDArray[np.float32],
+    windows: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    size: tuple[int, int],
+    *,
+    latest: bool,
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which looks should show each box, `(M, N)`, and the logarithms (base 2) of the sides of the boxes, `(M,)`."""
+    side = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(1)
+    # The border of the picture cuts no object.
+    low = np.where(windows[:, :2] > 0, windows[:, :2] + _EDGE / scale[:, None], -np.inf)
+    high = np.where(windows[:, 2:] < np.array(size) - 0.5, windows[:, 2:] - _EDGE / scale[:, None], np.inf)
+    inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
+    visible = inside & (side[:, None] + np.log2(scale) >= math.log2(_SMALLEST))
+    if latest:
+        for number in range(len(scale) - 1):
+            later = visible[:, number + 1 :] & (scale[number + 1 :] >= scale[number])
+            visible[:, number] &= ~later.any(1)
+    return visible, side

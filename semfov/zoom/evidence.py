@@ -14,7 +14,7 @@ from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
-from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
+from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.gist import Gist
@@ -45,8 +45,8 @@ class GlimpseEvidence(Pretrained):
     It answers two questions about a part w of the window and a class t, and one about the whole picture. Small
     networks answer them. They are fitted on mosaics of photographs with annotated boxes.
 
-    - Does a closer look at w show t with a score of 0.3 or more? The log odds depend on the strongest hint of t in w,
-      and on that of every other class, because some classes occur together:
+    - Does a closer look at w show t with a score of 0.3 or more (`detector.least`)? The log odds depend on the
+      strongest hint of t in w, and on that of every other class, because some classes occur together:
 
       .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
                 \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
@@ -72,7 +72,7 @@ class GlimpseEvidence(Pretrained):
         foresight: share of what still closer looks would find in a window that counts towards its value.
         thresholds: thresholds at which searches decide; None where none were chosen.
         verification: probabilities after closer looks; None decides searches without them.
-        certainty: probability that an object is there, by its score; None where it was not fitted.
+        certainty: probability that an object is there; None where it was not fitted.
         metadata: JSON values kept with the model.
 
     Raises:
@@ -114,7 +114,7 @@ class GlimpseEvidence(Pretrained):
             "survey": SURVEY,
             # Files of earlier versions have neither of these.
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
-            "certainty": Maybe(Pair((Number(low=-_LARGEST, high=_LARGEST), Number(low=-_LARGEST, high=_LARGEST)))),
+            "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
         },
     )
 
@@ -289,7 +289,7 @@ class GlimpseEvidence(Pretrained):
             "thresholds": _listed(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
             "verification": None if verified is None else {"thresholds": _listed(verified.thresholds)},
-            "certainty": None if self.certainty is None else list(self.certainty),
+            "certainty": None if self.certainty is None else self.certainty.numbers,
         }
 
     @classmethod
@@ -303,7 +303,7 @@ class GlimpseEvidence(Pretrained):
             foresight=record["foresight"],
             thresholds=_thresholds(record["thresholds"]),
             verification=None if verified is None else Verification(thresholds=_thresholds(verified["thresholds"])),
-            certainty=None if certainty is None else Certainty(*certainty),
+            certainty=None if certainty is None else Certainty.of(certainty),
             metadata=record["metadata"],
         )
         model.survey.foresight = record["survey"]["foresight"]

@@ -9,7 +9,6 @@ from semfov.detection.export_graph import Graph
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
 from semfov.zoom.gist import FOUND
-from semfov.zoom.hints import FAINT
 
 OPSET = 18
 """The first opset whose `Resize` has antialiasing."""
@@ -30,6 +29,7 @@ class LookGraph(Graph):
         super().__init__()
         self.wide, self.high = detector.input_size
         self.fill = float(detector.fill)
+        self.faint = detector.faint
 
     def double(self, value: float) -> str:
         """A constant in double precision, in which windows are computed."""
@@ -134,7 +134,7 @@ class LookGraph(Graph):
 
     def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str]:
         """Take the hints from candidates `(1, N, …)`: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
-        enough = self.add("GreaterOrEqual", confidence, self.constant(FAINT))
+        enough = self.add("GreaterOrEqual", confidence, self.constant(self.faint))
         _, index = self.add("Split", self.add("NonZero", enough), self.constant([1, 1]), outputs=2, axis=0)
         index = self.add("Squeeze", index, self.constant([0]))
         box, vector = (

@@ -151,7 +151,7 @@ class WindowEye(nn.Module):
         windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
             return WindowLooks(found, cut, None, windows)
-        faint = [hints_of(candidates, number, policy) for number in range(len(frames))]
+        faint = [hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
         placed = [Hints(place.to_picture(each.boxes, number), each.scores) for number, each in enumerate(faint)]
         return WindowLooks(found, cut, tuple(placed), windows)
 

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from semfov.detection.detector import FAINT
 from semfov.detection.scores import BackgroundPolicy, Candidates, shares
 from semfov.detection.selection import check_candidates, check_scores
-
-FAINT = 0.002
-"""Confidence from which on a candidate is a hint."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +22,14 @@ class Hints:
     scores: Tensor
 
 
-def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hints:
+def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float = FAINT) -> Hints:
     """Take the hints from all boxes of a detector's head.
 
     Args:
         candidates: the boxes, in canvas pixels.
         image: index of the image in the batch.
         policy: background policy of the scores.
+        faint: confidence from which on a candidate is a hint.
 
     Returns:
         The hints, in canvas pixels, without gradients.
@@ -45,7 +44,7 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hi
             [0.9000]])
     """
     confidence = candidates.confidence[image].detach()
-    index = (confidence >= FAINT).nonzero()[:, 0]
+    index = (confidence >= faint).nonzero()[:, 0]
     kept = candidates.take(image, index)
     boxes = kept.boxes.detach()
     check_candidates(image, confidence, boxes)

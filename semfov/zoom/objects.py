@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, Objects, merge_looks
+from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
+from semfov.zoom.certainty import FACTS, Certainty, object_facts
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 
@@ -73,6 +75,81 @@ def merge(
     """
     if not glances:
         return Objects.none()
+    return merge_looks(*_detected(glances, target), score=score, iou=iou, inside=inside)
+
+
+def merge_with_facts(
+    glances: Sequence[Glance],
+    lattice: Lattice,
+    target: int | Sequence[int] | None = None,
+    *,
+    latest: bool = False,
+) -> tuple[Objects, Tensor]:
+    """Merge the detections of several looks as `merge` does, and list the facts about each object.
+
+    Args:
+        glances: looks at one picture.
+        lattice: lattice of the picture.
+        target: as for `merge`.
+        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
+
+    Returns:
+        Objects, the highest scores first, and their facts (`semfov.zoom.certainty.object_facts`).
+    """
+    if not glances:
+        return Objects.none(), torch.zeros(0, len(FACTS))
+    every = _detected(glances, target)
+    # Fainter boxes say nothing that the absence of a box does not.
+    enough = every[1] >= FAINTEST
+    boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
+    kept = unlike(boxes, scores, labels, looks, cut, sharpness)
+    windows = torch.tensor([glance.window.region(lattice) for glance in glances])
+    scale = torch.tensor([glance.window.fixation[2] for glance in glances])
+    finest = lattice.magnifications[-1]
+    seen = windows, scale, lattice.size, finest
+    facts = object_facts(kept, boxes, scores, labels, looks, cut, *seen, latest=latest)
+    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept]), facts
+
+
+def probable_objects(
+    glances: Sequence[Glance],
+    lattice: Lattice,
+    target: int | Sequence[int] | None,
+    certainty: Certainty,
+    *,
+    remaining: float = 0.0,
+    promised: float = 0.0,
+    latest: bool = False,
+) -> tuple[Objects, tuple[float, float]]:
+    """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown.
+
+    Args:
+        glances: looks at one picture, the overview first.
+        lattice: lattice of the picture.
+        target: as for `merge`.
+        certainty: predicts the probabilities.
+        remaining: number of objects that looks are still expected to find (`ZoomBelief.remaining`).
+        promised: number of objects that the looks after the first were expected to find.
+        latest: as for `merge_with_facts`.
+
+    Returns:
+        Objects, the most probable first, and the number of objects that further looks are expected to show, with its
+        variance.
+    """
+    objects = _probable(*merge_with_facts(glances, lattice, target, latest=latest), certainty)
+    before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
+    shown = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
+    return objects, certainty.unseen(remaining, promised=promised, shown=shown)
+
+
+def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
+    """Objects with their probabilities in place of their scores, the most probable first."""
+    chances = certainty.probability(facts).to(objects.scores)
+    return replace(objects, scores=chances)[chances.argsort(descending=True, stable=True)]
+
+
+def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> tuple[Tensor, ...]:
+    """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications."""
     looks = [glance.detections for glance in glances]
     seen = Detections(
         *(torch.cat(parts, 1) for parts in zip(*((d.boxes, d.scores, d.mask) for d in looks), strict=True))
@@ -85,5 +162,4 @@ def merge(
     counts = torch.tensor([found.mask.shape[1] for found in looks])
     number = torch.arange(len(looks)).repeat_interleave(counts)
     closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]
-    cut = torch.cat([glance.cut for glance in glances])
-    return merge_looks(seen.boxes[0], value, label, number, cut, closer, score=score, iou=iou, inside=inside)
+    return seen.boxes[0], value, label, number, torch.cat([glance.cut for glance in glances]), closer

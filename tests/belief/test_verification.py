@@ -80,7 +80,7 @@ def test_shipped_models_are_loaded_by_name_and_others_are_none():
         model.check_compatible(evidence.metadata)
 
 
-@pytest.mark.parametrize("name", ["yolox-nano", "yolov3-tiny"])
+@pytest.mark.parametrize("name", ["yolox-nano", "yolov3-tiny", "nanodet-plus-m-1.5x"])
 def test_a_better_closer_look_raises_both_shipped_probabilities(name):
     """More score for the target at the place and in the window, and less for other classes, never lower the place."""
     model = Verification.from_pretrained(name)

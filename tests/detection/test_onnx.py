@@ -43,6 +43,11 @@ def residual(classes, objectness=None):
     return [1 - present] + [present * c / sum(classes) for c in classes]
 
 
+def normalised(classes):
+    parts = [1 - max(classes), *classes]
+    return [part / sum(parts) for part in parts]
+
+
 def yolox():
     def read(out):
         return [
@@ -111,7 +116,7 @@ def picodet():
 def nanodet_plus():
     def read(out):
         boxes = distance_boxes(out["output"][:, 3:], (8, 16, 32, 64), 0.0)
-        return list(zip(boxes, map(residual, out["output"][:, :3].tolist()), strict=True))
+        return list(zip(boxes, map(normalised, out["output"][:, :3].tolist()), strict=True))
 
     return {"output": random(1, 85, 35)}, read
 

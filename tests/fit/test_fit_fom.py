@@ -58,6 +58,31 @@ def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, 
     assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
 
 
+def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted, tmp_path):
+    assert main([*SMALL, "1", "--out", str(tmp_path), "--cache", str(fitted), "--most", "40"]) == 0
+    whole, drawn = (FovealObservationModel.from_pretrained(at / "yolov3-tiny.safetensors") for at in (fitted, tmp_path))
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, drawn.state_dict()[name]), name
+    judged = [
+        json.loads((at / "manifest.json").read_text())["held_out"]["raw scores"]["count"] for at in (fitted, tmp_path)
+    ]
+    assert 0 < judged[1] < judged[0] / 2
+
+
+def test_detections_are_drawn_evenly(fitted):
+    config = FitObservationConfig(data=DataConfig(limit=6, min_instances=0, max_target_area=None), fixations=2, shard=2)
+    sampler = SampleSettings.of(config).sampler(fitted / "samples")
+    every = sampler.all()
+    assert torch.equal(sampler.drawn(len(every)).scores, every.scores)
+    some = sampler.drawn(len(every) // 2)
+    assert torch.equal(sampler.drawn(len(every) // 2).boxes, some.boxes)
+    assert torch.equal(some.scenes, every.scenes)
+    # The number is binomial: within five standard deviations of its mean.
+    assert abs(len(some) - len(every) / 2) < 5 * (len(every) / 4) ** 0.5
+    places = [(each.scene.double().mul(1e4).add(each.boxes[:, 0].double())).tolist() for each in (some, every)]
+    assert set(places[0]) < set(places[1])
+
+
 def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
     model = fitted / "yolov3-tiny.safetensors"
     arguments = ["--data.limit", "3", "--fixations", "2", "--model", str(model), "--out", str(tmp_path)]

@@ -15,7 +15,7 @@ from semfov.fit.parts.windows import RECALL_PASSES, in_raw_order, photograph_rec
 from semfov.fit.windows import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
-from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.config import DataConfig
 from semfov.runs.looking import looking_of
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
@@ -40,7 +40,7 @@ def folder_of(home, **settings):
     config = FitDetectorConfig(
         model=home / "colours.onnx",
         data=DataConfig(root, root / "instances.json", min_instances=0, max_target_area=None),
-        detector=DetectorConfig(background=None), columns=4, rows=4, window_steps=20, workers=1,
+        columns=4, rows=4, window_steps=20, workers=1,
         out=home / "models", cache=home / "cache",
     )  # fmt: skip
     config = replace(config, **settings).named()

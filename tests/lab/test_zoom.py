@@ -11,10 +11,11 @@ from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
 from eval.zoom.numbers import number_table
 from eval.zoom.report import recall_and_precision, recall_cells
-from eval.zoom.run import ZoomConfig, ZoomRun, right_boxes
+from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.runs.config import DataConfig
+from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_orders import in_order, quad_tree, shuffled
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.episode import look_by_look
@@ -177,8 +178,8 @@ def test_a_right_box_shows_an_object_of_its_class_that_no_better_box_shows():
     objects = Objects(boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), labels, looks)
     there = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60], [80, 80, 90, 90]])
     annotation = Annotation(there, torch.tensor([1, 1, 2]), torch.zeros(3, dtype=torch.bool), (100, 100))
-    assert right_boxes(objects, annotation) == 2
-    assert right_boxes(Objects.none(), annotation) == 0
+    assert right_boxes(objects, annotation).tolist() == [1, 0, 1, 0, 0]
+    assert len(right_boxes(Objects.none(), annotation)) == 0
 
 
 def test_orders_look_at_every_slice_once(config):

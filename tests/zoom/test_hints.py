@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from semfov.detection import Candidates, Detector, Selection
+from semfov.detection.detector import FAINT
 from semfov.errors import InputError
 from semfov.zoom import WindowEye
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import LiveGlances, on_lattice
-from semfov.zoom.hints import FAINT, hints_of
+from semfov.zoom.hints import hints_of
 
 KINDS = 3
 
@@ -19,9 +20,9 @@ KINDS = 3
 class Given(Detector):
     """Proposes boxes that do not depend on the canvas; most are faint, many lie on each other."""
 
-    def __init__(self, count: int, background: str = "residual") -> None:
+    def __init__(self, count: int, background: str = "residual", faint: float = FAINT) -> None:
         selection = Selection(threshold=0.02, iou=0.5, limit=20)
-        super().__init__("given", ("a", "b", "c"), (128, 128), background=background, selection=selection)
+        super().__init__("given", ("a", "b", "c"), (128, 128), background=background, selection=selection, faint=faint)
         generator = torch.Generator().manual_seed(count)
         places = torch.rand(count // 4, 2, generator=generator) * 128
         middle = places.repeat(4, 1) + 0.1 * torch.rand(count // 4 * 4, 2, generator=generator)
@@ -36,10 +37,11 @@ class Given(Detector):
         return Candidates(self.boxes.expand(*size, 4), self.scores.expand(*size, KINDS), self.certain.expand(*size))
 
 
+@pytest.mark.parametrize("faint", [FAINT, 0.1])
 @pytest.mark.parametrize("count", [40, 2000])
 @pytest.mark.parametrize(("column", "row", "level"), [(0, 0, 0), (4, 3, 1), (16, 8, 1)])
-def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column, row, level):
-    detector = Given(count)
+def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, faint, column, row, level):
+    detector = Given(count, faint=faint)
     eye = WindowEye(detector)
     view = eye.open(torch.zeros(3, 384, 512))
     lattice = view.lattice
@@ -55,7 +57,7 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column
     strongest, size = torch.zeros(rows, columns, KINDS), torch.zeros(rows, columns)
     leads, hints = torch.zeros(rows, columns), 0
     for box, scores, certain in zip(detector.boxes, detector.scores, detector.certain, strict=True):
-        if float(certain * scores.max()) < FAINT:
+        if float(certain * scores.max()) < faint:
             continue
         confidence = float(certain * scores.max() / scores.sum())
         hints += 1

@@ -28,8 +28,8 @@ def fit_context(config: FitContextConfig) -> None:
     sampler, samples, scenes = None, None, None
     if config.weigh:
         settings = SampleSettings.of(config)
-        sampler, samples = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
-        scenes = sampler.scenes
+        sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+        samples, scenes = sampler.all(), sampler.scenes
     scenes = make_scenes(config.data, COCO_CLASSES) if scenes is None else scenes
     places = read_places(scenes, config)
     held_out = [index % config.holdout == 0 for index in range(len(places))]

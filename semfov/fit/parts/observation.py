@@ -10,7 +10,7 @@ from semfov.errors import DataError
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
 from semfov.fit.misses import count_misses
-from semfov.fit.observation import FitObservationConfig, fit_model
+from semfov.fit.observation import FitObservationConfig, fit_model, statistics_of
 from semfov.fit.parts.base import PartFit, PartResult
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation.foveal import FovealObservationModel
@@ -43,7 +43,7 @@ class ObservationFit(PartFit):
                 f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
                 "detections in all; give more photographs"
             )
-        model = fit_model(config, run, samples[~held_out])
+        model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = whole_photograph(self.config.columns, self.config.rows)
         misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)

@@ -1,0 +1,238 @@
+"""Probabilities of objects of large pictures, and numbers of objects that no look has shown."""
+
+import json
+import math
+from dataclasses import replace
+from itertools import product
+
+import pytest
+import torch
+from scipy.stats import nbinom
+
+from semfov.agents import ZoomAgent
+from semfov.data.scene import Annotation
+from semfov.detection.detections import Detections
+from semfov.detection.objects import Objects, unlike
+from semfov.errors import InputError
+from semfov.fit.windows_certainty import fit_certainty
+from semfov.io.storage import read, write_file
+from semfov.paths import ZoomPath
+from semfov.runs.window_looking import right_boxes
+from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom.certainty import FACTS, Certainty, object_facts
+from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge, merge_with_facts
+
+SCALES = torch.tensor([0.25, 0.5, 1.0, 0.5])
+WINDOWS = torch.tensor([[0.0, 0, 400, 300], [0, 0, 200, 200], [50, 50, 150, 150], [100, 100, 300, 300]])
+SIZE = (400, 300)
+
+
+def logit(score):
+    score = min(max(score, 0.01), 0.999)
+    return math.log(score / (1 - score))
+
+
+def shared(a, b):
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
+
+
+def area(box):
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def iou(a, b):
+    both = shared(a, b)
+    return both / (area(a) + area(b) - both)
+
+
+def visible(box, look):
+    window, edge, scale = WINDOWS[look].tolist(), 2 / float(SCALES[look]), float(SCALES[look])
+    low = [n + edge if n > 0 else -math.inf for n in window[:2]]
+    high = [n - edge if n < side else math.inf for n, side in zip(window[2:], SIZE, strict=True)]
+    inside = box[0] >= low[0] and box[1] >= low[1] and box[2] <= high[0] and box[3] <= high[1]
+    return inside and math.sqrt(area(box)) * scale >= 6
+
+
+def shown_in(number, look, boxes, scores, labels, looks, cut):
+    """Best score with which a look shows an object, and the overlaps of other whole boxes with it."""
+    box, best, overlaps = boxes[number], scores[number] if looks[number] == look else 0, []
+    for other in range(len(boxes)):
+        if looks[other] == look and labels[other] == labels[number] and other != number:
+            whole = iou(box, boxes[other]) >= 0.5
+            part = (
+                cut[other] and looks[other] != looks[number] and shared(box, boxes[other]) >= 0.8 * area(boxes[other])
+            )
+            best = max(best, scores[other]) if whole or part else best
+            overlaps += [iou(box, boxes[other])] if whole and not cut[other] else []
+    return best, overlaps
+
+
+def plain_facts(kept, boxes, scores, labels, looks, cut, latest):
+    """The facts of object after object, look after look."""
+    rows, bests = [], []
+    for number in kept:
+        box = boxes[number]
+        seen = [look for look in range(len(SCALES)) if visible(box, look)]
+        if latest:
+            seen = [n for n in seen if not any(m > n and SCALES[m] >= SCALES[n] for m in seen)]
+        told = [shown_in(number, look, boxes, scores, labels, looks, cut) for look in range(len(SCALES))]
+        best = [score for score, _ in told]
+        use = [look for look in range(len(SCALES)) if best[look] > 0 or look in seen]
+        agreement = [each for _, overlaps in told for each in overlaps]
+        finest = max(float(SCALES[look]) for look in use)
+        sharpest = max(logit(best[look]) for look in use if SCALES[look] == finest)
+        size = (math.log2(math.sqrt(area(box))) + math.log2(finest) - 5) / 2
+        mean = sum(agreement) / len(agreement) - 0.6 if agreement else 0
+        missed = sum(best[look] == 0 for look in seen)
+        bests.append(logit(max(best)))
+        numbers = math.log1p(sum(score > 0 for score in best)), math.log1p(missed)
+        first = logit(scores[number]), bests[-1], sharpest, *numbers, float(cut[number])
+        rows.append([*first, size, size**2, mean, 0, 0, 0, -math.log2(finest), 0])
+    for (one, number), (other, rival) in product(enumerate(kept), repeat=2):
+        if (bests[other], -other) <= (bests[one], -one):
+            continue
+        weight, box, better = 1 / (1 + math.exp(-bests[other])), boxes[number], boxes[rival]
+        both, overlap = shared(box, better), iou(box, better)
+        alike = (9, overlap), (10, both / area(box)), (11, both / area(better))
+        for place, value in alike if labels[number] == labels[rival] else ((13, overlap),):
+            rows[one][place] = max(rows[one][place], weight * value)
+    return rows
+
+
+@pytest.mark.parametrize("latest", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_facts_equal_a_plain_loop(latest, dtype):
+    generator = torch.Generator().manual_seed(3)
+    count = 60
+    corner = 40 + torch.rand(count, 2, generator=generator) * 90
+    boxes = torch.cat([corner, corner + 8 + torch.rand(count, 2, generator=generator) * 50], -1).to(dtype)
+    scores = (0.06 + 0.9 * torch.rand(count, generator=generator)).to(dtype)
+    labels = torch.randint(1, 3, (count,), generator=generator)
+    looks, cut = torch.randint(0, 4, (count,), generator=generator), torch.rand(count, generator=generator) < 0.3
+    kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
+    assert 5 < len(kept) < count - 5
+    every = boxes, scores, labels, looks, cut
+    facts = object_facts(kept, *every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
+    plain = plain_facts(kept.tolist(), *(each.tolist() for each in every), latest)
+    assert facts.shape == (len(kept), len(FACTS))
+    torch.testing.assert_close(facts, torch.tensor(plain), rtol=1e-4, atol=1e-4)
+    assert (facts.std(0) > 0).all()  # every fact differs between these objects
+
+
+def test_objects_have_the_facts_of_their_looks():
+    lattice = Lattice.over((1280, 960), (160, 160))
+
+    def look(level, box, score):
+        vectors = torch.tensor([[[1 - score, score, 0.0]]])
+        seen = Detections(torch.tensor([[box]]), vectors, torch.ones(1, 1, dtype=torch.bool))
+        return Glance(on_lattice(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
+
+    near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
+    faint = look(2, [21.0, 20, 90, 92], 0.04)
+    objects, facts = merge_with_facts([far, near, faint], lattice)
+    assert objects.boxes.tolist() == merge([far, near, faint]).boxes.tolist()
+    told = dict(zip(FACTS, facts[0].tolist(), strict=True))
+    assert told["score"] == told["best"] == told["sharpest"] == pytest.approx(logit(0.9))
+    assert told["shown"] == pytest.approx(math.log(3))
+    assert told["missed"] == pytest.approx(math.log(2))  # a box of so low a score is none
+    assert merge_with_facts([], lattice)[1].shape == (0, len(FACTS))
+
+
+def test_probabilities_of_the_fit_maximise_the_likelihood():
+    generator = torch.Generator().manual_seed(0)
+    facts = torch.randn(500, len(FACTS), generator=generator)
+    right = torch.rand(500, generator=generator) < facts[:, 0].sigmoid()
+    fitted = fit_certainty(facts, right)
+    parameters = torch.tensor([fitted.offset, *fitted.weights], dtype=torch.float64, requires_grad=True)
+    inputs = torch.cat([torch.ones(500, 1), facts], -1).double()
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(inputs @ parameters, right.double(), reduction="sum")
+    empty = parameters[0].sigmoid()
+    loss = loss + 0.5 * parameters[1:].square().sum() - 0.5 * (empty * (1 - empty)).log()
+    (gradient,) = torch.autograd.grad(loss, parameters)
+    assert gradient.abs().max() < 1e-3
+    everywhere = fit_certainty(facts, torch.ones(500, dtype=torch.bool))
+    assert math.isfinite(everywhere.offset)
+
+
+def test_what_no_look_has_shown_is_negative_binomial():
+    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0)
+    mean, variance = certainty.unseen(6.0, promised=10.0, shown=3.0)
+    shape, rate = 4 * 0.5 + 3, 4 + 10
+    law = nbinom(shape, rate / (rate + 6))
+    assert mean == pytest.approx(law.mean())
+    assert variance == pytest.approx(law.var())
+    assert certainty.unseen(0.0, promised=10.0, shown=3.0) == (0.0, 0.0)
+    assert Certainty.of(certainty.numbers) == certainty
+    with pytest.raises(InputError, match="certainty: expected 2 or 17 numbers, got 3"):
+        Certainty.of([1.0, 2.0, 3.0])
+
+
+def test_boxes_are_right_once_and_crowds_are_neither():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 9], [0, 0, 10, 10], [41, 41, 49, 49], [80, 80, 90, 90]])
+    found = Objects(
+        boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), torch.tensor([1, 1, 2, 1, 1]), torch.zeros(5).long()
+    )
+    there = torch.tensor([[0.0, 0, 10, 10], [40, 40, 60, 60]])
+    crowd = torch.tensor([False, True])
+    annotation = Annotation(there, torch.tensor([1, 1]), crowd, (100, 100))
+    assert right_boxes(found, annotation).tolist() == [1, 0, 0, -1, 0]
+
+
+@pytest.fixture
+def path(detector, picture):
+    torch.manual_seed(0)
+    weights = (1.0, *[0.0] * (len(FACTS) - 1))
+    evidence = GlimpseEvidence(3, 8, certainty=Certainty(-0.5, weights, scale=0.5, strength=2.0))
+    return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, passes=4)
+
+
+def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
+    assert path.least == 0.5
+    assert (path.objects.scores >= 0.5).all()
+    assert path.unseen[0] > 0
+    chances = path.candidates.scores.double()
+    assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
+    variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
+    assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
+    number = f"about {sum(path.expected.values()):.0f} ± {variance**0.5:.0f} in all"
+    assert path.describe() == f"{len(path.objects)} objects from probability 0.5, {number} in 4 passes"
+    path.save(tmp_path / "a.safetensors")
+    loaded = ZoomPath.load(tmp_path / "a.safetensors")
+    assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
+    assert len(replace(path, least=0.0).objects) == len(path.candidates)
+    assert not any(replace(path, unseen=None).expected_error.values())
+
+
+def test_files_of_earlier_versions_keep_their_objects_and_their_expected_number(path, tmp_path):
+    """Their scores were those of the detector, and probabilities followed from them."""
+    scores = torch.linspace(0.9, 0.05, len(path.candidates))
+    old = replace(path, candidates=replace(path.candidates, scores=scores), unseen=None, least=0.3)
+    file = tmp_path / "old.safetensors"
+    old.save(file)
+    tensors, record = read(file, "zoom path")
+    del record["unseen"]
+    write_file(file, tensors, {**record, "certainty": [-0.9, 1.1]})
+    loaded = ZoomPath.load(file)
+    assert loaded.objects.boxes.equal(old.objects.boxes)
+    chances = (-0.9 + 1.1 * scores.double().logit()).sigmoid()
+    assert sum(loaded.expected.values()) == pytest.approx(float(chances.sum()), rel=1e-5)
+
+
+def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
+    old = GlimpseEvidence(3, 8)
+    record = json.loads(json.dumps({**old._record(), "certainty": [-0.9, 1.1], "metadata": {}}))
+    certainty = GlimpseEvidence._restore(record, dict(old.state_dict())).certainty
+    facts = torch.randn(7, len(FACTS))
+    torch.testing.assert_close(certainty.probability(facts), (-0.9 + 1.1 * facts[:, 0]).sigmoid())
+    assert certainty.numbers == [-0.9, 1.1]
+
+
+def test_the_least_probability_can_be_chosen(detector, picture):
+    agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
+    assert agent.find_all(picture, "red", passes=2).least == 0.3  # scores, without a certainty
+    assert agent.find_all(picture, "red", passes=2, least=0.7).least == 0.7
+    assert agent.explore(picture, passes=2, least=0.6).least == 0.6
+    with pytest.raises(InputError, match="least"):
+        agent.find_all(picture, "red", least=1.5)
