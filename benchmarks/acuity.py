@@ -27,7 +27,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.eye import Eye
 from semfov.observation.matching import box_iou
-from semfov.sensor import Foveation, LogPolar, Sensor, named_sensor
+from semfov.sensor import Foveation, LogPolar, MultiScaleFovea, Sensor, named_sensor
 
 SIDE = 640
 EDGES = (0, 25, 50, 100, 150, 200, 300, 400)
@@ -172,19 +172,20 @@ def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count:
 
 
 def draw(image: Tensor, sensor: LogPolar, path: Path) -> None:
-    """Draw a picture `(1, 3, H, W)`, its views through both sensors, and its cortical image side by side."""
+    """Draw a picture `(1, 3, H, W)`, its views through three sensors, and its cortical image side by side."""
     from matplotlib.figure import Figure
 
     gaze = torch.tensor([image.shape[-1] * 0.4, image.shape[-2] * 0.5])
-    cortical = sensor.cortical(image, gaze)
+    cortical, crops = sensor.cortical(image, gaze), MultiScaleFovea(80)
     views = {
         "picture": image,
         "published": named_sensor("published")(image, gaze),
         "log-polar, back-projected": sensor.back(cortical, gaze, (image.shape[-1], image.shape[-2])),
         "cortical image": cortical,
+        "multi-scale": crops.picture(crops.open(image, torch.ones(2)), gaze[None]),
     }
-    figure = Figure(figsize=(14, 3.4), layout="constrained")
-    for axes, (name, view) in zip(figure.subplots(1, 4), views.items(), strict=True):
+    figure = Figure(figsize=(17.5, 3.4), layout="constrained")
+    for axes, (name, view) in zip(figure.subplots(1, 5), views.items(), strict=True):
         axes.imshow(view[0].clamp(0, 1).movedim(0, -1).numpy())
         axes.set_title(name)
         axes.set_axis_off()

@@ -146,7 +146,30 @@ def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
     return beta + scaled / scaled.sum(-1, keepdim=True)
 
 
-RULES: dict[str, _Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "sum": sum_scaled}
+def semba_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
+    r"""The rule in the code of SemBA, without checks, for scaled likelihoods.
+
+    .. math:: \beta'_k = \beta_k \left(1 + \frac{\lambda_k / D}{1 + \min_j \lambda_j / D}\right), \quad
+              D = \sum_j \beta_j \lambda_j
+
+    Only the second term of Kaplan's numerator is divided (`utils/semba.py` of vislab-tecnico-lisboa/SemBA). So a
+    likelihood that is the same for all classes makes the belief surer, and the mean is not that of the posterior. It
+    is here to compare with; the rule that is called Kaplan's is `kaplan`.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    >>> semba_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
+    tensor([1.5000, 1.2500])
+    """
+    return torch.addcdiv(beta, beta * scaled, (beta * scaled).sum(-1, keepdim=True) + scaled.amin(-1, keepdim=True))
+
+
+RULES: dict[str, _Rule] = {"kaplan": kaplan_scaled, "semba": semba_scaled, "product": product_scaled, "sum": sum_scaled}
 
 
 def check_parameters(beta: Tensor) -> None:
@@ -220,7 +243,7 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
         likelihood: `(B, L, K+1)`, likelihoods of the classes given each detection, in order of fusion.
         footprint: `(B, L, X·Y)`, the cells that each detection updates, false or 0 for padding: boolean, or weights
             in [0, 1] that are used as exponents of the likelihood.
-        rule: `kaplan`, `product` or `sum` (`semfov.fusion`).
+        rule: `kaplan`, `semba`, `product` or `sum` (`semfov.fusion`).
 
     Returns:
         `(B, X·Y, K+1)`, new parameters.
@@ -251,7 +274,7 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
         beta: `(B, X·Y, K+1)`, Dirichlet parameters, positive.
         scaled: `(B, L, K+1)`, likelihoods from `scale_covering`.
         footprint: `(B, L, X·Y)`, the cells that each detection updates.
-        rule: `kaplan`, `product` or `sum`.
+        rule: `kaplan`, `semba`, `product` or `sum`.
 
     Returns:
         `(B, X·Y, K+1)`, new parameters.

@@ -105,15 +105,26 @@ class OnnxDetector(Detector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
+        self._check_canvas(canvas)
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
         return self._run(self.preprocessing(canvas.detach()))
 
     def propose_bytes(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas of bytes `(B, 3, H, W)`, converted directly to the input."""
-        check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
+        self._check_canvas(canvas)
         return self._run(self.preprocessing.of_bytes(canvas))
+
+    def _check_canvas(self, canvas: Tensor) -> None:
+        """Raise `InputError` for a canvas of another shape than the network takes."""
+        check_shape(canvas, "canvas", None, 3, None, None)
+        height, width = self.session.shape[2:]
+        if (height or canvas.shape[-2], width or canvas.shape[-1]) != tuple(canvas.shape[-2:]):
+            raise InputError(
+                f"canvas: expected {width} × {height} px, the fixed input of {self.name}, got "
+                f"{canvas.shape[-1]} × {canvas.shape[-2]} px; a sensor with crops needs crops of that side, or a "
+                "network that takes pictures of any size"
+            )
 
     def _run(self, image: Tensor) -> Candidates:
         """Run the network on its input `(B, 3, H, W)`, and decode what it returns."""

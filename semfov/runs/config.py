@@ -150,7 +150,8 @@ class BeliefConfig(Settings):
         columns: number of columns of the grid.
         rows: number of rows of the grid.
         prior: Dirichlet parameter of every class before the first look.
-        fusion: rule that updates the belief with a detection: `kaplan` (published), `product` or `sum`.
+        fusion: rule that updates the belief with a detection: `kaplan` (published), `product`, `sum`, or `semba`, the
+            form in the code of SemBA.
         footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
@@ -168,7 +169,7 @@ class BeliefConfig(Settings):
     columns: Side = 10
     rows: Side = 10
     prior: Positive = 0.5
-    fusion: Literal["kaplan", "product", "sum"] = "kaplan"
+    fusion: Literal["kaplan", "product", "sum", "semba"] = "kaplan"
     footprint: Footprint = "overlap"
     tempering: Positive = 1.0
     memory: CellMemory = "all"

@@ -45,6 +45,18 @@ def test_kaplan_matches_the_formula_and_the_exact_mean(likelihood, data):
     assert after[l.argmin()] == b[l.argmin()]
 
 
+@given(likelihoods, st.data())
+def test_the_rule_of_semba_divides_only_the_second_term(likelihood, data):
+    beta = np.array(data.draw(st.lists(positive, min_size=len(likelihood), max_size=len(likelihood))))
+    scores = np.array(likelihood)
+    expected = beta * (1 + scores / sum(scores * beta) / (1 + min(scores) / sum(scores * beta)))
+    scaled = fusion.scale_likelihood(torch.from_numpy(scores))
+    after = fusion.RULES["semba"](torch.from_numpy(beta), scaled)
+    torch.testing.assert_close(after, torch.from_numpy(expected))
+    if min(likelihood) == 0:  # then the two forms are equal
+        torch.testing.assert_close(after, fusion.kaplan(torch.from_numpy(beta), torch.from_numpy(scores)))
+
+
 def test_kaplan_mean_equals_that_of_the_integrated_posterior():
     """Monte Carlo over the prior: the posterior mean of p is E[p (p·λ)] / E[p·λ]."""
     beta, likelihood = torch.tensor([0.7, 2.0, 1.3]).double(), torch.tensor([0.9, 0.2, 0.05]).double()

@@ -7,9 +7,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov import load_detector
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.sensor import MultiScaleFovea
+from tests.colours import write_network
 from tests.small import Coloured, close, draw
 
 
@@ -171,3 +173,11 @@ def test_bad_settings(settings, message):
 def test_bad_input(arguments, message):
     with pytest.raises(InputError, match=message):
         MultiScaleFovea(4)(*arguments)
+
+
+def test_a_network_with_a_fixed_input_takes_no_other_crops(tmp_path):
+    detector = load_detector(write_network(tmp_path / "colours.onnx"))
+    image = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    assert len(Eye(MultiScaleFovea(64, 2), detector)(image, (20.0, 20.0)).boxes) == 1
+    with pytest.raises(InputError, match="expected 64 × 64 px, the fixed input of colours, got 32 × 32 px; a sensor"):
+        Eye(MultiScaleFovea(32, 2), detector)(image, (20.0, 20.0))

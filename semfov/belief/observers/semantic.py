@@ -83,7 +83,7 @@ class Semantic(Observer):
         components: K + 1, number of classes with background.
         observation: model that calibrates the scores; None uses the raw scores as likelihoods.
         prior: Dirichlet parameter of every class before the first look, positive.
-        fusion: `kaplan`, `product` or `sum` (`semfov.fusion`).
+        fusion: `kaplan`, `product`, `sum` or `semba` (`semfov.fusion`).
         footprint: rule for the cells that a detection updates (`Grid.footprint`).
         tempering: exponent τ of the likelihoods, positive.
         memory: `all` fuses all looks, as published; `closest` keeps only the closest look at each cell.

@@ -1,0 +1,304 @@
+"""Sensors at equal numbers of the detector's pixels: `python -m eval.sensors`.
+
+    python -m eval.sensors --data.root val --data.annotations instances_val.json \
+      --fit.root train --fit.annotations instances_train.json
+
+Every sensor gets an observation model of its own, fitted to the same photographs (`--fit`), and target evidence of its
+own if `--learned` says so. Then it searches and explores the same other photographs (`--data`). `--fixations 0` fits
+nothing, and measures only what raw scores tell. The detector must take pictures of any size. To continue a stopped run,
+give the same command again.
+"""
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import yaml
+from torch import Tensor
+
+from eval.comparison.run import Run
+from eval.comparison.summary import Curve, collect_records
+from eval.explore.config import ExploreConfig
+from eval.explore.report import success
+from eval.explore.run import ExploreRun
+from eval.search.config import SearchConfig
+from eval.search.report import performance
+from eval.search.run import SearchRun
+from semfov.belief.look_features import highest_score
+from semfov.data.scene import Scenes
+from semfov.errors import check, lookup
+from semfov.eye import Eye
+from semfov.fit.evidence import FitSearchConfig, fit_search
+from semfov.fit.observation import FitObservationConfig, fit_fom
+from semfov.fit.outputs import model_path
+from semfov.io.files import clean, write_text
+from semfov.metrics.bootstrap import Bootstrap
+from semfov.metrics.presence import area_under_roc
+from semfov.observation import FovealObservationModel
+from semfov.observation.matching import box_iou
+from semfov.runs.command import run_command
+from semfov.runs.config import DataConfig, ProtocolConfig, ScenesConfig, SensorConfig
+from semfov.runs.looks import one_thread
+from semfov.runs.scene_run import finish
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.settings import Count, Whole
+from semfov.runs.setup import plain
+from semfov.runs.tables import percent, table
+
+
+class SensorChoice(NamedTuple):
+    """A sensor with a size of the detector's input.
+
+    Attributes:
+        sensor: name of the sensor.
+        side: side of the detector's input in pixels.
+        settings: fields of `SensorConfig` that differ from those of its name.
+    """
+
+    sensor: str
+    side: int
+    settings: Mapping[str, Any] = {}
+
+
+CANDIDATES = {
+    "published, 320": SensorChoice("published", 320),
+    "multi-scale, 4 × 160": SensorChoice("multi-scale", 320),
+    "gradual, 320": SensorChoice("gradual", 320),
+    "gradual, 416": SensorChoice("gradual", 416),
+    "log-polar, 320": SensorChoice("log-polar", 320),
+    "sharp, 320": SensorChoice("gradual", 320, {"sigma": 1e4}),
+    "multi-scale, 4 × 160 of 1920 px": SensorChoice("multi-scale", 320, {"reference": 1920.0}),
+}
+"""What is compared; the last one is for pictures of at least 1920 px, and left out unless it is asked for.
+
+A Gaussian window of 10,000 px is flat, so the sharp sensor shows the same from everywhere.
+"""
+
+_SHIFTS = (1, 5, 15)
+_ANSWERS = ("all classes", "without background")
+_SCORE, _OVERLAP = 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class SensorsConfig(ScenesConfig):
+    """Compare sensors, each with models of its own.
+
+    Args:
+        data: the photographs to search and to explore.
+        fit: the photographs to fit the observation models to.
+        detector: the detector; each sensor sets its `input_size`, which is not padded less than to a square.
+        sensor: ignored.
+        belief: the belief; its columns and rows are the cells.
+        protocol: the protocol of searches and explorations.
+        fixations: random fixations in each photograph of the fit (0: no observation model is fitted).
+        learned: number of the photographs of the fit from which target evidence is learned, from looks from every cell
+            (0: none is learned).
+        steps: training steps of the target evidence.
+        classes: largest number of classes of a photograph that are told present or absent, and as many that it lacks.
+        candidates: the sensors to compare, of `CANDIDATES`.
+        out: folder for models, records and the table.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
+    """
+
+    fit: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(starts=5, shifts=15))
+    fixations: Whole = 4
+    learned: Whole = 0
+    steps: Count = 250
+    classes: Count = 8
+    candidates: tuple[str, ...] = tuple(CANDIDATES)[:-1]
+    out: Path = Path("runs/sensors")
+
+    def settings(self, name: str) -> dict[str, Any]:
+        """Settings that the fit and the runs of a candidate have in common."""
+        candidate = CANDIDATES[lookup(name, CANDIDATES, "candidate")]
+        detector = replace(self.detector, input_size=candidate.side, stride=None)
+        sensor = SensorConfig(candidate.sensor, **candidate.settings)  # type: ignore[arg-type]
+        where = {"cache": self.cache, "workers": self.workers, "scheduler": self.scheduler}
+        return {"detector": detector, "sensor": sensor, **where}
+
+    def folder(self, name: str) -> Path:
+        """Folder of a candidate."""
+        return self.out / clean(name)
+
+
+def compare_sensors(config: SensorsConfig) -> None:
+    """Fit, search and explore with every sensor, and write the table."""
+    check(config.protocol.shifts >= _SHIFTS[-1], "protocol.shifts", f"{_SHIFTS[-1]} or more", config.protocol.shifts)
+    rows = [_row(config, name) for name in config.candidates]
+    head = ["sensor", "detector's pixels", "ms", *(f"{p}, CP@{n}" for p in policies(config)[1:] for n in _SHIFTS)]
+    head += [f"{what}, {looks}" for what in ("area", "recall") for looks in ("1 look", "5 looks")]
+    head += [f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS]
+    text = "\n".join(table([head, *rows])) + "\n"
+    write_text(config.out / "summary.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    print(text)
+
+
+def _row(config: SensorsConfig, name: str) -> list[str]:
+    """The row of a sensor."""
+    shared, folder = config.settings(name), config.folder(name)
+    belief, searchers, mapping = config.belief, policies(config), "random-raw"
+    model = None
+    if config.fixations:
+        file, mapping = _observation(config, name), "random-calibrated"
+        belief = replace(belief, model=str(file))
+        model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
+    if config.learned:
+        belief = replace(belief, target_model=str(_evidence(config, name)))
+    common = {"data": config.data, "protocol": config.protocol, "store": config.store, **shared}
+    common["belief"] = belief
+    search = SearchRun(SearchConfig(policies=searchers, out=folder / "search", **common))
+    found = _curves(
+        search, name, lambda records: performance(records, searchers, config.protocol.shifts, "all targets")
+    )
+    explore = ExploreRun(ExploreConfig(policies=(mapping,), out=folder / "explore", **common))
+    known = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
+    five = five_looks(search, model, config.classes)
+    pixels, seconds = cost(search.eye, search.scenes[0].image)
+    return [
+        name,
+        f"{pixels:,}",
+        f"{1e3 * seconds:.0f}",
+        *(percent(*_at(found[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
+        *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(five.value, five.error, strict=True)),
+        *(percent(*_at(known[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
+    ]
+
+
+def policies(config: SensorsConfig) -> tuple[str, ...]:
+    """The searchers that are compared, the random one first."""
+    calibrated, learned = (
+        ["non-predictive-calibrated"] * bool(config.fixations),
+        ["target-evidence"] * bool(config.learned),
+    )
+    return ("random", "non-predictive-raw", *calibrated, *learned)
+
+
+def _observation(config: SensorsConfig, name: str) -> Path:
+    """File of the observation model of a sensor, which is fitted unless it is there."""
+    fitting = FitObservationConfig(
+        data=config.fit,
+        fixations=config.fixations,
+        name="observation",
+        out=config.folder(name),
+        **config.settings(name),
+    )
+    file = model_path(fitting, "")
+    if not file.is_file():
+        fit_fom(fitting)
+    return file
+
+
+def _evidence(config: SensorsConfig, name: str) -> Path:
+    """File of the target evidence of a sensor, which is fitted unless it is there."""
+    fitting = FitSearchConfig(
+        data=replace(config.fit, limit=config.learned),
+        columns=config.belief.columns,
+        rows=config.belief.rows,
+        steps=config.steps,
+        name=f"evidence-{config.learned}",
+        out=config.folder(name) / "evidence",
+        **config.settings(name),
+    )
+    file = model_path(fitting, "")
+    if not file.is_file():
+        fit_search(fitting)
+    return file
+
+
+def _curves(run: Run, name: str, measure: Any) -> dict[str, Curve]:
+    """Finish a run, and average its records."""
+    finish(run, name)
+    curves: dict[str, Curve] = measure(collect_records(run)[0])
+    return curves
+
+
+def _at(curve: Curve, shift: int) -> tuple[float, float]:
+    return float(curve.mean[shift]), float(curve.over_images[shift])
+
+
+def five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
+    """What is seen in one look from the middle, and in that and four looks around it.
+
+    The area tells how well the largest score of a class says whether it is in a photograph. An object is found by a
+    detection of its class with a score of 0.1 that overlaps it by half.
+
+    Args:
+        run: the finished looks from every cell.
+        model: observation model that calibrates the scores for the area; None takes raw scores.
+        classes: largest number of present classes of a photograph, and of absent ones.
+
+    Returns:
+        `(4,)`: area under the ROC after one look and after five, recall after one look and after five; the samples are
+        of photographs.
+    """
+    scores, there, groups = [], [], []
+    objects = torch.zeros(len(run.scenes), 3)
+    for index in range(len(run.scenes)):
+        grid, annotation = run.grid(index), run.scenes.annotation(index)
+        places = grid.extent * torch.tensor([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+        cells = grid.cell_of(places)
+        seen = run.detections(index)[cells]
+        boxes, labels = annotation.boxes[~annotation.crowd], annotation.labels[~annotation.crowd]
+        overlap = torch.stack([box_iou(boxes, each) for each in seen.boxes])
+        hits = (overlap >= _OVERLAP) & (seen.labels[:, None] == labels[:, None])
+        hits = (hits & (seen.confidence >= _SCORE)[:, None]).any(-1)
+        objects[index] = torch.stack([hits[0].sum(), hits.any(0).sum(), torch.tensor(len(boxes))])
+        chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
+        if model is not None:
+            distance = grid.box_distance(seen.boxes, grid.centres[cells])
+            seen = replace(seen, scores=model.calibrate(seen.scores, distance))
+        highest = highest_score(seen, torch.tensor(chosen, dtype=torch.int64))
+        scores.append(torch.stack([highest[0], highest.amax(0)], -1))
+        there.append(present)
+        groups.append(torch.full((len(chosen),), index))
+    score, label, group = torch.cat(scores), torch.cat(there), torch.cat(groups)
+    of_scene = [(group == index).nonzero()[:, 0] for index in range(len(run.scenes))]
+
+    def measure(drawn: Tensor) -> Tensor:
+        cases = torch.cat([of_scene[index] for index in drawn.tolist()])
+        told, found = label[cases], objects[drawn].sum(0)
+        areas = torch.full((2,), torch.nan)
+        if told.any() and not told.all():
+            areas = torch.tensor([area_under_roc(score[cases, looks], told) for looks in range(2)])
+        return torch.cat([areas, found[:2] / found[2]])
+
+    return Bootstrap.of(measure, range(len(run.scenes)), samples=200)
+
+
+def _classes(scenes: Scenes, index: int, classes: int, seed: int) -> tuple[list[int], Tensor]:
+    """Classes that a photograph has, as many that it lacks, and which of them it has."""
+    annotation = scenes.annotation(index)
+    chosen = choose_classes(scenes, index, annotation, classes, 1.0, seed)
+    return chosen, torch.isin(torch.tensor(chosen, dtype=torch.int64), annotation.labels)
+
+
+def cost(eye: Eye, image: Tensor, looks: int = 12) -> tuple[int, float]:
+    """Pixels that the detector sees in a look, and seconds of a processor for it: the fastest of `looks`."""
+    with one_thread(), torch.inference_mode():
+        view = eye.open(image[None])
+        point = torch.tensor([[image.shape[-1] / 2, image.shape[-2] / 2]])
+        seconds = []
+        for _ in range(looks):
+            start = time.process_time()
+            canvases = eye.foveated(view, point)
+            eye.detect(view, point, canvases)
+            seconds.append(time.process_time() - start)
+        return len(canvases) * canvases.shape[-2] * canvases.shape[-1], min(seconds)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(compare_sensors, SensorsConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
