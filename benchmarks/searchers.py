@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument(
         "--sides", type=int, nargs="+", default=[5, 7, 10], help="numbers of rows (and columns) of grids"
     )
-    parser.add_argument("--episodes", type=int, default=20, help="number of beliefs for which choices are compared")
+    parser.add_argument("--episodes", type=int, default=150, help="number of beliefs for which choices are compared")
     parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each grid")
     parser.add_argument("--threads", type=int, default=1, help="number of threads")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")

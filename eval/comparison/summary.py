@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from semfov.runs.scene_run import gather
 from semfov.runs.setup import observation_name, plain
 from semfov.runs.tables import percent
 from semfov.version import __version__
+
+_Value = TypeVar("_Value", float, FloatArray)
+"""A number, or a curve."""
 
 
 @dataclass(frozen=True)
@@ -49,24 +52,13 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
     Returns:
         The mean curve with its standard errors.
     """
-    images: dict[Any, list[FloatArray]] = defaultdict(list)
-    repetitions: dict[int, dict[Any, list[FloatArray]]] = defaultdict(lambda: defaultdict(list))
-    for record in records:
-        curve = measure(record)
-        images[record["scene"]].append(curve)
-        repetitions[record["repetition"]][record["scene"]].append(curve)
-
-    def per_image(groups: dict[Any, list[FloatArray]]) -> FloatArray:
-        return np.stack([np.mean(group, axis=0) for group in groups.values()])
-
-    means = per_image(images)
-    return Curve(
-        means.mean(0),
-        standard_error(means),
-        standard_error(np.stack([per_image(groups).mean(0) for groups in repetitions.values()])),
-        len(means),
-        sum(map(len, images.values())),
-    )
+    told = [(record["scene"], record["repetition"], measure(record)) for record in records]
+    means = np.stack([*by_scene((scene, curve) for scene, _, curve in told).values()])
+    repetitions = defaultdict(list)
+    for scene, repetition, curve in told:
+        repetitions[repetition].append((scene, curve))
+    over_repetitions = np.stack([np.mean([*by_scene(group).values()], axis=0) for group in repetitions.values()])
+    return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(told))
 
 
 def collect_records(run: Run) -> tuple[list[ResultRecord], dict[str, float]]:
@@ -77,7 +69,7 @@ def collect_records(run: Run) -> tuple[list[ResultRecord], dict[str, float]]:
     return records, seconds
 
 
-def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
+def by_scene(values: Iterable[tuple[Any, _Value]]) -> dict[Any, _Value]:
     """Mean value of each scene, from pairs of scene and value.
 
     Args:
@@ -86,13 +78,13 @@ def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
     Returns:
         The mean by scene.
 
-    >>> by_scene([(7, 1.0), (7, 2.0), (8, 5.0)])
+    >>> {scene: float(mean) for scene, mean in by_scene([(7, 1.0), (7, 2.0), (8, 5.0)]).items()}
     {7: 1.5, 8: 5.0}
     """
-    scenes: dict[Any, list[float]] = defaultdict(list)
+    scenes: dict[Any, list[_Value]] = defaultdict(list)
     for scene, value in values:
         scenes[scene].append(value)
-    return {scene: float(np.mean(group)) for scene, group in scenes.items()}
+    return {scene: np.mean(group, axis=0) for scene, group in scenes.items()}
 
 
 def write_summary(out: Path, name: str, text: str, records: list[ResultRecord]) -> list[Path]:

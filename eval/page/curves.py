@@ -2,12 +2,13 @@
 
 import json
 import math
-from collections import defaultdict
-from functools import cache
+from collections.abc import Sequence
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
+from eval.comparison.summary import Curve, by_scene, curve_of
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
@@ -42,24 +43,32 @@ def curve_of_record(record: ResultRecord, last: int, field: str = "right") -> Fl
 
 def per_image(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
     """Measure of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
-    images: dict[str, list[FloatArray]] = defaultdict(list)
-    for record in records:
-        images[str(record["scene"])].append(curve_of_record(record, last, field))
-    return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
+    means = by_scene((str(record["scene"]), curve_of_record(record, last, field)) for record in records)
+    return np.stack([means[scene] for scene in sorted(means)])
 
 
-def repetition_error(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
-    """Standard error of the mean over the repetitions, as published, `(last+1,)`."""
-    repetitions: dict[int, list[ResultRecord]] = defaultdict(list)
-    for record in records:
-        repetitions[record["repetition"]].append(record)
-    return standard_error(np.stack([per_image(group, last, field).mean(0) for group in repetitions.values()]))
+def averaged(records: list[ResultRecord], last: int) -> Curve:
+    """Mean measure after 0..`last` gaze shifts, with its standard errors over images and over repetitions."""
+    return curve_of(records, partial(curve_of_record, last=last))
+
+
+def paired_difference(
+    folder: Path, one: str, other: str, last: int, field: str = "right", *, commonest: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """`difference` of two policies of a run after 0..`last` gaze shifts."""
+    both = (records_of(folder, policy, commonest=commonest) for policy in (one, other))
+    return difference(*(per_image(records, last, field) for records in both))
 
 
 def difference(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean difference, paired over images, and its standard error, each `(last+1,)`."""
     paired = one - other
     return paired.mean(0), standard_error(paired)
+
+
+def points(mean: FloatArray, error: FloatArray, shifts: Sequence[int]) -> list[str]:
+    """Differences after these gaze shifts, in percentage points, with their standard errors."""
+    return [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
 
 
 def behind(mean: FloatArray, error: FloatArray) -> list[int]:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from eval.page.curves import per_image, records_of, repetition_error
+from eval.page.curves import averaged, records_of
 from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
-from eval.page.findings import LAST
+from eval.page.findings import LAST, TESTED
 from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
@@ -59,7 +59,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
             f"{title}\n{contrast.text}": (contrast, name)
             for contrast in CONTRASTS
             for name, title in DETECTORS.items()
-            if contrast.kind == "search" or contrast.other == "random-calibrated"
+            if contrast.finding in (TESTED[0], TESTED[7])
         }
         drawn = plot_curve_panels(
             {title: threshold_panel(*chosen, runs) for title, chosen in shown.items()}, label="difference (points)"
@@ -77,10 +77,13 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
 def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
-    records = {policy: records_of(folder, policy, commonest=figure.kind == "search") for policy in figure.policies}
+    curves = {
+        policy: averaged(records_of(folder, policy, commonest=figure.kind == "search"), last)
+        for policy in figure.policies
+    }
     return (
-        {policy: per_image(these, last).mean(0) for policy, these in records.items()},
-        {policy: repetition_error(these, last) for policy, these in records.items()},
+        {policy: each.mean for policy, each in curves.items()},
+        {policy: each.over_repetitions for policy, each in curves.items()},
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.page import paper
-from eval.page.curves import OBJECTS, behind, corrected_signs, difference, per_image, records_of, spans
+from eval.page.curves import OBJECTS, behind, corrected_signs, paired_difference, points, spans
 from eval.page.experiments import DETECTORS
 from eval.page.tables import Runs, published_columns
 from eval.page.verdicts import VERDICTS, Answer, gain_verdict, legend, overtaken_verdict
@@ -60,7 +60,7 @@ class Advantage:
     def answer(self, mean: FloatArray, error: FloatArray) -> Answer:
         """Sizes in percentage points, with standard errors, and the verdict."""
         chosen, errors = mean[list(self.shifts)], error[list(self.shifts)]
-        told = " / ".join(f"{100 * m:+.1f} ± {100 * e:.1f}" for m, e in zip(chosen, errors, strict=True))
+        told = " / ".join(points(mean, error, self.shifts))
         within = bool((np.abs(chosen) <= 2 * errors).all())
         signs = {int(sign) for sign in corrected_signs(chosen, errors)}
         return Answer(told, gain_verdict(signs, self.expected, within))
@@ -116,14 +116,14 @@ class Finding:
     shown: str
     test: Advantage | Overtaken
 
+    def difference(self, folder: Path, measure: Measure) -> tuple[FloatArray, FloatArray]:
+        """Difference of the policies in a run, by a measure, with its standard error, by gaze shift."""
+        last, policies = LAST[self.kind], (self.test.one, self.test.other)
+        return paired_difference(folder, *policies, last, measure.field, commonest=measure.commonest)
+
     def answer(self, folder: Path, measure: Measure) -> Answer:
         """The answer of a run, by a measure."""
-        last = LAST[self.kind]
-        curves = [
-            per_image(records_of(folder, policy, commonest=measure.commonest), last, measure.field)
-            for policy in (self.test.one, self.test.other)
-        ]
-        return self.test.answer(*difference(*curves))
+        return self.test.answer(*self.difference(folder, measure))
 
     @property
     def detects(self) -> bool:
@@ -225,7 +225,7 @@ BASELINES = (
 )
 """Findings that are tested at the default threshold alone."""
 
-FINDINGS = (*TESTED[:7], BASELINES[0], *BASELINES[1:], *TESTED[7:])
+FINDINGS = (*TESTED[:7], *BASELINES, *TESTED[7:])
 """Findings that can be tested on curves; costs are measured by `python -m benchmarks.decisions`."""
 
 

@@ -7,21 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from eval.page import paper
-from eval.page.curves import (
-    behind,
-    difference,
-    per_image,
-    policies_of,
-    records_of,
-    repetition_error,
-    spans,
-)
+from eval.page.curves import averaged, behind, paired_difference, points, policies_of, records_of, spans
 from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
-from semfov.metrics.averages import standard_error
 from semfov.metrics.search import random_search
 from semfov.runs.presets import label as name_of
-from semfov.runs.tables import table
+from semfov.runs.tables import percent, table
 
 Runs = dict[str, Experiment]
 
@@ -58,13 +49,14 @@ def beside_paper(runs: Runs) -> list[str]:
 
 def performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
-    curves = per_image(records_of(folder, policy, commonest=True), shifts)[:, shifts]
-    return f"{100 * curves.mean():.1f} ± {100 * standard_error(curves):.1f}"
+    found = averaged(records_of(folder, policy, commonest=True), shifts)
+    return percent(found.mean[shifts], found.over_images[shifts])
 
 
 def largest_error(folder: Path, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
-    return f"{100 * repetition_error(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS)).max():.3f}"
+    found = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
+    return f"{100 * found.over_repetitions.max():.3f}"
 
 
 def readings(runs: Runs) -> list[str]:
@@ -93,9 +85,8 @@ def study_table(title: str, runs: Runs) -> list[str]:
         for choice in study.policies:
             policy = name_of(choice, "exploration" if study.explores else "search")
             head = [label, *([policy] if several else [])]
-            curves = per_image(records_of(folder, policy), max(study.shifts))
-            mean, error = curves.mean(0), standard_error(curves)
-            rows.append([*head, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in study.shifts)])
+            found = averaged(records_of(folder, policy), max(study.shifts))
+            rows.append([*head, *(percent(found.mean[n], found.over_images[n]) for n in study.shifts)])
     return table(rows)
 
 
@@ -140,18 +131,15 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
     Raises:
         DataError: the run has no records of the baseline.
     """
-    last = max(shifts)
     names = [policy for policy in policies_of(folder) if policy.endswith(ending)]
-    curves = {policy: per_image(records_of(folder, policy), last, field) for policy in names}
-    if baseline not in curves:
+    if baseline not in names:
         raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
     rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
-    for policy, curve in curves.items():
+    for policy in names:
         if policy == baseline:
             continue
-        mean, error = difference(curve, curves[baseline])
-        cells = [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
-        rows.append([policy, *cells, spans(behind(mean, error)) or "no shift"])
+        mean, error = paired_difference(folder, policy, baseline, max(shifts), field)
+        rows.append([policy, *points(mean, error, shifts), spans(behind(mean, error)) or "no shift"])
     return table(rows)
 
 
@@ -175,9 +163,7 @@ def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> lis
     for policy in policies_of(folder):
         plain, _, drawn = policy.partition(", samples ")
         if drawn:
-            curves = (per_image(records_of(folder, name), max(shifts), field) for name in (policy, plain))
-            mean, error = difference(*curves)
-            rows.append([policy, *(f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts)])
+            rows.append([policy, *points(*paired_difference(folder, policy, plain, max(shifts), field), shifts)])
     return table(rows)
 
 

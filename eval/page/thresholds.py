@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from eval.page.curves import difference, per_image, records_of
+from eval.page.curves import points
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
-from eval.page.findings import COUNTED, EXPLORE, LAST, SEARCH, TESTED, Finding, Measure
+from eval.page.findings import COUNTED, EXPLORE, SEARCH, TESTED, Finding, Measure
 from eval.page.tables import Runs
 from eval.page.verdicts import VERDICTS, Answer, legend
 from semfov.metrics.averages import FloatArray
@@ -52,66 +52,34 @@ def words_of_verdicts(runs: Runs) -> list[str]:
 
 @dataclass(frozen=True)
 class Contrast:
-    """A difference of two policies that the page shows at every score threshold.
+    """The difference of the policies of a finding, as the page shows it at every score threshold.
 
     Attributes:
         text: its description.
-        kind: kind of the experiment.
-        one: the first policy.
-        other: the policy that is subtracted.
+        finding: the finding.
         measure: what is counted.
         shifts: gaze shifts that the table shows.
     """
 
     text: str
-    kind: str
-    one: str
-    other: str
+    finding: Finding
     measure: Measure
     shifts: tuple[int, ...]
 
     def difference(self, threshold: float, name: str, runs: Runs) -> tuple[FloatArray, FloatArray]:
         """Paired difference and its standard error by gaze shift, at a threshold with one of `DETECTORS`."""
-        folder, last = runs[at_threshold(self.kind, threshold, name)].out, LAST[self.kind]
-        both = (records_of(folder, policy, commonest=self.measure.commonest) for policy in (self.one, self.other))
-        return difference(*(per_image(records, last, self.measure.field) for records in both))
+        return self.finding.difference(runs[at_threshold(self.finding.kind, threshold, name)].out, self.measure)
 
 
-CONTRASTS = (
-    *(
-        Contrast(
-            f"search, {measure.text}: calibrated less raw",
-            "search",
-            "non-predictive-calibrated",
-            "non-predictive-raw",
-            measure,
-            SEARCH,
-        )
-        for measure in COUNTED["search"]
-    ),
-    *(
-        Contrast(
-            f"exploration, {measure.text}: KL less random, {scores}",
-            "explore",
-            f"kl-{scores}",
-            f"random-{scores}",
-            measure,
-            (1, 5, 10, 20),
-        )
-        for scores in ("calibrated", "raw")
-        for measure in COUNTED["explore"]
-    ),
-    *(
-        Contrast(
-            f"exploration by KL, {measure.text}: calibrated less raw",
-            "explore",
-            "kl-calibrated",
-            "kl-raw",
-            measure,
-            EXPLORE,
-        )
-        for measure in COUNTED["explore"]
-    ),
+CONTRASTS = tuple(
+    Contrast(text.format(measure.text), finding, measure, shifts)
+    for text, finding, shifts in (
+        ("search, {}: calibrated less raw", TESTED[0], SEARCH),
+        ("exploration, {}: KL less random, calibrated", TESTED[7], (1, 5, 10, 20)),
+        ("exploration, {}: KL less random, raw", TESTED[8], (1, 5, 10, 20)),
+        ("exploration by KL, {}: calibrated less raw", TESTED[9], EXPLORE),
+    )
+    for measure in COUNTED[finding.kind]
 )
 """Differences on which the two headlines of the paper rest."""
 
@@ -122,7 +90,6 @@ def by_threshold(runs: Runs) -> list[str]:
     for name, title in DETECTORS.items():
         for contrast in CONTRASTS:
             told = [contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS]
-            for n in contrast.shifts:
-                cells = (f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for mean, error in told)
-                rows.append([title, contrast.text, str(n), *cells])
+            columns = [points(mean, error, contrast.shifts) for mean, error in told]
+            rows += [[title, contrast.text, *map(str, row)] for row in zip(contrast.shifts, *columns, strict=True)]
     return table(rows)

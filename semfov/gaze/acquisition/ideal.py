@@ -65,8 +65,8 @@ class EntropyLimit(SignalSearch):
     .. math:: a(f) = \frac{1}{2} \sum_x q(x) \, d'^2(x, f), \qquad q \propto P(t \in x)
 
     This is the ELM rule of Najemnik and Geisler (2009), in nats. It costs little: a sum over the cells for each
-    fixation. In about two of three random problems it makes the ideal searcher's choice (`python -m
-    benchmarks.searchers`).
+    fixation. In 73 to 88 % of 150 random beliefs, by the size of the grid, it makes the ideal searcher's choice
+    (`python -m benchmarks.searchers`).
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
