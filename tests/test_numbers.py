@@ -52,7 +52,7 @@ OTHERS = [
 COMMAND = re.compile(r"python -m|`(?:eval|train|benchmarks)\.|`semfov fit|commit [0-9a-f]{7}")
 
 COMPANIONS = {
-    "README.md": ["docs/results.md", "docs/tables.md", "docs/measurements/zoom.md"],
+    "README.md": ["docs/results.md", "docs/tables.md", "docs/measurements/zoom.md", "docs/detectors.md"],
     "docs/results.md": ["docs/tables.md"],
     "docs/tables.md": ["docs/results.md"],
     "docs/decisions/closer_looks.md": ["docs/results.md", "docs/tables.md"],

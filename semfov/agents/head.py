@@ -69,7 +69,7 @@ class HeadAgent(nn.Module):
         """Make the agent with the models that are shipped for a detector, as `ActivePerception.recommended` does.
 
         Args:
-            name: `yolov3-tiny` or `yolox-nano`.
+            name: `yolov3-tiny`, `yolox-nano`, or `nanodet-plus-m-1.5x` with `weights=`.
             options: options of `semfov.load_detector`.
 
         Returns:

@@ -52,6 +52,13 @@ def agent():
     ).eval()
 
 
+def test_a_record_counts_detections_from_the_score_that_the_detector_names(agent, image):
+    agent.eye.detector.least = 0.95
+    assert len(agent.explore(image, start=3, shifts=2).objects) == 0
+    agent.eye.detector.least = 0.2
+    assert len(agent.explore(image, start=3, shifts=2).objects) > 0
+
+
 @pytest.fixture(params=["search", "exploration"])
 def scanpath(request, agent, image):
     with torch.inference_mode():
