@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
-from eval.zoom.numbers import number_table
+from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.results import ResultRecord
@@ -49,7 +49,9 @@ def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
     for record in records:
         groups[record["measure"], record["way"]].append(record)
     finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
-    lines = recalls(finding, run) if finding else []
+    returned = [record for record in records if record["measure"] == "objects"]
+    lines = object_table(returned) if returned else []
+    lines += recalls(finding, run) if finding else []
     hits = {way: group for (measure, way), group in groups.items() if measure == "first hit"}
     if hits:
         rows = [["", "mean", "median", "failures at the cap"]]
@@ -67,8 +69,6 @@ def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
         ]
     if decided := [record for record in records if record["measure"] == "decision"]:
         lines += decision_tables(decided)
-    if counted := [record for record in records if record["measure"] == "number"]:
-        lines += number_table(counted, run.config.passes)
     return "\n".join(lines)
 
 

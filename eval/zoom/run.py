@@ -14,7 +14,7 @@ from torch import Tensor
 
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
-from eval.zoom.numbers import count_objects
+from eval.zoom.objects import object_record
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
@@ -44,7 +44,10 @@ from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, slices
 
-_Measure = Literal["recall", "hit", "decision", "number"]
+_Measure = Literal["objects", "recall", "hit", "decision"]
+
+_COMPARED = "slices, raster", "slices, ranked by the overview", "ours"
+"""Ways of looking whose objects are compared with the annotated ones."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,8 @@ class ZoomConfig(WindowLookingConfig):
         slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
         overlap: overlap of neighbouring slices, as a share of their side.
         passes: largest number of detector passes.
-        measures: what to measure: `recall` after each pass; passes to the first `hit`, in mosaics, for classes that a
-            slice shows; the `decision` at the end of a search; the `number` of objects that an exploration gives.
+        measures: what to measure: the `objects` that are returned; `recall` after each pass; passes to the first `hit`,
+            in mosaics, for classes that a slice shows; the `decision` at the end of a search.
         sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
             until a decision (with `target`, only that class is searched for).
         cut: what to do with boxes at a window's border.
@@ -83,7 +86,7 @@ class ZoomConfig(WindowLookingConfig):
     slice: TileSize = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
-    measures: tuple[_Measure, ...] = ("recall", "hit", "decision")
+    measures: tuple[_Measure, ...] = ("objects", "recall", "hit", "decision")
     sought: Count = 4
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     observation: str | None = None
@@ -120,8 +123,16 @@ class ZoomRun(WindowLooking, SceneRun):
         glances = self.glances(index)
         records: list[ResultRecord] = []
         measures = self.config.measures
-        for name, turns in self._finding(index, glances) if "recall" in measures else ():
+        for name, turns in self._finding(index, glances) if {"objects", "recall"} & {*measures} else ():
+            if "recall" not in measures and name not in _COMPARED:
+                continue
             seen = [turn.glance for turn in islice(turns, self.config.passes)]
+            if "objects" in measures:
+                records += self._objects(name, index, seen)
+            if "recall" not in measures:
+                if name == _COMPARED[-1]:  # the oracle is dear
+                    break
+                continue
             records.append(self._recall(name, index, seen))
             if name in ("slices, raster", "ours"):
                 records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
@@ -132,12 +143,6 @@ class ZoomRun(WindowLooking, SceneRun):
         if "decision" in measures:
             records += self._decisions(index, glances)
         watch.lap("decision")
-        if "number" in measures:
-            counted = count_objects(
-                glances, self.evidence, self.target, self.annotation(index), passes=self.config.passes
-            )
-            records += [record | {"scene": self.scenes.ids[index]} for record in counted]
-        watch.lap("number")
         glances.save()
         return records, watch.seconds
 
@@ -192,6 +197,18 @@ class ZoomRun(WindowLooking, SceneRun):
             return annotation
         kept = annotation.labels == self.target
         return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
+
+    def _objects(self, name: str, index: int, seen: list[Glance]) -> Iterator[ResultRecord]:
+        """Compare the objects of ours, with probabilities and with scores, and of slices with the annotated ones."""
+        if name not in _COMPARED:
+            return
+        lattice = Lattice.over(self.scenes.annotation(index).size, self.eye.detector.input_size, finest=self.eye.finest)
+        given = seen, lattice, self.target, self.annotation(index), self.config.passes
+        ways = (
+            {name: None} if name != "ours" else {"ours": self.evidence.certainty, "ours, scores of the detector": None}
+        )
+        for way, certainty in ways.items():
+            yield object_record(way, *given, certainty) | {"scene": self.scenes.ids[index]}
 
     def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)

@@ -1,7 +1,6 @@
 """The experiment with large pictures: results with and without a store, resuming, and orders of windows."""
 
 import json
-import re
 from dataclasses import replace
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
-from eval.zoom.numbers import number_table
+from eval.zoom.objects import average_precision, object_figures
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
@@ -69,6 +68,8 @@ def test_tables_match_records(config, capsys):
         elif record["measure"] == "decision":
             assert record["passes"] <= config.passes
             assert 0 <= record["probability"] <= 1
+        elif record["measure"] == "objects":
+            assert all(len(found["scores"]) == len(found["right"]) for found in record["after"].values())
         else:
             assert 1 <= record["passes"] <= 5
 
@@ -90,27 +91,58 @@ def test_damaged_stored_looks_are_computed_again(config):
 
 @pytest.mark.slow
 def test_measures_can_be_left_out(config, capsys):
-    zoom_report.zoom(replace(config, measures=("decision", "number")))
+    zoom_report.zoom(replace(config, measures=("decision", "objects")))
     text = capsys.readouterr().out
     assert "Is the target present?" in text
-    assert "| objects from score 0.3 |" in text
+    assert "| ours, scores of the detector " in text
     assert "Recall" not in text
     assert {json.loads(line)["measure"] for line in (config.out / "records.jsonl").read_text().splitlines()} == {
         "decision",
-        "number",
+        "objects",
     }
 
 
-def test_numbers_of_objects_match_hand_calculations():
+def test_figures_of_objects_match_hand_calculations():
+    """Two pictures with two objects each: three right boxes and one wrong one, of which three are from 0.5 on."""
+    found = [([0.9, 0.6], [1, 0]), ([0.8, 0.1], [1, 1])]
     records = [
-        {"measure": "number", "way": way, "scene": scene, "number": number, "objects": 4}
-        for way, numbers in (("shown", (6.0, 3.0)), ("expected", (4.5, 4.5)))
-        for scene, number in enumerate(numbers)
+        {"objects": 2, "after": {"1": {"scores": [], "right": []}, "4": {"scores": scores, "right": right}}}
+        for scores, right in found
     ]
-    text = re.sub(" +", " ", "\n".join(number_table(records, 24)))
-    assert "2 pictures with 4.0 objects" in text
-    assert "| shown | 4.50 | 1.50 | +0.50 |" in text
-    assert "| expected | 4.50 | 0.50 | +0.50 |" in text
+    none, precision, *figures = object_figures({"ours": records}, ["1", "4"], torch.arange(2))[0].tolist()
+    assert none == 0
+    # Precision 1 up to a recall of 2 / 4, 3 / 4 up to 3 / 4, and 0 beyond it.
+    assert precision == pytest.approx((51 + 25 * 0.75) / 101)
+    ece = (abs(0.9 - 1) + abs(0.6 - 0) + abs(0.8 - 1) + abs(0.1 - 1)) / 4
+    assert figures == pytest.approx([2 / 3, 2 / 4, 3 / 4, (0 + 1) / 2, (0.5 + 1.1) / 2, ece])
+
+
+def test_average_precision_equals_that_of_coco():
+    """Boxes in a row, far from each other, so that a box is right or not."""
+    coco, evaluation = pytest.importorskip("pycocotools.coco"), pytest.importorskip("pycocotools.cocoeval")
+    generator = torch.Generator().manual_seed(0)
+    right, scores = torch.rand(40, generator=generator) < 0.6, torch.rand(40, generator=generator)
+    truth = coco.COCO()
+    box = {"image_id": 1, "category_id": 1}
+    places = [[20.0 * n, 0.0, 10.0, 10.0] for n in range(60)]
+    objects = [*places[:40], *places[50:]]
+    truth.dataset = {
+        "images": [{"id": 1}],
+        "categories": [{"id": 1}],
+        "annotations": [
+            box | {"id": n + 1, "bbox": place, "area": 100, "iscrowd": 0} for n, place in enumerate(objects)
+        ],
+    }
+    truth.createIndex()
+    seen = [
+        box | {"bbox": place if hit else [place[0], 500.0, 10.0, 10.0], "score": score}
+        for place, hit, score in zip(places, right.tolist(), scores.tolist(), strict=False)
+    ]
+    judge = evaluation.COCOeval(truth, truth.loadRes(seen), "bbox")
+    judge.evaluate()
+    judge.accumulate()
+    theirs = judge.eval["precision"][0, :, 0, 0, -1].mean()
+    assert average_precision(scores, right, len(objects)) == pytest.approx(theirs, abs=1e-6)
 
 
 def test_tables_of_decisions_match_hand_calculations():
