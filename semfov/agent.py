@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
 
@@ -24,7 +23,7 @@ from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, SemfovError, check, check_number, check_whole, lookup
+from semfov.errors import InputError, SemfovError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
@@ -391,7 +390,6 @@ class ActivePerception(nn.Module):
         on_look: OnLook | None = None,
         worth: float | None = None,
         batch: int = 1,
-        least: float | None = None,
         color: Color = "rgb",
     ) -> GazeRecord:
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
@@ -411,8 +409,6 @@ class ActivePerception(nn.Module):
             worth: least gain for which a look is worth it: of windows the expected number of new objects, where None
                 takes 0.01; of a head the expected number of additional correct cells, where None takes all looks.
             batch: number of windows that are chosen jointly and pass the detector together.
-            least: score from which on objects count, in windows their probability; None takes 0.3, or 0.5 for
-                probabilities.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
 
         Returns:
@@ -423,8 +419,6 @@ class ActivePerception(nn.Module):
                 kind of look.
             DataError: the file of the picture cannot be read.
         """
-        if least is not None:
-            check_number(least, "least", 0, 1)
         kind = self.kind_of_look(picture, how, every=True)
         targets = class_numbers(target, self.classes[1:], "target")
         _only_for(kind, "fovea", "passes", shifts=shifts)
@@ -434,16 +428,12 @@ class ActivePerception(nn.Module):
             _only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            path = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
-            return path if least is None else replace(path, least=least)
+            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
         if kind == "head":
             given = _given(worth=worth, duration=duration, **limits)
-            turned = self.head.find_all(_scene(picture, color), targets, **given)
-            return turned if least is None else replace(turned, least=least)
+            return self.head.find_all(_scene(picture, color), targets, **given)
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(
-            _large(picture, color), wanted, batch=batch, least=least, **_given(worth=worth, **limits)
-        )
+        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))
 
     def explore(
         self,
