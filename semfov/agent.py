@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
 
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from semfov.agents.fovea import MOST_SHIFTS, FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook
+from semfov.agents.limits import EpisodeLimits, OnLook, given_of, only_for
 from semfov.agents.windows import ZoomAgent, pays
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -23,7 +24,7 @@ from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, SemfovError, check, check_whole, lookup
+from semfov.errors import InputError, SemfovError, check, check_number, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
@@ -351,8 +352,8 @@ class ActivePerception(nn.Module):
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
         kind = self.kind_of_look(picture, how)
-        _only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
-        _only_for(kind, "head", "seconds", duration=duration)
+        only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
+        only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             usual = 30 if passes is None else MOST_SHIFTS
@@ -370,11 +371,11 @@ class ActivePerception(nn.Module):
             )
         index = _one_class(target, self.classes)
         if kind == "head":
-            given = _given(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
-            _only_for(kind, "fovea", "confirm", closer=closer)
-            return self.head.search(_scene(picture, color), index, seed=seed, **given)
-        _only_for(kind, "fovea", "none", start=start)
-        given = _given(confirm=confirm, give_up=give_up, closer=closer, **limits)
+            given = given_of(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
+            only_for(kind, "fovea", "confirm", closer=closer)
+            return self.head.search(open_scene(picture, color), index, seed=seed, **given)
+        only_for(kind, "fovea", "none", start=start)
+        given = given_of(confirm=confirm, give_up=give_up, closer=closer, **limits)
         return self.zoom.search(_large(picture, color), index, **given)
 
     def find_all(
@@ -389,6 +390,7 @@ class ActivePerception(nn.Module):
         duration: float | None = None,
         on_look: OnLook | None = None,
         worth: float | None = None,
+        least: float | None = None,
         batch: int = 1,
         color: Color = "rgb",
     ) -> GazeRecord:
@@ -408,6 +410,8 @@ class ActivePerception(nn.Module):
             on_look: called after each look with the record so far; returning False ends it.
             worth: least gain for which a look is worth it: of windows the expected number of new objects, where None
                 takes 0.01; of a head the expected number of additional correct cells, where None takes all looks.
+            least: score from which on an object counts, in windows its probability; None takes 0.5 there, and elsewhere
+                what suits the detector (`record.least`).
             batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
 
@@ -421,19 +425,22 @@ class ActivePerception(nn.Module):
         """
         kind = self.kind_of_look(picture, how, every=True)
         targets = class_numbers(target, self.classes[1:], "target")
-        _only_for(kind, "fovea", "passes", shifts=shifts)
-        _only_for(kind, "head", "seconds", duration=duration)
+        only_for(kind, "fovea", "passes", shifts=shifts)
+        only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
-            _only_for(kind, "windows", "passes", worth=worth)
+            only_for(kind, "windows", "passes", worth=worth)
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            return self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
+            record = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
+            return _counting(record, least)
         if kind == "head":
-            given = _given(worth=worth, duration=duration, **limits)
-            return self.head.find_all(_scene(picture, color), targets, **given)
+            given = given_of(worth=worth, duration=duration, **limits)
+            return _counting(self.head.find_all(open_scene(picture, color), targets, **given), least)
         wanted = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(_large(picture, color), wanted, batch=batch, **_given(worth=worth, **limits))
+        return self.zoom.find_all(
+            _large(picture, color), wanted, batch=batch, **given_of(worth=worth, least=least, **limits)
+        )
 
     def explore(
         self,
@@ -446,6 +453,7 @@ class ActivePerception(nn.Module):
         duration: float | None = None,
         on_look: OnLook | None = None,
         worth: float | None = None,
+        least: float | None = None,
         start: Start = None,
         seed: int = 0,
         color: Color = "rgb",
@@ -467,6 +475,7 @@ class ActivePerception(nn.Module):
                 correctly classified cells (`semfov.acquisition.ExpectedGain`; None takes 0.1). Of windows it is the
                 number of new objects (None takes 0.01), and of a head that of additional correct cells. 0 makes all
                 looks.
+            least: score or probability from which on an object counts, as for `find_all`.
             start: first cell of a fovea or first action of a head, as for `search`.
             seed: seed of the generator that draws the start and breaks ties.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
@@ -480,19 +489,20 @@ class ActivePerception(nn.Module):
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
         kind = self.kind_of_look(picture, how)
-        _only_for(kind, "fovea", "passes", shifts=shifts)
-        _only_for(kind, "head", "seconds", duration=duration)
+        only_for(kind, "fovea", "passes", shifts=shifts)
+        only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
             shifts = usual if shifts is None else shifts
-            return self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
+            record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
+            return _counting(record, least)
         if kind == "head":
-            given = _given(start=start, duration=duration, worth=worth, **limits)
-            return self.head.explore(_scene(picture, color), seed=seed, **given)
-        _only_for(kind, "fovea", "none", start=start)
-        return self.zoom.explore(_large(picture, color), **_given(worth=worth, **limits))
+            given = given_of(start=start, duration=duration, worth=worth, **limits)
+            return _counting(self.head.explore(open_scene(picture, color), seed=seed, **given), least)
+        only_for(kind, "fovea", "none", start=start)
+        return self.zoom.explore(_large(picture, color), **given_of(worth=worth, least=least, **limits))
 
     def live(
         self,
@@ -568,19 +578,12 @@ class ActivePerception(nn.Module):
                 check_grid(module.metadata.get("training", {}), grid, module.title)
 
 
-def _only_for(kind: KindOfLook, suits: KindOfLook, instead: str, **given: Any) -> None:
-    """Raise `InputError` for arguments that suit another kind of look."""
-    for name, value in given.items():
-        if value is not None and kind != suits:
-            raise InputError(
-                f"{name}: expected None for a picture that is looked at by {kind!r}, got {value}; use {instead}, or "
-                f"how={suits!r}"
-            )
-
-
-def _given(**values: Any) -> dict[str, Any]:
-    """The arguments that are not None."""
-    return {name: value for name, value in values.items() if value is not None}
+def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
+    """The record, whose objects count from `least` on; None leaves it as it is."""
+    if least is None:
+        return record
+    check_number(least, "least", 0, 1)
+    return replace(record, least=least)
 
 
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
@@ -593,8 +596,3 @@ def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
 def _large(picture: PictureLike, color: Color) -> LargePicture:
     """The picture of windows."""
     return open_large(cast(ImageLike | LargePicture, picture), color=color)
-
-
-def _scene(picture: PictureLike, color: Color) -> World:
-    """The scene of a head."""
-    return open_scene(picture, color)

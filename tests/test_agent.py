@@ -51,6 +51,21 @@ def test_search_goes_to_the_target(agent, image):
     assert len(set(scanpath.cells.tolist())) == len(scanpath)
 
 
+@pytest.mark.parametrize("how", ["fovea", "windows"])
+def test_objects_count_from_the_asked_score_on(agent, image, how):
+    every = agent.find_all(image, how=how, passes=2, least=0.0)
+    middle = float(every.candidates.scores.median())
+    start = {"start": 0} if how == "fovea" else {}
+    for some in (
+        agent.find_all(image, how=how, passes=2, least=middle),
+        agent.explore(image, how=how, passes=2, least=middle, **start),
+    ):
+        assert some.least == middle
+        assert len(some.objects) == int((some.candidates.scores >= middle).sum())
+    with pytest.raises(InputError, match="least"):
+        agent.find_all(image, how=how, passes=2, least=1.5)
+
+
 def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, image):
     image[:, 8:28, 8:28] = 0.4  # nothing red is left
     scanpath = agent.search(image, {"red": 1.0, "green": 0.8}, start=0)

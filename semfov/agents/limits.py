@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Literal
 
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
@@ -65,3 +65,28 @@ class EpisodeLimits:
     def room(self, passes: int) -> float:
         """Number of passes that are left after some; infinite without a limit."""
         return float("inf") if self.passes is None else self.passes - passes
+
+
+def only_for(kind: str, suits: str, instead: str, **given: object) -> None:
+    """Raise `InputError` for arguments that suit another kind of look.
+
+    Args:
+        kind: the kind of look.
+        suits: the kind of look that the arguments suit.
+        instead: what to give in their place.
+        given: the arguments; None is no argument.
+
+    Raises:
+        InputError: an argument was given, and the kind of look is another one.
+    """
+    for name, value in given.items():
+        if value is not None and kind != suits:
+            raise InputError(
+                f"{name}: expected None for a picture that is looked at by {kind!r}, got {value}; use {instead}, or "
+                f"how={suits!r}"
+            )
+
+
+def given_of(**values: Any) -> dict[str, Any]:
+    """The arguments that are not None."""
+    return {name: value for name, value in values.items() if value is not None}

@@ -77,6 +77,7 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 {_AGENT}
 {_LOOKS}
   --worth N            a look is worth a pass if it is expected to show this many new objects (default 0.01)
+  --least P            objects count from this probability on, in small pictures from this score on
   --batch N            windows that are looked at together
 {_OUTPUT}
 """

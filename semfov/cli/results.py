@@ -155,7 +155,7 @@ def _summary(name: str, record: GazeRecord, seconds: float) -> dict[str, Any]:
         found |= {"outcome": record.decision.outcome, "probability": record.decision.probability}
         found |= dict(zip("xy", point or (None, None), strict=True))
         found |= dict(zip(("x1", "y1", "x2", "y2"), box or [None] * 4, strict=True))
-    said = {"least_score": record.least, "expected": record.expected, "passes": record.passes}
+    said = {"least": record.least, "expected": record.expected, "passes": record.passes}
     return {**found, **said, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
 
 

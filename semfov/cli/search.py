@@ -109,7 +109,8 @@ class FindJob(PictureJob):
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Find all objects in a picture."""
-        return self.agent.find_all(picture, self.targets, worth=self.options.worth, batch=self.options.batch, **shared)
+        given = {name: getattr(self.options, name) for name in ("worth", "least", "batch")}
+        return self.agent.find_all(picture, self.targets, **given, **shared)
 
 
 class ExploreJob(PictureJob):
@@ -129,8 +130,8 @@ class ExploreJob(PictureJob):
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Explore a picture."""
-        options = self.options
-        return self.agent.explore(picture, start=self.start, seed=options.seed, worth=options.worth, **shared)
+        given = {name: getattr(self.options, name) for name in ("seed", "worth", "least")}
+        return self.agent.explore(picture, start=self.start, **given, **shared)
 
 
 def _check(options: PictureOptions) -> Any:
