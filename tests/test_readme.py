@@ -43,7 +43,12 @@ def test_it_has_few_lines():
 def test_links_lead_somewhere():
     links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
     assert len(links) > 5
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    for link in links:
+        file, _, heading = link.partition("#")
+        assert (ROOT / file).exists(), link
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", (ROOT / file).read_text(encoding="utf-8"), re.M)
+            assert heading in [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles], link
 
 
 def test_images_are_small():
