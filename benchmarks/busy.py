@@ -10,17 +10,23 @@ import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import cycle
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from benchmarks.beliefs import make_belief, make_look, make_model, unvisited
 from benchmarks.images import GAZE, SIGMA, photograph
 from benchmarks.machine import describe
 from benchmarks.tables import RESULTS, number, spread, table, write
 from benchmarks.timing import Run, Spread, interleaved
-from semfov import Grid, acquisition, foveate
+from semfov import EmbeddedScenes, Grid, ZoomAgent, acquisition, foveate
 from semfov.belief import fuse
+from semfov.data.large import to_bytes
+from semfov.data.mosaics import Mosaics
+from semfov.detection.scores import Candidates
+from semfov.paths import ZoomPath
 
 
 def paths() -> dict[str, Run]:
@@ -34,7 +40,30 @@ def paths() -> dict[str, Run]:
         "fixation, pyramid included": lambda: foveate(image, gaze, sigma=SIGMA),
         "Kaplan's rule, one look": lambda: fuse(belief.beta, likelihood, footprint),
         "decision by KL divergence": lambda: value(belief, visited),
+        "search of 3840 × 2880 px, 16 passes without the detector": large_search(),
     }
+
+
+def large_search() -> Run:
+    """A search of a mosaic by windows, whose detector returns what it has returned before."""
+    agent = ZoomAgent.recommended("yolov3-tiny")
+    scenes = EmbeddedScenes(agent.classes[1:], count=16)
+    picture = to_bytes(Mosaics(scenes, 6, 6, tile=(640, 480), count=1)[0].image)
+    detector, seen = agent.eye.detector, list[Candidates]()
+    propose = detector.propose_bytes
+
+    def remembered(canvases: Tensor) -> Candidates:
+        seen.append(propose(canvases))
+        return seen[-1]
+
+    def search() -> ZoomPath:
+        return agent.search(picture, "person", passes=16, confirm=1.0, give_up=0.0, closer=0)
+
+    vars(detector)["propose_bytes"] = remembered
+    search()
+    again = cycle(seen)
+    vars(detector)["propose_bytes"] = lambda canvases: next(again)
+    return search
 
 
 def with_threads(threads: int, run: Run) -> Run:
