@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import multiprocessing
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -251,14 +253,27 @@ def plain(settings: dict[str, Any]) -> Any:
     return json.loads(json.dumps(settings, default=str))
 
 
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Numbers of two settings of glibc's malloc (malloc.h)."""
+
+
 def prepare_worker() -> None:
     """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
 
     Only worker processes are silenced: the main process has logged the same messages already.
     """
     torch.set_num_threads(1)
-    # Freeing one large block raises the size from which glibc returns memory to the system; otherwise it would return
-    # and request memory at every look.
-    torch.empty(31 << 20, dtype=torch.uint8)
+    _keep_memory()
     if multiprocessing.parent_process() is not None:
         logging.getLogger("semfov").setLevel(logging.ERROR)
+
+
+def _keep_memory() -> None:
+    """Have glibc keep freed memory; otherwise it would return and request memory at every look.
+
+    Dask's workers return memory at once, by a variable of the environment, which also takes away glibc's own rule.
+    """
+    with suppress(OSError, AttributeError):  # other systems have no such setting
+        setting = ctypes.CDLL(None).mallopt
+        setting(_MMAP_THRESHOLD, 31 << 20)
+        setting(_TRIM_THRESHOLD, 1 << 30)
