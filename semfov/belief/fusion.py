@@ -166,7 +166,8 @@ def semba_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
     >>> semba_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
     tensor([1.5000, 1.2500])
     """
-    return torch.addcdiv(beta, beta * scaled, (beta * scaled).sum(-1, keepdim=True) + scaled.amin(-1, keepdim=True))
+    joint = beta * scaled
+    return torch.addcdiv(beta, joint, joint.sum(-1, keepdim=True) + scaled.amin(-1, keepdim=True))
 
 
 RULES: dict[str, _Rule] = {"kaplan": kaplan_scaled, "semba": semba_scaled, "product": product_scaled, "sum": sum_scaled}

@@ -159,13 +159,10 @@ class PictureFiles:
 
     def before(self) -> dict[int, PictureOutcome]:
         """Outcomes of an interrupted command with the same options, by the numbers of the pictures."""
-        found: dict[int, PictureOutcome] = {}
-        for number in range(len(self.job.sources)) if self.finished is not None else ():
-            assert self.finished is not None
-            stored = self.finished.load(number)
-            if stored is not None:
-                found[number] = PictureOutcome(**stored["records"][0])
-        return found
+        if self.finished is None:
+            return {}
+        stored = ((number, self.finished.load(number)) for number in range(len(self.job.sources)))
+        return {number: PictureOutcome(**each["records"][0]) for number, each in stored if each is not None}
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write what is wanted of a picture, whose figures are there if it was finished before."""
