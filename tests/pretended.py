@@ -4,6 +4,7 @@ Operations on tensors of two devices, and `numpy()` of a tensor that was not cop
 Values are those of the CPU, so a module must give the same output there, and errors of values are raised, too.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -65,6 +66,8 @@ class PretendedGpu(TorchDispatchMode):
         # `torch.tensor` would copy to the device without dispatching.
         self._lifts = torch._C._only_lift_cpu_tensors()
         torch._C._set_only_lift_cpu_tensors(True)
+        # In inference mode composite operations are dispatched whole, and results count no versions.
+        self._inference, torch._C._InferenceMode = torch._C._InferenceMode, _no_gradients
         # The data of a parameter cannot become that of another device, so `Module.to` replaces the parameter.
         # Operations of cuDNN are chosen by the device, and do not exist on the CPU.
         self._cudnn, torch.backends.cudnn.enabled = torch.backends.cudnn.enabled, False
@@ -75,12 +78,17 @@ class PretendedGpu(TorchDispatchMode):
     def __exit__(self, *error: Any) -> None:
         super().__exit__(*error)
         torch.cuda._lazy_init = self._lazy_init
+        torch._C._InferenceMode = self._inference
         torch.backends.cudnn.enabled = self._cudnn
         torch._C._set_only_lift_cpu_tensors(self._lifts)
         torch.__future__.set_overwrite_module_params_on_conversion(self._replaces)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(func, args, kwargs or {})
+
+
+def _no_gradients(mode: bool) -> AbstractContextManager[None]:
+    return torch.no_grad() if mode else nullcontext()
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:

@@ -59,14 +59,17 @@ class TestActivePerception(TensorTester):
         return module.explore(image, start=5, shifts=2).probabilities
 
 
-def test_every_public_module_has_a_tester():
-    """The modules are those of the API reference, so modules that are added to it are included."""
-    files = sorted(Path(__file__).parent.rglob("test_modules.py"))
+def find_testers() -> dict[str, type[BaseTester]]:
+    """All testers by name."""
     found = {}
-    for file in files:
+    for file in sorted(Path(__file__).parent.rglob("test_modules.py")):
         folder = file.relative_to(Path(__file__).parents[1]).with_suffix("")
         found |= vars(import_module(".".join(folder.parts)))
-    tested = {name for name, thing in found.items() if isclass(thing) and issubclass(thing, BaseTester)}
+    return {name: thing for name, thing in found.items() if isclass(thing) and issubclass(thing, BaseTester)}
+
+
+def test_every_public_module_has_a_tester():
+    """The modules are those of the API reference, so modules that are added to it are included."""
     modules = {
         name
         for things in entries().values()
@@ -74,7 +77,7 @@ def test_every_public_module_has_a_tester():
         if isclass(thing) and issubclass(thing, nn.Module) and not isabstract(thing)
     }
     assert len(modules) > 50
-    assert sorted(modules - {name.removeprefix("Test") for name in tested}) == []
+    assert sorted(modules - {name.removeprefix("Test") for name in find_testers()}) == []
 
 
 def test_the_page_on_testing_shows_a_complete_tester():

@@ -155,7 +155,8 @@ class HeadAgent(nn.Module):
         check_number(foresight, "foresight", 0, 1e6)
         limits = self._limits(passes, seconds, on_look)
         views = self.views(scene, color)
-        gain, observer = SearchGain(views, foresight), SceneObserver(Target(self.target_evidence), views, prior=prior)
+        evidence = self.target_evidence.cpu()  # where the geometry of the scene is
+        gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
         sure = CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
         return self._look(observer, gain, (index,), start, limits, duration, seed, thresholds=thresholds)
@@ -249,7 +250,8 @@ class HeadAgent(nn.Module):
         seed: int,
     ) -> HeadPath:
         check_number(worth, "worth", 0, float("inf"))
-        gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
+        evidence = self.map_evidence.cpu()
+        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
         return self._look(observer, gain, targets, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()

@@ -156,8 +156,8 @@ class ZoomAgent(nn.Module):
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
+        glances = self._open(picture)
         with torch.inference_mode():
-            glances = self._open(picture)
             if self.evidence is None:
                 return search_slices(glances, self.classes, index, limits, confirm)
             return search_windows(
@@ -256,6 +256,8 @@ class ZoomAgent(nn.Module):
         return self.find_all(picture, None, batch=batch, worth=worth, least=least, **limits)
 
     def _open(self, picture: _Picture) -> LiveGlances:
+        if self.evidence is not None:
+            self.evidence.cpu()  # where the looks are that it reads
         return LiveGlances(self.eye, self.eye.open(picture))
 
 

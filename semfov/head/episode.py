@@ -67,12 +67,12 @@ def live(eye: Eye, views: Views) -> Detect:
         number, cell = divmod(action, views.cells)
         pose = views.poses[number]
         if opened is not None and opened[0] == number and world.still:
-            return eye.look(opened[1], views.view_grid.centres[cell][None])
+            return eye.look(opened[1], views.view_grid.centres[cell][None]).to(pose.device)
         image, at = world.view(pose)
-        opened = number, eye.open(image[None])
+        opened = number, eye.open(image[None].to(eye.sensor.like.device))
         if at is pose:
-            return eye.look(opened[1], views.view_grid.centres[cell][None])
-        seen = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0])
+            return eye.look(opened[1], views.view_grid.centres[cell][None]).to(pose.device)
+        seen = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0]).to(pose.device)
         return replace(seen, boxes=boxes_from(world, seen.boxes, at, pose))
 
     return detect

@@ -78,7 +78,7 @@ class WindowPerception(FramePerception):
         color: Color = "rgb",
     ) -> None:
         super().__init__(agent.classes, target, targets, rate, color)
-        self.eye, self.evidence = agent.eye, agent.evidence
+        self.eye, self.evidence = agent.eye, None if agent.evidence is None else agent.evidence.cpu()
         self._thresholds = confirm, give_up
         self._decisions: WindowDecisions | None = None
         if self.evidence is not None and target is not None:

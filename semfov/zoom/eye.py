@@ -138,7 +138,8 @@ class WindowEye(nn.Module):
             Detections and hints of each look.
         """
         canvas, frames = self._resample(view, fixations, within)
-        exact = canvas.dtype == torch.uint8
+        exact, here = canvas.dtype == torch.uint8, canvas.device
+        canvas = canvas.to(next(self.detector.parameters(), canvas).device)
         seen = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
         candidates = seen.precise()
         policy = self.detector.background
@@ -147,12 +148,16 @@ class WindowEye(nn.Module):
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
-        found, cut = self._treat(Detections(boxes, selected.scores, selected.mask), place.cut(selected))
+        found = Detections(boxes, selected.scores, selected.mask).to(here)
+        found, cut = self._treat(found, place.cut(selected).to(here))
         windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
             return WindowLooks(found, cut, None, windows)
         faint = [hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
-        placed = [Hints(place.to_picture(each.boxes, number), each.scores) for number, each in enumerate(faint)]
+        placed = [
+            Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
+            for number, each in enumerate(faint)
+        ]
         return WindowLooks(found, cut, tuple(placed), windows)
 
     def glimpse(

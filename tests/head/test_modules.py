@@ -21,6 +21,8 @@ def views():
 class SceneTester(BaseTester):
     """Tests of a module that acts in its own scene, one episode at a time."""
 
+    test_device = None  # the geometry of a scene is on the CPU; of a head, the eye alone is on a GPU
+
     def inputs(self):
         return tuple(each[:1] for each in look()[:2])
 
@@ -75,6 +77,8 @@ class TestScan(TestPerSecond):
 
 
 class TestHeadAgent(BaseTester):
+    on_cpu = True
+
     def make(self):
         return HeadAgent(Eye(Foveation(20.0), Blobs()), evidence(), mapping()).eval().requires_grad_(False)
 

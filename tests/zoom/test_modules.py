@@ -27,6 +27,8 @@ class TestGlimpseEvidence(TensorTester):
 class TestWindowEye(BaseTester):
     """Pictures are bytes, as in files, and stay bytes."""
 
+    on_cpu = True
+
     def make(self):
         return WindowEye(Blobs())
 
@@ -39,6 +41,8 @@ class TestWindowEye(BaseTester):
 
 
 class TestZoomAgent(BaseTester):
+    on_cpu = True
+
     def make(self):
         return ZoomAgent(WindowEye(Blobs()), GlimpseEvidence(3, 8)).eval()
 

@@ -1,0 +1,219 @@
+"""Public functions and modules on a GPU, which is pretended on a machine without one: all but those that are named.
+
+Modules are run by their testers. A function is run by the example in its docstring: its arguments are moved to the GPU,
+its results are moved back, and the example must print what the docstring says.
+"""
+
+import copy
+import doctest
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import GeneratorType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from docs.api import entries
+from semfov import Detections, Objects
+from semfov.belief.observers import Semantic
+from semfov.data.fixations import Fixations
+from semfov.episode import Step, StoredLooks, rollout
+from semfov.gaze.acquisition import Uniform
+from semfov.gaze.choice import Given
+from semfov.paths import ZoomPath
+from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.lattice import Lattice
+from tests import small
+from tests.pretended import PretendedGpu
+from tests.test_modules import find_testers
+from tests.viz.test_places import calls
+
+CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
+
+GEOMETRY = "holds the geometry of a scene, which is on the CPU; of a head, the eye alone is on the GPU (`HeadAgent`)"
+LEFT_OUT = {
+    "SceneObserver": GEOMETRY,
+    "SearchGain": GEOMETRY,
+    "ExploreGain": GEOMETRY,
+    "PerSecond": GEOMETRY,
+    "Scan": GEOMETRY,
+    "fit_discriminative": "needs gradients, for which PyTorch asks the GPU's driver",
+    "export_look": "writes a file; PyTorch exports networks from the CPU",
+}
+"""Public modules and functions that are not run on the pretended GPU, and why."""
+
+ON_CPU = {"class_posterior", "entropy", "merge_boxes", "open_scene", "reduced_copy"}
+"""Functions whose results are on the CPU: of records and of scenes."""
+
+
+def public(keep: Callable[[Any], bool]) -> dict[str, Any]:
+    return {name: thing for things in entries().values() for name, thing in things if keep(thing)}
+
+
+MODULES = public(
+    lambda thing: inspect.isclass(thing) and issubclass(thing, nn.Module) and not inspect.isabstract(thing)
+)
+
+
+def holds_tensors(kind: type) -> bool:
+    """Whether an attribute of a class is annotated as a tensor."""
+    hints = [hint for base in kind.__mro__ for hint in vars(base).get("__annotations__", {}).values()]
+    return issubclass(kind, nn.Module) or any(re.search(r"\bTensor\b", str(hint)) for hint in hints)
+
+
+HOLDERS = public(lambda thing: inspect.isclass(thing) and holds_tensors(thing))
+TAKEN = re.compile(rf"\b(Tensor|ImageLike|{'|'.join(HOLDERS)})\b")
+
+
+def takes_tensors(function: Any) -> bool:
+    """Whether an argument of a function is annotated as a tensor, or as an object that holds one."""
+    if not inspect.isfunction(function):
+        return False
+    return any(TAKEN.search(str(hint)) for name, hint in function.__annotations__.items() if name != "return")
+
+
+FUNCTIONS = public(takes_tensors)
+
+
+@contextmanager
+def copies_on(device: torch.device) -> Iterator[list[Tensor]]:
+    """While it is open, deep copies have their tensors on a device; yields the tensors that were copied."""
+    copied: list[Tensor] = []
+
+    def copied_tensor(self: Tensor, memo: dict[int, Any]) -> Tensor:
+        if id(self) not in memo:
+            copied.append(self)
+            there = self.detach().to(device)
+            parameter = isinstance(self, nn.Parameter)
+            memo[id(self)] = nn.Parameter(there, self.requires_grad) if parameter else there
+        return memo[id(self)]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (Tensor, nn.Parameter):
+            patch.setattr(kind, "__deepcopy__", copied_tensor)
+        yield copied
+
+
+class OnGpu:
+    """A function whose arguments are moved to the GPU, and whose results are moved back.
+
+    Attributes:
+        given: the tensors among the arguments.
+        results: the tensors among the results.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.inside = function, False
+        self.given: list[Tensor] = []
+        self.results: list[Tensor] = []
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        if self.inside:
+            return self.function(*args, **options)
+        with copies_on(GPU) as copied:
+            args, options = copy.deepcopy((args, options))
+        self.given += copied
+        self.inside = True
+        try:
+            result = self.function(*args, **options)
+            if isinstance(result, GeneratorType):
+                result = iter([*result])
+        finally:
+            self.inside = False
+        with copies_on(CPU) as copied:
+            result = copy.deepcopy(result)
+        self.results += copied
+        return result
+
+
+class Steps:
+    """The steps of an episode, which begins when they are asked for."""
+
+    def __init__(self, *episode: Any) -> None:
+        self.episode = episode
+
+    def __iter__(self) -> Iterator[Step]:
+        return rollout(*self.episode, most=3)
+
+
+def record() -> ZoomPath:
+    """A record of one look at a picture of 160 × 120 px."""
+    lattice, nothing = Lattice.over((160, 120), (40, 40)), torch.zeros(0)
+    look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
+    return ZoomPath(
+        lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
+        candidates=Objects.none(), ending="passes",
+    )  # fmt: skip
+
+
+def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Arguments and options of functions that have no example with tensors that runs."""
+    path = small.scanpath(small.GRID, torch.tensor([0, 6, 11]), target=2)
+    looks = StoredLooks(small.scattered(0, small.GRID, 2), small.GRID)
+    episode = looks, Semantic(3), Uniform(), torch.tensor([4]), Given(torch.tensor([[0, 7, 9]]))
+    person = Fixations("a.jpg", "1", path.fixations.numpy(), (64, 48))
+    image = small.rand(3, 48, 64)
+    return {name: (arguments, options) for name, (arguments, options, _) in calls(path).items()} | {
+        "animate": ((path, folder / "film.gif"), {"image": image, "views": [image] * 3}),
+        "as_image": ((image,), {}),
+        "compare_scanpath": ((path, [person, person]), {}),
+        "episode_data": ((path, image, [image] * 3), {"name": "a.jpg"}),
+        "merge_boxes": ((torch.tensor([[4.0, 4, 9, 9]]), torch.rand(1), torch.ones(1, dtype=torch.long)), {}),
+        "plot_zoom_path": ((record(), small.rand(3, 120, 160)), {}),
+        "required_target": ((torch.tensor(2), "a policy"), {}),
+        "rollout": (episode, {"most": 3}),
+        "trace": ((Steps(*episode), small.GRID, ("background", "cat", "cup"), 1, None), {}),
+    }
+
+
+def run(name: str, folder: Path) -> OnGpu:
+    """Run a function on the GPU: with the arguments of `more`, or else by its example."""
+    function = FUNCTIONS[name]
+    on_gpu, given = OnGpu(function), more(folder).get(name)
+    if given is not None:
+        arguments, options = given
+        with PretendedGpu():
+            on_gpu(*arguments, **options)
+        return on_gpu
+    (example,) = doctest.DocTestFinder(recurse=False).find(
+        function, name=name, globs=dict(vars(sys.modules[function.__module__]))
+    )
+    failures: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        for module in [module for key, module in sys.modules.items() if key.startswith("semfov")]:
+            for key in [key for key, value in vars(module).items() if value is function]:
+                patch.setattr(module, key, on_gpu)
+        example.globs[function.__name__] = on_gpu
+        with PretendedGpu():
+            doctest.DocTestRunner(verbose=False).run(example, out=failures.append)
+    assert not failures, "".join(failures)
+    return on_gpu
+
+
+def test_every_module_runs_on_a_gpu_or_is_named():
+    ran = {name for name, tester in find_testers().items() if tester.test_device is not None}
+    assert len(MODULES) > 70
+    assert {name for name in MODULES if f"Test{name}" not in ran} == LEFT_OUT.keys() & MODULES.keys()
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - LEFT_OUT.keys()))
+def test_a_function_runs_on_a_gpu(name, tmp_path):
+    on_gpu = run(name, tmp_path)
+    assert on_gpu.given
+    assert {tensor.device.type for tensor in on_gpu.results} <= {"cpu" if name in ON_CPU else "cuda"}
+
+
+def test_the_page_on_testing_counts_what_runs_on_a_gpu():
+    page = (Path(__file__).parents[1] / "docs/testing.md").read_text(encoding="utf-8")
+    counts = [("modules", MODULES), ("functions of tensors", FUNCTIONS)]
+    assert LEFT_OUT.keys() <= MODULES.keys() | FUNCTIONS.keys()
+    rows = [f"| {kind} | {len(named)} | {len(named.keys() - LEFT_OUT.keys())} |" for kind, named in counts]
+    for table in (rows, [f"| `{name}` | {reason} |" for name, reason in LEFT_OUT.items()]):
+        expected = "|---|\n" + "\n".join(table) + "\n\n"
+        assert expected in page, f"docs/testing.md must have the table\n{expected}"
