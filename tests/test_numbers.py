@@ -124,6 +124,8 @@ KNOWN = {
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
         "75 MB": "a sixteenth, a sixty-fourth and so on of what the sentence gives",
+        "134 MB": "of copies with at most 2 to the 25th pixels, three bytes each, and a third more",
+        "64 MB": "given to GDAL",
         "900 MB": "three bytes for each pixel of the sentence",
         "by 4, 8, 16": "a series",
         f"opset {OPSET}": "code",

@@ -69,6 +69,7 @@ semfov find: all objects, and how many
   semfov find flight/*.jpg --target person,car --passes 16 --out boxes.json
   semfov find street.jpg --out street.coco.json
   semfov find BIG.jpg --models mymodels --report page.html
+  semfov find orthophoto.tif --target car --out cars.geojson      (pip install "semfov[geo]")
 
 usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 

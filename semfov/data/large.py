@@ -1,4 +1,4 @@
-"""Large pictures that are read window by window: arrays, memory maps, tiled TIFFs, and files decoded when needed."""
+"""Large pictures that are read window by window: arrays, memory maps, TIFFs, rasters, and files decoded when needed."""
 
 import warnings
 import weakref
@@ -17,13 +17,18 @@ from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
-from semfov.data.reduction import FIRST, LARGE, PixelBox, ReducedCopies, bytes_of, reduction_for
+from semfov.data.reduction import FIRST, KEPT, LARGE, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+RASTERS = (".vrt", ".jp2")
+"""Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
+
+_BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
+_ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
 _TILED = (".tif", ".tiff")
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
 _WHITE_IS_ZERO, _PALETTE = 0, 3  # photometric interpretations of a TIFF
@@ -51,25 +56,27 @@ class LargePicture(ABC):
             RGB bytes `(h, w, 3)`.
         """
 
-    def reduction(self, ratio: float) -> int:
+    def reduction(self, ratio: float, kept: float = KEPT) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it.
 
         Args:
             ratio: pixels of a window for each wanted pixel.
+            kept: pixels that a reduced window keeps for each wanted pixel.
 
         Returns:
             A power of two; 1 for windows that are read as they are: those of pictures of up to 16 million pixels, and
-            those that keep more than an eighth of the pixels along a side.
+            those that keep more than a sixth of the pixels along a side (of very large pictures, a twelfth or less).
         """
         many = self.size[0] * self.size[1] > LARGE
-        reduction = reduction_for(int(ratio)) if many else 1
-        return reduction if reduction >= FIRST else 1
+        reduction = reduction_for(ratio, kept) if many else 1
+        return reduction if reduction >= self._first else 1
 
     def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
         """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
 
         The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels
-        (25 MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture.
+        (25 MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture,
+        and at most 134 MB: copies of pictures of more than 537 million pixels begin at a coarser one.
 
         Args:
             box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
@@ -81,13 +88,23 @@ class LargePicture(ABC):
         Raises:
             InputError: the box is empty or not inside the picture.
         """
+        self._inside(box)
+        if reduction < self._first or self.size[0] * self.size[1] <= LARGE:
+            return bytes_of(self.pixels(box))
+        return self._copies.window(box, reduction)
+
+    def _inside(self, box: PixelBox) -> PixelBox:
+        """The box; raises `InputError` where it is empty or not inside the picture."""
         x1, y1, x2, y2 = box
         width, height = self.size
         inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
         check(inside, "box", f"a window inside {width} × {height} pixels", box)
-        if reduction < FIRST or width * height <= LARGE:
-            return bytes_of(self.pixels(box))
-        return self._copies.window(box, reduction)
+        return box
+
+    @cached_property
+    def _first(self) -> int:
+        """Least factor by which windows are read reduced."""
+        return first_for(self.size)
 
     @cached_property
     def _copies(self) -> ReducedCopies:
@@ -141,6 +158,13 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
     return pixels
 
 
+def _from_16(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Bytes, of bytes or of 16-bit numbers, whose white is 65535."""
+    if pixels.dtype == np.uint16:
+        pixels = (pixels.astype(np.uint32) * 255 + 32767) // 65535
+    return pixels.astype(np.uint8, copy=False)
+
+
 class PhotographPicture(LargePicture):
     """A picture in a file that Pillow reads.
 
@@ -178,10 +202,20 @@ class PhotographPicture(LargePicture):
                 if image.mode in _PLAIN and "transparency" not in image.info:
                     stored = orientation(image)
                     image.load()
-                    self._array = np.asarray(turned(image, stored, orientation(image), upright=True).convert("RGB"))
+                    self._array = _rgb(turned(image, stored, orientation(image), upright=True))
                 else:
                     self._array = to_bytes(read_image(self.path))
         return self._array
+
+
+def _rgb(image: "Image") -> NDArray[np.uint8]:
+    """Bytes `(H, W, 3)` of a Pillow image of 8 bits, converted a few rows at a time."""
+    width, height = image.size
+    array = np.empty((height, width, 3), np.uint8)
+    for top in range(0, height, _ROWS):
+        rows = image.crop((0, top, width, min(top + _ROWS, height)))
+        array[top : top + _ROWS] = np.asarray(rows.convert("RGB"))
+    return array
 
 
 class TiffPicture(LargePicture):
@@ -194,7 +228,8 @@ class TiffPicture(LargePicture):
         path: the file; its first page is read.
 
     Raises:
-        DataError: `tifffile` is not installed, or the page is not grey or RGB with 8 or 16 bits.
+        DataError: `tifffile` is not installed, or has no codec for the file, or the page is not grey or RGB with 8 or
+            16 bits.
     """
 
     path: Path
@@ -215,8 +250,18 @@ class TiffPicture(LargePicture):
             got = "a palette" if page.photometric == _PALETTE else f"{page.dtype} {shape}"
             expected = "grey or RGB with 8 or 16 bits and interleaved channels"
             raise DataError(f"{path}: expected {expected}, got {got}; convert it")
+        if page.compression not in tifffile.TIFF.DECOMPRESSORS:
+            packed = page.compression.name
+            raise DataError(f"{path}: expected imagecodecs for {packed} compression; pip install imagecodecs")
         self._page = page
         self.size = shape[1], shape[0]
+
+    @property
+    def has_overviews(self) -> bool:
+        """Whether the file has reduced copies of its own, which `tifffile` does not tell apart from other pages."""
+        with _opening(self.path, "opened"):
+            pages: Any = self._file.pages[1:]
+            return bool(self._page.subifds) or any(page.is_reduced for page in pages)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
@@ -252,16 +297,91 @@ class TiffPicture(LargePicture):
 
     def _bytes(self, tile: NDArray[Any]) -> NDArray[np.uint8]:
         """Grey or RGB bytes, in which 0 is black."""
-        if tile.dtype == np.uint16:
-            tile = ((tile.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+        tile = _from_16(tile)
         return 255 - tile if self._page.photometric == _WHITE_IS_ZERO else tile
+
+
+class RasterPicture(LargePicture):
+    """A picture in a file that GDAL reads: a cloud-optimised GeoTIFF, a mosaic of files (`.vrt`), JPEG 2000.
+
+    Windows are read alone. Coarse windows are read from the overviews of the file, if it has some. Bands that the file
+    calls red, green and blue are the channels, else the first three, or a single one as grey. Bands of 16 bits are
+    scaled by their white, 65535, to 8 bits.
+
+    Args:
+        path: the file.
+
+    Raises:
+        DataError: rasterio is not installed, GDAL cannot read the file, or it has a palette or other numbers than bytes
+            and 16 bits.
+
+    Example::
+
+        picture = RasterPicture("orthophoto.tif")
+        picture.size, picture.read((0, 0, 4096, 4096), 8).shape
+    """
+
+    path: Path
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        try:
+            import rasterio
+        except ImportError:
+            raise DataError(f'{path}: expected rasterio for reading it; pip install "semfov[geo]"') from None
+        self.path = Path(path)
+        self._limits = rasterio.Env(GDAL_CACHEMAX=_BLOCKS)
+        with _opening(self.path, "opened"), self._limits:
+            self.path.stat()  # GDAL has many messages for a file that is not there
+            self._file: Any = rasterio.open(self.path)
+        weakref.finalize(self, self._file.close)
+        meanings = [each.name for each in self._file.colorinterp]
+        kinds = {*self._file.dtypes}
+        if "palette" in meanings or not kinds <= {"uint8", "uint16"}:
+            got = "a palette" if "palette" in meanings else ", ".join(sorted(kinds))
+            raise DataError(f"{path}: expected bands of 8 or 16 bits, got {got}; convert it (gdal_translate)")
+        named = [meanings.index(name) + 1 for name in ("red", "green", "blue") if name in meanings]
+        self._bands = named if len(named) == 3 else [1, 2, 3] if self._file.count >= 3 else [1]
+        self.size = self._file.width, self._file.height
+        self._has_overviews = bool(self._file.overviews(self._bands[0]))
+
+    @cached_property
+    def _first(self) -> int:
+        return FIRST if self._has_overviews else super()._first
+
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+        """Read a window."""
+        return self._window(box, 1)
+
+    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
+        """Read a window; coarse ones from the overviews of the file, else as in other large pictures."""
+        if reduction < FIRST or not self._has_overviews:
+            return super().read(box, reduction)
+        x1, y1, x2, y2 = self._inside(box)
+        right, bottom = (min(-(-n // reduction) * reduction, m) for n, m in zip((x2, y2), self.size, strict=True))
+        outwards = x1 // reduction * reduction, y1 // reduction * reduction, right, bottom
+        return bytes_of(self._window(outwards, reduction))
+
+    def _window(self, box: PixelBox, reduction: int) -> NDArray[np.uint8]:
+        from rasterio.enums import Resampling
+        from rasterio.windows import Window
+
+        x1, y1, x2, y2 = box
+        shape = len(self._bands), -(-(y2 - y1) // reduction), -(-(x2 - x1) // reduction)
+        with _opening(self.path, "decoded"), self._limits:
+            bands = self._file.read(
+                self._bands, window=Window(x1, y1, x2 - x1, y2 - y1), out_shape=shape, resampling=Resampling.average
+            )
+        found = np.moveaxis(_from_16(bands), 0, -1)
+        return np.repeat(found, 3, -1) if len(self._bands) == 1 else found
 
 
 def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> LargePicture:
     """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
-    Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, else as other photographs. Arrays of
-    bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows of a `numpy.memmap` are read.
+    Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, and by rasterio if that is installed and
+    they have overviews or are of a kind that `tifffile` leaves; else as other photographs. Rasters `.vrt` and `.jp2`
+    need rasterio (`RasterPicture`). Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows
+    of a `numpy.memmap` are read.
 
     Args:
         source: the picture.
@@ -280,22 +400,31 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
     if not isinstance(source, str | PathLike):
         return MemoryPicture(source, color=color)
     check_local(source, "picture")
+    if Path(source).suffix.lower() in RASTERS:
+        return RasterPicture(source)
     if Path(source).suffix.lower() in _TILED:
         return _tiff(source)
     return PhotographPicture(source)
 
 
 def _tiff(path: str | PathLike[str]) -> LargePicture:
-    """A TIFF read tile by tile, or as a photograph if `tifffile` is missing or leaves such files to Pillow."""
+    """A TIFF read by windows; by rasterio if it has overviews, or of a kind that `tifffile` leaves; else by Pillow."""
     try:
-        return TiffPicture(path)
+        tiff = TiffPicture(path)
+        if not tiff.has_overviews:
+            return tiff
     except DataError as error:
-        try:
+        with suppress(DataError):
+            return RasterPicture(path)
+        with suppress(DataError):
             photograph = PhotographPicture(path)
             photograph.read((0, 0, 1, 1))
-        except DataError:
-            raise error from None
-        return photograph
+            return photograph
+        raise error from None
+    try:
+        return RasterPicture(path)
+    except DataError:
+        return tiff
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
@@ -320,9 +449,9 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
         return source.size
     if isinstance(source, str | PathLike):
         path = Path(source)
-        if path.suffix.lower() in _TILED:
+        if path.suffix.lower() in (*_TILED, *RASTERS):
             with suppress(DataError):
-                return TiffPicture(path).size
+                return open_large(path).size
         with _opening(path, "opened"), Pillow.open(path) as image:
             return _upright_size(image)
     if isinstance(source, Pillow.Image):

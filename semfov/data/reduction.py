@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
+from torch.utils.dlpack import from_dlpack
 
 PixelBox = tuple[int, int, int, int]
 
@@ -17,27 +18,50 @@ STRIP = 1 << 23
 """Pixels that are read at once for a copy."""
 
 FIRST = 4
-"""Factor by which the largest copy is reduced. All copies together take a twelfth of the memory of the picture."""
+"""Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
 
-_KEPT = 2  # pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works
+LARGEST = 1 << 25
+"""Most pixels of a copy, so that all copies together take at most 134 MB."""
+
+KEPT = 1.5
+"""Pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works."""
 
 
-def reduction_for(ratio: int) -> int:
+def reduction_for(ratio: float, kept: float = KEPT) -> int:
     """Largest factor by which a window may be reduced that is resampled afterwards.
 
     Args:
         ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
+        kept: pixels that the reduced window keeps for each wanted pixel.
 
     Returns:
         A power of two.
 
-    >>> [reduction_for(ratio) for ratio in (0, 3, 4, 9, 16)]
+    >>> [reduction_for(ratio) for ratio in (0, 2.9, 3, 9, 12.3)]
     [1, 1, 2, 4, 8]
     """
     reduction = 1
-    while ratio >= 2 * _KEPT * reduction:
+    while ratio >= 2 * kept * reduction:
         reduction *= 2
     return reduction
+
+
+def first_for(size: tuple[int, int]) -> int:
+    """Factor by which the largest copy of a picture is reduced, so that it has at most `LARGEST` pixels.
+
+    Args:
+        size: `(width, height)` of the picture.
+
+    Returns:
+        A power of two.
+
+    >>> first_for((20_000, 15_000)), first_for((40_000, 40_000))
+    (4, 8)
+    """
+    first = FIRST
+    while size[0] * size[1] > LARGEST * first**2:
+        first *= 2
+    return first
 
 
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -59,9 +83,13 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
-    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared."""
-    shared = pixels.flags.writeable and min(pixels.strides) >= 0
-    return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)
+    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared; they are not to be written to."""
+    try:
+        # Other than `from_numpy`, it takes arrays that may not be written to.
+        shared = from_dlpack(pixels if min(pixels.strides) >= 0 else pixels.copy())
+    except BufferError:  # NumPy 1 lends only what may be written to
+        shared = torch.from_numpy(pixels.copy())
+    return shared.permute(2, 0, 1)
 
 
 class ReducedCopies:
@@ -81,7 +109,7 @@ class ReducedCopies:
     """
 
     def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:
-        self.size = size
+        self.size, self.first = size, first_for(size)
         self._read = read
         self._copies: dict[int, Tensor] = {}
 
@@ -90,7 +118,7 @@ class ReducedCopies:
 
         Args:
             box: `(x1, y1, x2, y2)` in pixels of the picture. Edges between multiples of the reduction move outwards.
-            reduction: factor by which the copy is reduced, a power of two from `FIRST` on.
+            reduction: factor by which the copy is reduced, a power of two from `first_for` on.
 
         Returns:
             `(3, h, w)`, bytes, channels last in memory.
@@ -104,7 +132,7 @@ class ReducedCopies:
     def _copy(self, reduction: int) -> Tensor:
         """The picture reduced by a factor, `(3, h, w)`, channels last in memory."""
         if reduction not in self._copies:
-            if reduction == FIRST:
+            if reduction == self.first:
                 self._copies[reduction] = self._largest()
             else:
                 larger = self._copy(reduction // 2)
@@ -113,16 +141,17 @@ class ReducedCopies:
         return self._copies[reduction]
 
     def _largest(self) -> Tensor:
-        """The picture reduced by `FIRST`, strip by strip."""
-        wide, high = (max(1, length // FIRST) for length in self.size)
-        width, height = (min(length, count * FIRST) for length, count in zip(self.size, (wide, high), strict=True))
-        rows = max(1, STRIP // self.size[0] // FIRST)
+        """The largest copy, made strip by strip."""
+        first = self.first
+        wide, high = (max(1, length // first) for length in self.size)
+        width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
+        rows = max(1, STRIP // self.size[0] // first)
         parts = []
         for top in range(0, high, rows):
             bottom = min(top + rows, high)
             # The filter reaches over the borders of a strip by less than one pixel of the copy.
             low, end = max(top - 1, 0), min(bottom + 1, high)
-            strip = bytes_of(self._read((0, low * FIRST, width, min(end * FIRST, height))))
+            strip = bytes_of(self._read((0, low * first, width, min(end * first, height))))
             part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
             parts.append(part.permute(1, 2, 0))
         return torch.cat(parts).permute(2, 0, 1)

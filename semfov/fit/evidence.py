@@ -14,13 +14,13 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import place_known
-from semfov.episode import Step, rollout
+from semfov.episode import Step
 from semfov.fit.descent import descend
-from semfov.fit.evidence_examples import ExampleLooks, Examples, make_examples
+from semfov.fit.evidence_examples import TargetExamples, make_examples
+from semfov.fit.examples import example_episodes
 from semfov.fit.outputs import Fit, fit_and_write, split, training_of
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
-from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.looking import Looking
@@ -86,7 +86,7 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
 
 
 def train_evidence(
-    config: FitSearchConfig, examples: Examples, grid: Grid, metadata: dict[str, object], components: int
+    config: FitSearchConfig, examples: TargetExamples, grid: Grid, metadata: dict[str, object], components: int
 ) -> TargetEvidence:
     """Train the model on searches that it makes itself. Some of their fixations are random.
 
@@ -121,26 +121,10 @@ def train_evidence(
 
 
 def searches(
-    model: TargetEvidence, examples: Examples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+    model: TargetEvidence, examples: TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
-    """Search every example from a random start. The searches continue after they reach their target.
-
-    Args:
-        model: the target evidence.
-        examples: the examples, one search each.
-        grid: the grid of cells.
-        looks: number of looks in a search.
-        astray: share of the fixations that are drawn at random.
-        generator: source of random numbers.
-
-    Returns:
-        The steps of all searches together.
-    """
-    count = len(examples)
-    start = torch.randint(len(grid), (count,), generator=generator)
-    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
-    observer = Target(model, together=True)
-    return rollout(ExampleLooks(examples, grid), observer, TargetPosterior(1), start, choice, most=looks)
+    """Search every example; see `example_episodes`."""
+    return example_episodes(examples, Target(model, together=True), TargetPosterior(1), grid, looks, astray, generator)
 
 
 def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
@@ -186,7 +170,7 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
 
 @torch.no_grad()
 def judge_evidence(
-    config: FitSearchConfig, model: TargetEvidence, examples: Examples, grid: Grid
+    config: FitSearchConfig, model: TargetEvidence, examples: TargetExamples, grid: Grid
 ) -> tuple[list[dict[str, float]], Thresholds]:
     """Evaluate the model on held-out searches and choose its thresholds.
 

@@ -3,82 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score, look_features
 from semfov.belief.observers import Observer
 from semfov.belief.observers.base import own
 from semfov.belief.observers.target import Target, TargetLook
-from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight
 from semfov.errors import DataError
+from semfov.fit.examples import Examples
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 
 
 @dataclass(frozen=True)
-class Examples:
+class TargetExamples(Examples):
     """One example for each pair of photograph and class to search for. The class may be absent.
 
     Attributes:
         features: `(E, X·Y, X·Y, F)`, `look_features` of the looks from every cell, in half precision.
         score: `(E, X·Y)`, highest score of the class in the look from each cell.
-        distance: `(E, X·Y, X·Y)`, distance from every cell to every cell, in units of the image's longer side.
         goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; all False if the class is absent.
         target: `(E,)`, the class.
-        scene: `(E,)`, index of the photograph.
     """
 
-    features: Tensor
-    score: Tensor
-    distance: Tensor
     goal: Tensor
     target: Tensor
-    scene: Tensor
 
-    def __len__(self) -> int:
-        return len(self.scene)
-
-    def __getitem__(self, index: Tensor) -> Examples:
-        """Select examples by index or mask."""
-        return Examples(*(getattr(self, field.name)[index] for field in fields(self)))
-
-
-class ExampleLooks(Looks):
-    """Looks at many photographs at once, with one episode for each photograph.
-
-    Args:
-        examples: the examples, one for each episode.
-        grid: the grid of cells, of the examples' size.
-    """
-
-    def __init__(self, examples: Examples, grid: Grid) -> None:
-        self.examples, self.grid = examples, grid
-        self.like = examples.score
-
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Look up the looks from some cells, processed by the model in training."""
-        known, model = self.examples, own(observer, Target, "observer").model
-        evidence = model.evidence(known.features[episodes, cell].float())
-        look = TargetLook(
-            evidence,
-            known.distance[episodes, cell],
-            known.score[episodes, cell],
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> TargetLook:
+        """Process stored looks with the model in training; see `Examples.look`."""
+        return TargetLook(
+            own(observer, Target, "observer").model.evidence(self.features[episodes, cell].float()),
+            self.distance[episodes, cell],
+            self.score[episodes, cell],
             cell,
-            known.target[episodes],
-            self.grid.columns,
+            self.target[episodes],
+            columns,
         )
-        return Sight(look, no_detections, {})
-
-
-def no_detections() -> Detections:
-    """Raise an error: examples store features of detections, but not the detections."""
-    raise NotImplementedError("examples store features of detections, not the detections")
 
 
 def make_examples(
@@ -89,7 +53,7 @@ def make_examples(
     *,
     absent: int | None = None,
     scenes: Sequence[int] | None = None,
-) -> Examples:
+) -> TargetExamples:
     """Make examples from photographs for present and for absent classes.
 
     Args:
@@ -120,7 +84,8 @@ def make_examples(
             with torch.inference_mode():
                 features = look_features(detections, grid.centres, grid, target).half()
             score = highest_score(detections, target)
-            parts.append((features, score, grid.cell_distance, goal, torch.tensor(target), torch.tensor(index)))
+            row = features, score, grid.cell_distance, torch.tensor(index), goal, torch.tensor(target)
+            parts.append(row)
     if not parts:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
-    return Examples(*(torch.stack(column) for column in zip(*parts, strict=True)))
+    return TargetExamples(*(torch.stack(column) for column in zip(*parts, strict=True)))

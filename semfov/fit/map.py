@@ -12,14 +12,14 @@ from torch.nn import functional as F
 from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, MapBelief
-from semfov.episode import Step, rollout
+from semfov.episode import Step
 from semfov.errors import check
 from semfov.fit.descent import descend
-from semfov.fit.map_examples import MapExampleLooks, MapExamples, make_map_examples
+from semfov.fit.examples import example_episodes
+from semfov.fit.map_examples import MapExamples, make_map_examples
 from semfov.fit.outputs import Fit, fit_and_write, split, training_of
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
-from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
 from semfov.runs.looking import Looking
@@ -122,24 +122,10 @@ def train_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, g
 def explorations(
     model: MapEvidence, examples: MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
-    """Explore every example from a random start.
-
-    Args:
-        model: the map evidence.
-        examples: the examples, one exploration each.
-        grid: the grid of cells.
-        looks: number of looks in an exploration.
-        astray: share of the fixations that are drawn at random.
-        generator: source of random numbers.
-
-    Returns:
-        The steps of all explorations together.
-    """
-    count = len(examples)
-    start = torch.randint(len(grid), (count,), generator=generator)
-    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
-    observer = LearnedMap(model, together=True)
-    return rollout(MapExampleLooks(examples, grid), observer, CloserLook(grid), start, choice, most=looks)
+    """Explore every example; see `example_episodes`."""
+    return example_episodes(
+        examples, LearnedMap(model, together=True), CloserLook(grid), grid, looks, astray, generator
+    )
 
 
 def map_objective(step: Step, examples: MapExamples) -> Tensor:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, MapLook, Observer
 from semfov.belief.observers.base import own
-from semfov.episode import Looks, Sight
 from semfov.errors import DataError
-from semfov.fit.evidence_examples import no_detections
+from semfov.fit.examples import Examples
 from semfov.metrics.exploration import answers_of
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
@@ -21,61 +19,33 @@ from semfov.runs.seeds import generator_for
 
 
 @dataclass(frozen=True)
-class MapExamples:
+class MapExamples(Examples):
     """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
 
     Attributes:
         features: `(E, X·Y, T, X·Y, F)`, `class_features` of the looks from every cell, in half precision.
         score: `(E, X·Y, T)`, highest score of each class in the look from each cell.
-        distance: `(E, X·Y, X·Y)`, distance from every cell to every cell, in units of the image's longer side.
         answers: `(E, X·Y, T+1)` boolean, whether a cell is background (first), and whether an object of each class
             overlaps it.
         targets: `(E, T)`, the classes.
         stands_for: `(E, T)`, number of classes that each class represents.
-        scene: `(E,)`, index of the photograph.
     """
 
-    features: Tensor
-    score: Tensor
-    distance: Tensor
     answers: Tensor
     targets: Tensor
     stands_for: Tensor
-    scene: Tensor
 
-    def __len__(self) -> int:
-        return len(self.scene)
-
-    def __getitem__(self, index: Tensor) -> MapExamples:
-        """Select examples by index or mask."""
-        return MapExamples(*(getattr(self, field.name)[index] for field in fields(self)))
-
-
-class MapExampleLooks(Looks):
-    """Looks at many photographs at once, with one episode for each photograph.
-
-    Args:
-        examples: the examples, one for each episode.
-        grid: the grid of cells, of the examples' size.
-    """
-
-    def __init__(self, examples: MapExamples, grid: Grid) -> None:
-        self.examples, self.grid = examples, grid
-        self.like = examples.score
-
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Look up the looks from some cells, processed by the model in training."""
-        known, model = self.examples, own(observer, LearnedMap, "observer").model
-        look = MapLook(
-            model.evidence(known.features[episodes, cell].float()),
-            known.distance[episodes, cell],
-            known.score[episodes, cell],
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> MapLook:
+        """Process stored looks with the model in training; see `Examples.look`."""
+        return MapLook(
+            own(observer, LearnedMap, "observer").model.evidence(self.features[episodes, cell].float()),
+            self.distance[episodes, cell],
+            self.score[episodes, cell],
             cell,
-            known.targets[episodes],
-            self.grid.columns,
-            known.stands_for[episodes],
+            self.targets[episodes],
+            columns,
+            self.stands_for[episodes],
         )
-        return Sight(look, no_detections, {})
 
 
 def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> MapExamples:
@@ -119,7 +89,7 @@ def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> Map
             )
         answers = answers_of(annotation, grid, components)
         answers = torch.cat([~answers.any(-1, keepdim=True), answers[:, every[chosen]]], -1)
-        row = features, score[:, chosen], grid.cell_distance, answers, every[chosen], stands_for, torch.tensor(index)
+        row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), answers, every[chosen], stands_for
         parts.append(row)
     if not parts:
         raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")

@@ -1,4 +1,4 @@
-"""The place of a picture on earth, from a GeoTIFF."""
+"""The place of a picture on earth, from a GeoTIFF or another raster that GDAL reads."""
 
 import struct
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semfov.data.large import RASTERS
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
@@ -15,7 +16,7 @@ _KEYS = 34735
 
 
 def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """The map from pixels of a GeoTIFF to longitude and latitude.
+    """The map from pixels of a GeoTIFF, or of another raster, to longitude and latitude.
 
     Args:
         source: file of the picture.
@@ -28,7 +29,8 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
         InputError: the picture has a georeference, and rasterio is not installed.
         DataError: the file is missing or cannot be read.
     """
-    if Path(source).suffix.lower() not in (".tif", ".tiff") or not _is_referenced(source):
+    kind = Path(source).suffix.lower()
+    if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None
     try:
         import rasterio

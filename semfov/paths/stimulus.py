@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.large import LargePicture
-from semfov.data.reduction import reduction_for, resized
+from semfov.data.reduction import resized
 from semfov.detection.placement import Placement, resize
 from semfov.errors import check, check_shape
 from semfov.eye import Eye
@@ -173,7 +173,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(height * scale)), max(1, round(width * scale))
-    pixels = picture.read((0, 0, width, height), reduction_for(int(1 / scale)))
+    pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, kept=1))
     return resized(pixels, size)[0].contiguous()
 
 

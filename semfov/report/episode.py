@@ -17,7 +17,7 @@ from semfov.detection.placement import resize
 from semfov.paths import Scanpath, sensor_in_words
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
-from semfov.viz.semantic import entropy
+from semfov.viz.semantic import cell_entropy
 
 Data = dict[str, Any]
 
@@ -99,7 +99,7 @@ def episode_data(
         "truth": [] if boxes is None else boxes.tolist(),
         "fixations": fixations,
         "maps": map_data(scanpath, classes),
-        "entropy": quantised(entropy(scanpath)),
+        "entropy": quantised(cell_entropy(scanpath)),
     }
 
 

@@ -13,7 +13,7 @@ from semfov.viz.presence import plot_roc
 from semfov.viz.reliability import plot_cell_reliability, plot_reliability
 from semfov.viz.saliency import plot_saliency
 from semfov.viz.scanpath import plot_episode, plot_foveated_strip, plot_scanpath
-from semfov.viz.semantic import entropy, named_regions, plot_semantic_map
+from semfov.viz.semantic import cell_entropy, named_regions, plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure
 from semfov.viz.zoom import plot_zoom_path
 
@@ -21,8 +21,8 @@ __all__ = [
     "COLOURS",
     "CONFIDENT",
     "animate",
+    "cell_entropy",
     "class_posterior",
-    "entropy",
     "named_regions",
     "plot_belief",
     "plot_belief_bars",

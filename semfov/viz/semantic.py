@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _NAME_POINTS = 7
 
 
-def entropy(scanpath: Scanpath) -> Tensor:
+def cell_entropy(scanpath: Scanpath) -> Tensor:
     r"""Entropy of the class of every cell after each look.
 
     .. math:: H = -\sum_k p_k \log_2 p_k
@@ -50,7 +50,7 @@ def entropy(scanpath: Scanpath) -> Tensor:
     >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
     >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=None, cells=cells,
     ...                 fixations=grid.centres[cells], detections=(), probabilities=p, values=values)
-    >>> entropy(path)
+    >>> cell_entropy(path)
     tensor([[1., 0.]])
     """
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
@@ -89,7 +89,7 @@ def plot_semantic_map(
     draw_scale(named, drawn, "probability of the most probable object")
     if image is not None:
         draw_image(unsure, image, grid, grey=True)
-    values = entropy(scanpath)
+    values = cell_entropy(scanpath)
     style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
     bits = draw_cells(unsure, grid, values[fixation], alpha=0.65 if image is not None else None, **style)
     draw_gaze(unsure, scanpath, fixation)

@@ -179,6 +179,8 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
     colours.save(tmp_path / "palette.tif")
     expected = np.asarray(colours.convert("RGB"))
     assert np.array_equal(open_large(tmp_path / "palette.tif").pixels((0, 0, 230, 150)), expected)
+    Image.fromarray(array).save(tmp_path / "packed.tif", compression="tiff_lzw")  # tifffile needs a codec for it
+    assert np.array_equal(open_large(tmp_path / "packed.tif").pixels((0, 0, 230, 150)), array)
     tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb")
     monkeypatch.setitem(sys.modules, "tifffile", None)
     assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)

@@ -89,7 +89,7 @@ def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
 def test_small_pictures_and_fine_windows_are_read_as_they_are(strips):
     small, large = ArrayPicture(pixels(60, 70)), ArrayPicture(pixels(128, 192))
     assert [small.reduction(ratio) for ratio in (1, 9, 40)] == [1, 1, 1]
-    assert [large.reduction(ratio) for ratio in (0.3, 1, 4, 7.9, 8, 17, 40)] == [1, 1, 1, 1, 4, 8, 16]
+    assert [large.reduction(ratio) for ratio in (0.3, 1, 4, 5.9, 6, 17, 40)] == [1, 1, 1, 1, 4, 8, 16]
     assert small.read((0, 0, 70, 60), 4).shape == (3, 60, 70)
     assert large.read((10, 10, 20, 20), 2).shape == (3, 10, 10)
 
@@ -100,3 +100,23 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)
     assert torch.equal(TiffPicture(tmp_path / "a.tif").read(box, 8), ArrayPicture(array).read(box, 8))
+
+
+def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):
+    """Copies have at most 1600 pixels here."""
+    monkeypatch.setattr("semfov.data.reduction.LARGEST", 1600)
+    array, rows = pixels(256, 384), []
+
+    class Counting(ArrayPicture):
+        def pixels(self, box):
+            rows.append(box[3] - box[1])
+            return super().pixels(box)
+
+    picture = Counting(array)
+    assert [picture.reduction(ratio) for ratio in (6, 11.9, 12, 24)] == [1, 1, 8, 16]
+    assert torch.equal(
+        picture.read((0, 0, 384, 256), 8), resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
+    )
+    assert max(rows) < 256
+    assert picture.read((0, 0, 384, 256), 16).shape == (3, 16, 24)
+    assert picture.read((8, 8, 40, 40), 4).shape == (3, 32, 32)

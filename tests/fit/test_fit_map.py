@@ -14,8 +14,9 @@ from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
+from semfov.fit.examples import ExampleLooks
 from semfov.fit.map import FitMapConfig, frequencies, map_objective, train_gain, train_map
-from semfov.fit.map_examples import MapExampleLooks, make_map_examples
+from semfov.fit.map_examples import make_map_examples
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
 from tests.small import scattered
@@ -100,7 +101,7 @@ def test_looks_of_examples_match_stored_looks(run):
     cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
     observer, acquisition = LearnedMap(model), CloserLook(GRID)
     chosen = examples[torch.tensor([0, 3])]
-    steps = rollout(MapExampleLooks(chosen, GRID), observer, acquisition, cells[:, 0], Given(cells), most=4)
+    steps = rollout(ExampleLooks(chosen, GRID), observer, acquisition, cells[:, 0], Given(cells), most=4)
     beliefs = [step.belief for step in steps]
     for row, scene in enumerate(chosen.scene.tolist()):
         path, order = cells[row : row + 1], chosen.targets[row]

@@ -25,7 +25,8 @@ from semfov.fit.evidence import (
     searches,
     train_evidence,
 )
-from semfov.fit.evidence_examples import ExampleLooks, make_examples
+from semfov.fit.evidence_examples import make_examples
+from semfov.fit.examples import ExampleLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.search_protocol import choose_classes

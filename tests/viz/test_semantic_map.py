@@ -10,7 +10,7 @@ import torch
 
 from semfov import Grid
 from semfov.cli.text import regions_lines
-from semfov.viz import entropy, plot_semantic_map
+from semfov.viz import cell_entropy, plot_semantic_map
 from semfov.viz.semantic import borders, named_regions, regions
 from tests import small
 
@@ -102,7 +102,7 @@ def test_figure_of_marginal_probabilities():
             named.images[-1].get_array(), scanpath.probabilities[-1, :, 1:].amax(-1).reshape(4, 6), rtol=1e-6
         )
         assert named.images[-1].get_clim() == (0, 1)
-        np.testing.assert_allclose(unsure.images[-1].get_array(), entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
+        np.testing.assert_allclose(unsure.images[-1].get_array(), cell_entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
         assert sorted(text.get_text() for text in named.texts if text.get_text() in CLASSES) == ["cat", "dog", "dog"]
 
 
@@ -139,7 +139,7 @@ def test_names_of_many_regions_do_not_overlap():
 
 def test_entropy_is_that_of_normalised_probabilities():
     scanpath = marginal_map()
-    got = entropy(scanpath)
+    got = cell_entropy(scanpath)
     assert got.shape == (3, 24)
     for look in range(3):
         for cell in range(24):
