@@ -48,12 +48,14 @@ LEFT_OUT = {
 }
 """Public modules and functions that are not run on the pretended GPU, and why."""
 
-ON_CPU = {"class_posterior", "entropy", "merge_boxes", "open_scene", "reduced_copy"}
+ON_CPU = {"cell_entropy", "class_posterior", "merge_boxes", "open_scene", "reduced_copy"}
 """Functions whose results are on the CPU: of records and of scenes."""
 
 
 def public(keep: Callable[[Any], bool]) -> dict[str, Any]:
-    return {name: thing for things in entries().values() for name, thing in things if keep(thing)}
+    found = [each for things in entries().values() for each in things if keep(each[1])]
+    assert len(dict(found)) == len(found), "two public names are equal"
+    return dict(found)
 
 
 MODULES = public(
