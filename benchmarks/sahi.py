@@ -4,15 +4,17 @@
     python -m benchmarks.sahi --data.root DIR --data.annotations FILE --mosaics 0 --target person
 
 SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges the detections by its
-own rules (`GREEDYNMM`, its default, or `NMS`). It always looks at all slices, so it has a single result: recall after
-all of its passes. It is compared with the same slices, merged by `semfov.zoom.merge`, and with windows that semfov
-chooses.
+own rules (`GREEDYNMM`, its default, or `NMS`). It always looks at all slices, so it has a single result. It is compared
+with the same slices, merged by `semfov.zoom.merge`, with fewer of them, and with windows that semfov chooses. Every way
+looks anew, so that its seconds are its own: reading, detecting, choosing and merging, on one thread (processor time).
 """
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -21,18 +23,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.tables import table
+from eval.zoom.objects import AFTER, average_precision
 from eval.zoom.run import ZoomConfig, ZoomRun
+from semfov.data.large import to_bytes
 from semfov.data.scene import Annotation
 from semfov.detection.detector import Detector
+from semfov.detection.objects import Objects
 from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
-from semfov.runs.zoom_orders import in_order
-from semfov.zoom.episode import look_by_look
+from semfov.runs.window_looking import right_boxes
+from semfov.runs.zoom_orders import in_order, quad_tree, sparse
+from semfov.zoom.episode import Order, look_by_look
 from semfov.zoom.gist import FOUND
+from semfov.zoom.glances import LiveGlances, Window
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.search import find_everything
-from semfov.zoom.slices import slices
+from semfov.zoom.slices import adaptive_slices, slices
 
 try:
     from sahi.models.base import DetectionModel
@@ -110,29 +118,45 @@ class Outcome:
         objects: number of objects.
         boxes: number of boxes reported.
         passes: number of detector passes.
+        seconds: time that it took.
+        scores: scores of the boxes of each picture.
+        right: which of them are right.
     """
 
     found: int = 0
     objects: int = 0
     boxes: int = 0
     passes: int = 0
+    seconds: float = 0.0
+    scores: list[Tensor] = field(default_factory=list)
+    right: list[Tensor] = field(default_factory=list)
 
-    def add(self, boxes: Tensor, labels: Tensor, annotation: Annotation, passes: int) -> None:
+    def add(self, objects: Objects, annotation: Annotation, passes: int, seconds: float) -> None:
         """Add a picture's counts; an object is found if a box of its class has an IoU of 0.5, as in `eval.zoom`."""
-        hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
+        hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
         self.found += int(hits.any(0).sum())
         self.objects += len(annotation.boxes)
-        self.boxes += len(boxes)
+        self.boxes += len(objects)
         self.passes += passes
+        self.seconds += seconds
+        right = right_boxes(objects, annotation)
+        self.scores.append(objects.scores[right >= 0])  # not those in a crowd
+        self.right.append(right[right >= 0] > 0)
+
+    def row(self, pictures: int) -> list[str]:
+        """Passes and seconds for a picture, recall, average precision, and boxes for each object."""
+        precision = average_precision(torch.cat(self.scores), torch.cat(self.right), self.objects)
+        shares = self.found / max(self.objects, 1), precision
+        rest = [f"{share:.3f}" for share in shares] + [f"{self.boxes / max(self.objects, 1):.2f}"]
+        return [f"{self.passes / pictures:.1f}", f"{self.seconds / pictures:.2f}", *rest]
 
 
-def sliced(run: ZoomRun, index: int, **merging: str) -> tuple[Tensor, Tensor, int]:
-    """Boxes and labels that SAHI reports for a picture, and its passes; `merging` changes its default rules."""
+def sliced(run: ZoomRun, pixels: NDArray[np.uint8], **merging: str) -> tuple[Objects, int]:
+    """Objects that SAHI reports for a picture `(H, W, 3)`, and its passes; `merging` changes its default rules."""
     config = run.config
     model = Slicing(run.eye.detector, run.target, FOUND)
-    picture = (run.scenes[index].image * 255).round().byte().permute(1, 2, 0).numpy()
     result = get_sliced_prediction(
-        picture,
+        pixels,
         model,
         slice_height=config.slice,
         slice_width=config.slice,
@@ -143,37 +167,63 @@ def sliced(run: ZoomRun, index: int, **merging: str) -> tuple[Tensor, Tensor, in
     )
     kept = result.object_prediction_list
     boxes = torch.tensor([each.bbox.to_xyxy() for each in kept], dtype=torch.float32).view(-1, 4)
-    return boxes, torch.tensor([each.category.id for each in kept], dtype=torch.long), model.passes
+    labels = torch.tensor([each.category.id for each in kept], dtype=torch.long)
+    scores = torch.tensor([each.score.value for each in kept], dtype=torch.float32)
+    return Objects(boxes, scores, labels, torch.zeros_like(labels)), model.passes
+
+
+def ordered(run: ZoomRun, pixels: NDArray[np.uint8], order: Callable[[Lattice], Order]) -> tuple[Objects, int]:
+    """Objects that an order of windows shows in a picture, and its passes."""
+    glances = LiveGlances(run.eye, run.eye.open(pixels))
+    seen = [turn.glance for turn in islice(look_by_look(glances, order(glances.lattice), None), run.config.passes)]
+    return merge(seen, run.target, score=FOUND), len(seen)
+
+
+def chosen(run: ZoomRun, pixels: NDArray[np.uint8], passes: int) -> tuple[Objects, int]:
+    """Objects in the windows that semfov chooses, and its passes."""
+    glances = LiveGlances(run.eye, run.eye.open(pixels))
+    seen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
+    return merge(seen, run.target, score=FOUND), len(seen)
+
+
+def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects, int]]]:
+    """The ways of looking at a picture, by name."""
+    config, targets = run.config, [] if run.target is None else [run.target]
+
+    def cut(lattice: Lattice) -> list[Window]:
+        return slices(lattice, config.slice, config.overlap)
+
+    orders: dict[str, Callable[[Lattice], Order]] = {
+        "the same slices, merged here": lambda lattice: in_order(cut(lattice)),
+        "sparse slices": lambda lattice: sparse(cut(lattice), targets, config.sparse),
+        "slices as in ASAHI": lambda lattice: in_order(adaptive_slices(lattice)),
+        "quad-tree": lambda lattice: quad_tree(lattice, run.target, most=False),
+    }
+    return {
+        "SAHI": partial(sliced, run),
+        "SAHI, NMS": partial(sliced, run, postprocess_type="NMS", postprocess_match_metric="IOU"),
+        **{name: partial(ordered, run, order=order) for name, order in orders.items()},
+        **{f"ours, {number} passes": partial(chosen, run, passes=number) for number in AFTER[1:]},
+    }
 
 
 def compare(config: ZoomConfig) -> None:
     """Look at every picture in all ways, and print the table."""
     run = ZoomRun(config)
-    merging = {"SAHI": {}, "SAHI, NMS": {"postprocess_type": "NMS", "postprocess_match_metric": "IOU"}}
-    names = "the same slices, merged here", "ours, as many passes", "ours, half as many"
-    outcomes = {name: Outcome() for name in (*merging, *names)}
-    with one_thread():
+    outcomes = {name: Outcome() for name in ways(run)}
+    with one_thread(), torch.inference_mode():
         for index in range(len(run.scenes)):
-            annotation, glances = run.annotation(index), run.glances(index)
-            for name, how in merging.items():
-                boxes, labels, passes = sliced(run, index, **how)
-                outcomes[name].add(boxes, labels, annotation, passes)
-            same = look_by_look(glances, in_order(slices(glances.lattice, config.slice, config.overlap)), None)
-            chosen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
-            ways = {names[0]: [turn.glance for turn in same], names[1]: chosen, names[2]: chosen[: passes // 2]}
-            for name, looks in ways.items():
-                found = merge(looks, run.target, score=FOUND)
-                outcomes[name].add(found.boxes, found.labels, annotation, len(looks))
-            glances.save()
+            annotation, pixels = run.annotation(index), to_bytes(run.scenes[index].image)
+            for name, way in ways(run).items():
+                began = process_time()
+                objects, passes = way(pixels)
+                outcomes[name].add(objects, annotation, passes, process_time() - began)
             print(f"{run.scenes.ids[index]}: {outcomes['SAHI'].found} of {outcomes['SAHI'].objects} so far", flush=True)
     count = len(run.scenes)
-    rows = [
-        [name, f"{o.passes / count:.1f}", f"{o.found / max(o.objects, 1):.3f}", f"{o.boxes / max(o.objects, 1):.2f}"]
-        for name, o in outcomes.items()
-    ]
     what = "objects" if config.target is None else config.target
     print(f"\n{outcomes['SAHI'].objects} {what} in {count} pictures, slices of {config.slice} px:\n")
-    print(table(["", "passes", "recall", "boxes for each object"], rows))
+    head = ["", "passes", "seconds", "recall", "AP50", "boxes for each object"]
+    print(table(head, [[name, *outcome.row(count)] for name, outcome in outcomes.items()]))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -34,7 +34,7 @@ from semfov.runs.window_looking import (
     found_in,
     right_boxes,
 )
-from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled
+from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled, sparse
 from semfov.zoom.episode import Turn, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -42,11 +42,18 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
-from semfov.zoom.slices import ranked, slices
+from semfov.zoom.slices import adaptive_slices, ranked, slices
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
 
-_COMPARED = "slices, raster", "slices, ranked by the overview", "ours"
+_COMPARED = (
+    "slices, raster",
+    "slices, sparse",
+    "slices as in ASAHI",
+    "slices, ranked by the overview",
+    "quad-tree, best first",
+    "ours",
+)
 """Ways of looking whose objects are compared with the annotated ones."""
 
 
@@ -64,6 +71,7 @@ class ZoomConfig(WindowLookingConfig):
         target: class whose objects are to be found (None: objects of any class).
         slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
         overlap: overlap of neighbouring slices, as a share of their side.
+        sparse: sparse slices are those in which the overview has a score of at least this.
         passes: largest number of detector passes.
         measures: what to measure: the `objects` that are returned; `recall` after each pass; passes to the first `hit`,
             in mosaics, for classes that a slice shows; the `decision` at the end of a search.
@@ -85,6 +93,7 @@ class ZoomConfig(WindowLookingConfig):
     target: str | None = None
     slice: TileSize = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
+    sparse: Annotated[float, Range(0, 1)] = 0.02
     passes: Annotated[int, Range(2, 100_000)] = 24
     measures: tuple[_Measure, ...] = ("objects", "recall", "hit", "decision")
     sought: Count = 4
@@ -150,10 +159,13 @@ class ZoomRun(WindowLooking, SceneRun):
         """Every way of looking for all objects, with its name in tables."""
         cut, lattice = self.slices(index, glances.lattice), glances.lattice
         annotation, target = self.annotation(index), self.target
+        targets = [] if target is None else [target]
         orders = {
             "slices, raster": in_order(cut),
             "slices, random": shuffled(cut, [self.config.seed, index]),
-            "slices, ranked by the overview": ranked(cut, [] if target is None else [target]),
+            "slices, sparse": sparse(cut, targets, self.config.sparse),
+            "slices as in ASAHI": in_order(adaptive_slices(lattice)),
+            "slices, ranked by the overview": ranked(cut, targets),
             "quad-tree, best first": quad_tree(lattice, target, most=False),
         }
         for name, order in orders.items():

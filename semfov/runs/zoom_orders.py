@@ -18,6 +18,28 @@ def in_order(windows: Sequence[Window]) -> Order:
     return lambda looks, done: [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
 
 
+def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> Order:
+    """The windows in their order, without those in which the overview shows too little: sparse slicing.
+
+    Args:
+        windows: slices, as in slicing-aided hyper inference (SAHI; Akyon, Altinuc and Temizel, 2022).
+        targets: classes 1..K; none: any class.
+        least: a window is looked at if the highest raw score of the overview in it is at least this.
+
+    Returns:
+        The order.
+    """
+    kept: list[Window] | None = None
+
+    def order(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
+        nonlocal kept
+        if kept is None:
+            kept = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
+        return in_order(kept)(looks, done)
+
+    return order
+
+
 def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
     """The windows in random order."""
     order = np.random.Generator(np.random.PCG64(list(seed))).permutation(len(windows))

@@ -27,8 +27,38 @@ def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
     >>> [window.within for window in slices(Lattice.over((900, 400), (416, 416)), 500, 0.2)]
     [(0.0, 0.0, 500.0, 400.0), (400.0, 0.0, 900.0, 400.0)]
     """
+    return _squares(lattice, side, max(1, int(side * (1 - overlap))))
+
+
+def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
+    r"""Square slices whose number and side follow from the size of the picture, as in ASAHI.
+
+    A picture whose longer side exceeds :math:`512 (4 - 3 l) + 1` pixels is covered by 4 × 3 slices with an overlap l,
+    another one by 3 × 2; n × m slices need the side
+
+    .. math:: p = \max\left(\frac{W}{n - (n - 1) l}, \frac{H}{m - (m - 1) l}\right) + 1
+
+    Zhang, H. et al. (2023), Adaptive slicing-aided hyper inference for small object detection in high-resolution remote
+    sensing images, Remote Sensing 15(5):1249.
+
+    Args:
+        lattice: lattice of the picture.
+        overlap: share of a slice by which neighbours overlap.
+
+    Returns:
+        The slices, row by row: fewer than 4 × 3 or 3 × 2 where the picture is narrower than these.
+
+    >>> [len(adaptive_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1600, 1200), (3840, 600))]
+    [12, 6, 4]
+    """
+    many = max(lattice.size) > 512 * (4 - 3 * overlap) + 1
+    counts = (4, 3) if many else (3, 2)
+    side = int(max(length / (n - (n - 1) * overlap) for length, n in zip(lattice.size, counts, strict=True))) + 1
+    return _squares(lattice, side, side - int(side * overlap))
+
+
+def _squares(lattice: Lattice, side: int, step: int) -> list[Window]:
     width, height = lattice.size
-    step = max(1, int(side * (1 - overlap)))
 
     def starts(length: int) -> list[int]:
         last = max(length - side, 0)
