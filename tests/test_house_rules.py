@@ -91,7 +91,6 @@ def test_names_in_all_exist_once_and_are_public(module):
 
 REPEATED = {
     "main": "the command line of each program",
-    "Choice": "a rule of the next fixation (`semfov.gaze`), and a window with its value (`semfov.zoom.policy`)",
 }
 """Public names that several modules define, each with the reason."""
 

@@ -35,7 +35,7 @@ from semfov.runs.window_looking import (
     right_boxes,
 )
 from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled, sparse
-from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
@@ -155,7 +155,7 @@ class ZoomRun(WindowLooking, SceneRun):
         glances.save()
         return records, watch.seconds
 
-    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Turn[Any]]]]:
+    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[WindowStep[Any]]]]:
         """Every way of looking for all objects, with its name in tables."""
         cut, lattice = self.slices(index, glances.lattice), glances.lattice
         annotation, target = self.annotation(index), self.target
@@ -251,7 +251,7 @@ class ZoomRun(WindowLooking, SceneRun):
                 "slices, ranked by the overview": ranked(cut, [target], most=True),
                 "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
             }
-            ways: dict[str, Iterator[Turn[Any]]] = {
+            ways: dict[str, Iterator[WindowStep[Any]]] = {
                 **{name: look_by_look(glances, order, None) for name, order in orders.items()},
                 "ours": look_for(glances, self.evidence, target, slices=cut),
                 "ours, free windows": look_for(glances, self.evidence, target, closest=True),

@@ -24,7 +24,7 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
-from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances
@@ -207,7 +207,7 @@ class ZoomAgent(nn.Module):
         if least is not None:
             check_number(least, "least", 0, 1)
         glances, one = self._open(picture), targets[0] if len(targets) == 1 else None
-        turns: Iterator[Turn[Any]]
+        turns: Iterator[WindowStep[Any]]
         if self.evidence is None:
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
@@ -439,7 +439,7 @@ class _Windows:
         """A reduced copy of the picture; None for stored looks."""
         return None if self.picture is None else reduced_copy(self.picture)
 
-    def add(self, turn: Turn[Any], *, counting: bool = True) -> None:
+    def add(self, turn: WindowStep[Any], *, counting: bool = True) -> None:
         """Keep a look; in a search its value is no number of objects, and none are counted that no look has shown."""
         if counting:
             self.promised += turn.worth if self.seen else 0.0

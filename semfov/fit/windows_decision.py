@@ -21,7 +21,7 @@ from semfov.runs.search_protocol import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.episode import Turn
+from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.facts import SearchFacts
 from semfov.zoom.search import look_for
@@ -64,7 +64,7 @@ def searches_of(
     passes: int,
     seed: int,
     title: str,
-) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], SearchFacts]]]]:
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
     """Search every mosaic for some present classes and for as many absent ones, without decisions.
 
     Args:
@@ -88,7 +88,7 @@ def searches_of(
         looks.save()
 
 
-def _with_facts(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBelief], SearchFacts]]:
+def _with_facts(turns: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]:
     """The turns of a search, each with the facts about the search after it."""
     facts: SearchFacts | None = None
     for turn in turns:

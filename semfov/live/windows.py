@@ -17,7 +17,7 @@ from semfov.live.base import FramePerception
 from semfov.paths import WindowMoment, reduced_copy
 from semfov.zoom.closer import closer_window, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
-from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.glances import Glance, LiveGlances, Window
 from semfov.zoom.objects import without_replaced
 from semfov.zoom.search import find_everything, look_for
@@ -87,8 +87,8 @@ class WindowPerception(FramePerception):
                 self.evidence, target, self._close_up, forgetting=self.forgetting, **given
             )
         self._glances: LiveGlances | None = None
-        self._turns: Iterator[Turn[Any]] = iter(())
-        self._last: Turn[Any] | None = None
+        self._turns: Iterator[WindowStep[Any]] = iter(())
+        self._last: WindowStep[Any] | None = None
         self._kept: list[_Look] = []
         self._number = 0
 
@@ -113,7 +113,7 @@ class WindowPerception(FramePerception):
             self._number += 1
             return moment
 
-    def _begin(self, glances: LiveGlances) -> Iterator[Turn[Any]]:
+    def _begin(self, glances: LiveGlances) -> Iterator[WindowStep[Any]]:
         """Start the episode, which never ends."""
         wanted = (self.target,) if self.target is not None else self.targets
         if self.evidence is None:

@@ -10,7 +10,7 @@ from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import CandidateBoxes, WindowLook
-from semfov.zoom.episode import Turn
+from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import Glance
@@ -81,7 +81,7 @@ class WindowDecisions:
         if self.verifier is not None:
             self.verifier.wait()
 
-    def see(self, turn: Turn[ZoomBelief], number: int, *, last: bool) -> None:
+    def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
         """Take in a look, and choose the place that is to be looked at closely.
 
         Args:

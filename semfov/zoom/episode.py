@@ -7,16 +7,16 @@ from typing import Generic, TypeVar
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Glances, Window, overview
-from semfov.zoom.policy import Choice
+from semfov.zoom.policy import WindowChoice
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
 
-Order = Callable[[Sequence[Glance], set[Window]], Sequence[Choice]]
+Order = Callable[[Sequence[Glance], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
 none ends the episode."""
 
 
-class Turn(Generic[_Belief]):
+class WindowStep(Generic[_Belief]):
     """One step of an episode: a look, its value when it was chosen, and the belief after it.
 
     Attributes:
@@ -32,13 +32,13 @@ class Turn(Generic[_Belief]):
         worth: float,
         belief: _Belief,
         looks: Sequence[Glance],
-        choose: Callable[[], Sequence[Choice]],
+        choose: Callable[[], Sequence[WindowChoice]],
     ) -> None:
         self.glance, self.worth, self.looks, self._choose = glance, worth, looks, choose
         self.belief: _Belief = belief
 
     @cached_property
-    def choices(self) -> Sequence[Choice]:
+    def choices(self) -> Sequence[WindowChoice]:
         """The windows to look at next and their values, chosen when they are first asked for."""
         return self._choose()
 
@@ -111,7 +111,7 @@ def look_by_look(
     ends: Callable[[Glance], bool] = lambda glance: False,
     hints: bool = True,
     forgetting: Forgetting | None = None,
-) -> Iterator[Turn[_Belief]]:
+) -> Iterator[WindowStep[_Belief]]:
     r"""Look at the whole picture, and then at the windows of an order, until it has none left.
 
     The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it.
@@ -142,18 +142,18 @@ def look_by_look(
     """
     recent, first = _Recent(belief, forgetting), overview(glances.lattice)
 
-    def choose() -> Sequence[Choice]:
+    def choose() -> Sequence[WindowChoice]:
         choices = order(recent.looks, recent.windows)
         if forgetting is not None and (recent.renewed or not choices):
             return [(first, choices[0][1])] if choices else [(recent.oldest, 0.0)]
         return choices
 
-    choices: Sequence[Choice] = [(first, float("inf"))]
+    choices: Sequence[WindowChoice] = [(first, float("inf"))]
     while choices:
         looks = glances.see([window for window, _ in choices], hints=hints)
         for glance, (_, worth) in zip(looks, choices, strict=True):
             recent.add(glance, glances.frame)
-            turn = Turn(glance, worth, belief, tuple(recent.looks), choose)
+            turn = WindowStep(glance, worth, belief, tuple(recent.looks), choose)
             yield turn
             if ends(glance):
                 return

@@ -11,11 +11,11 @@ from semfov.zoom.glances import Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.sums import Cells
 
-Choice = tuple[Window, float]
+WindowChoice = tuple[Window, float]
 """A window and the value of a look at it."""
 
 
-def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> Choice | None:
+def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> WindowChoice | None:
     r"""Choose the window in which a look is expected to find most objects that were not found yet.
 
     .. math:: v(w) = E[n_k(w)] + \kappa \, E[n_{k+1}(w)]
@@ -32,13 +32,13 @@ def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> 
         The window and its value; None if nothing is left to find.
     """
     lattice = belief.lattice
-    best: Choice | None = None
+    best: WindowChoice | None = None
     for level in range(1, lattice.levels):
         best = _better(best, belief.value(level, foresight), level, lattice, done)
     return best
 
 
-def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) -> Choice | None:
+def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) -> WindowChoice | None:
     """Choose the window that most probably shows the target, or one after which the target is soon found.
 
     The value of a window is the probability that it shows the target. For windows that can be looked at more closely it
@@ -54,7 +54,7 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
     """
     lattice, patience = belief.lattice, belief.evidence.patience
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
-    best: Choice | None = None
+    best: WindowChoice | None = None
     for level, values in chances.items():
         last = level == lattice.levels - 1
         if closest and not last:
@@ -90,7 +90,9 @@ def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells
     return total
 
 
-def _better(best: Choice | None, values: Cells, level: int, lattice: Lattice, done: set[Window]) -> Choice | None:
+def _better(
+    best: WindowChoice | None, values: Cells, level: int, lattice: Lattice, done: set[Window]
+) -> WindowChoice | None:
     """The better of a choice and the best window of a level that was not looked at."""
     flat, across = values.ravel(), values.shape[1]
     for _ in range(len(done) + 1):
@@ -106,14 +108,14 @@ def _better(best: Choice | None, values: Cells, level: int, lattice: Lattice, do
     return best
 
 
-def best_slice(belief: ZoomBelief, slices: Sequence[Window], done: set[Window]) -> Choice | None:
+def best_slice(belief: ZoomBelief, slices: Sequence[Window], done: set[Window]) -> WindowChoice | None:
     """As `best_hit`, but only given slices can confirm the target; coarser windows are those of the lattice."""
     odds = {window: belief.odds_of(window) for window in slices if window not in done}
     if not odds:
         return None
     chances = {window: float(torch.tensor(value).sigmoid()) for window, value in odds.items()}
     window = max(chances, key=chances.__getitem__)
-    best: Choice = window, chances[window]
+    best: WindowChoice = window, chances[window]
     lattice = belief.lattice
     finest = min(window.level for window in slices)
     for level in range(1, finest):
@@ -144,8 +146,8 @@ def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
 
 
 def jointly(
-    choose: Callable[[set[Window]], Choice | None], belief: ZoomBelief, done: set[Window], count: int
-) -> list[Choice]:
+    choose: Callable[[set[Window]], WindowChoice | None], belief: ZoomBelief, done: set[Window], count: int
+) -> list[WindowChoice]:
     """Choose several windows to look at together, each as if the windows before it had been looked at.
 
     Args:

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 
 from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
-from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window
-from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
+from semfov.zoom.policy import WindowChoice, best_find, best_hit, best_slice, jointly
 
 
 def look_for(
@@ -19,7 +19,7 @@ def look_for(
     slices: Sequence[Window] | None = None,
     closest: bool = False,
     forgetting: Forgetting | None = None,
-) -> Iterator[Turn[ZoomBelief]]:
+) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
 
     Args:
@@ -37,7 +37,7 @@ def look_for(
     belief, last = ZoomBelief(glances.lattice, evidence, target), glances.lattice.levels - 1
     allowed = None if slices is None else set(slices)
 
-    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
+    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
         choice = best_hit(belief, done, closest=closest) if slices is None else best_slice(belief, slices, done)
         return [] if choice is None else [choice]
 
@@ -57,7 +57,7 @@ def find_everything(
     batch: int = 1,
     worth: float = 0.0,
     forgetting: Forgetting | None = None,
-) -> Iterator[Turn[ZoomBelief]]:
+) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
 
     Args:
@@ -73,7 +73,7 @@ def find_everything(
     """
     belief = ZoomBelief(glances.lattice, evidence, target or 0)
 
-    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
+    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
         chosen = jointly(lambda taken: best_find(belief, taken, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 

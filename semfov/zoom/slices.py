@@ -7,7 +7,7 @@ import torch
 from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Window, around
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.policy import Choice
+from semfov.zoom.policy import WindowChoice
 
 OVERLAP = 0.2
 """Share of a slice by which neighbours overlap."""
@@ -100,10 +100,10 @@ def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool
     Returns:
         The order.
     """
-    ranking: list[Choice] = []
+    ranking: list[WindowChoice] = []
     ranked_by: Glance | None = None
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
         nonlocal ranked_by
         if looks[0] is not ranked_by:
             ranked_by = looks[0]

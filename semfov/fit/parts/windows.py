@@ -33,7 +33,7 @@ from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
-from semfov.zoom.episode import Turn, look_by_look
+from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances
@@ -49,7 +49,7 @@ _OF_INPUT = 1.15
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
-Way = Callable[[Glances], Iterator[Turn[Any]]]
+Way = Callable[[Glances], Iterator[WindowStep[Any]]]
 """A way of looking for all objects of a picture."""
 
 
@@ -171,7 +171,7 @@ def fit_mosaics(
     return model, "\n".join(lines)
 
 
-def in_raw_order(glances: Glances) -> Iterator[Turn[Any]]:
+def in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
     """Look at slices in the order of the overview's scores, as an agent without evidence does."""
     return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
 
