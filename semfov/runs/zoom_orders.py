@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.policy import Choice
+from semfov.zoom.policy import WindowChoice
 from semfov.zoom.slices import raw
 
 
@@ -31,7 +31,7 @@ def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> O
     """
     kept: list[Window] | None = None
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> Sequence[Choice]:
+    def order(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
         nonlocal kept
         if kept is None:
             kept = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
@@ -61,7 +61,7 @@ def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
     # Quarters at the right and bottom borders are moved inside the picture, where two of them may coincide.
     known = set[Window]()
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
         new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in known]
         known.update(window for _, window in new)
         frontier.extend(new)
@@ -104,7 +104,7 @@ def oracle(glances: Glances, windows: Sequence[Window], found: Callable[[Glance]
     shown = torch.stack([found(glance) for glance in glances.see(windows)])
     seen: list[Tensor] = []
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[Choice]:
+    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
         if len(looks) >= min(most, len(windows)):
             return []
         if len(looks) == 1:
