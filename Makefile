@@ -47,9 +47,10 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 # Numbers are computed a second time as on a processor without AVX, on one thread: other processors round otherwise.
+# Graphs are traced alike on all of them.
 test: lint types
 	$(PYTEST) -m "not lab and not long"
-	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(PYTEST) -m "not lab and not long and not slow" $(NUMERIC)
+	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(PYTEST) -m "not lab and not long and not slow" -k "not compile and not export" $(NUMERIC)
 
 # Some of these tests build the site.
 lab: $(STAMP)

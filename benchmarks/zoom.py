@@ -1,8 +1,9 @@
 """Cost of a look at a large picture beside the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
 
 The agent explores mosaics of embedded scenes, finds all objects of a class in them, and searches them for a class. In
-the same repetition the detector alone, with the selection of its boxes, gets the same canvases. The rest of a pass is
-reading and resampling the window, pooling hints, merging boxes, updating the belief and choosing the next window.
+the same repetition the detector alone, with the selection of its boxes, gets the same canvases. The rest of a task is
+reading and resampling windows, pooling hints, updating the belief, choosing the next windows, merging boxes and the
+record.
 """
 
 import argparse
@@ -22,14 +23,15 @@ from semfov.data.mosaics import Mosaics
 from semfov.detection.selection import select
 from semfov.paths import ZoomPath
 
-PASSES = 17
-SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6), "10240 × 7680 px": (16, 16)}
+PASSES = 16
+TILES = {"2560 × 1920 px": (4, 480), "3840 × 2160 px": (6, 360), "10240 × 7680 px": (16, 480)}
+"""For each size of a mosaic its tiles along a side, which are 640 pixels wide, and their height."""
 
 
-def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, Run, int]]:
+def programs(agent: ZoomAgent, side: int, height: int) -> dict[str, tuple[Run, Run, int]]:
     """For each task: the program of the agent, that of the detector alone, and the number of passes."""
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
-    picture = to_bytes(Mosaics(scenes, columns, rows, tile=(640, 480), count=1)[0].image)
+    picture = to_bytes(Mosaics(scenes, side, side, tile=(640, height), count=1)[0].image)
     eye, detector = agent.eye, agent.eye.detector
     view = eye.open(picture)
 
@@ -56,11 +58,11 @@ def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, 
     return {name: (task, alone(path := task()), path.passes) for name, task in tasks.items()}
 
 
-def share(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
-    """Milliseconds of a task and of the detector alone, and the share of the task that is not the detector."""
+def cost(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
+    """Milliseconds of a task and of the detector alone, and their ratio."""
     found = interleaved({"task": task, "detector": detector}, seconds, clock)
-    rest = [1 - theirs / ours for ours, theirs in zip(found["task"], found["detector"], strict=True)]
-    return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(rest)
+    ratios = [ours / theirs for ours, theirs in zip(found["task"], found["detector"], strict=True)]
+    return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(ratios)
 
 
 @torch.inference_mode()
@@ -76,20 +78,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clock, times = clock_for(options.threads)
     agent = ZoomAgent.recommended("yolox-nano", weights=options.weights)
     rows, figures = [], {}
-    for size, (columns, lines) in SIZES.items():
-        for name, (task, detector, passes) in programs(agent, columns, lines).items():
-            whole, alone, rest = share(task, detector, options.seconds, clock)
-            rows.append([f"{name}, {size}", number(whole.middle / passes), number(alone.middle / passes), spread(rest)])
-            figures[f"{name}, {size}"] = {"task": asdict(whole), "detector": asdict(alone), "rest": asdict(rest)}
+    for size, (side, height) in TILES.items():
+        for name, (task, detector, passes) in programs(agent, side, height).items():
+            whole, alone, ratio = cost(task, detector, options.seconds, clock)
+            each = [number(whole.middle / passes), number(alone.middle / passes)]
+            rows.append([f"{name}, {size}", *each, spread(ratio)])
+            figures[f"{name}, {size}"] = {"task": asdict(whole), "detector": asdict(alone), "ratio": asdict(ratio)}
             print(" | ".join(rows[-1]), flush=True)
     about = describe() | {"times": times}
-    head = ["task", "pass, ms", "detector, ms", "share of a pass that is not the detector"]
+    head = ["task", "pass, ms", "detector, ms", "task by detector"]
     text = "\n".join(
         [
             "# Large pictures",
             "",
             f"Written by `python -m benchmarks.zoom`. YOLOX-nano, {PASSES} passes over mosaics of embedded scenes.",
-            "Medians over repetitions; shares with quartiles.",
+            "Medians over repetitions; ratios with quartiles.",
             "",
             *(f"- {key}: {value}" for key, value in about.items()),
             "",

@@ -146,12 +146,12 @@ class ReducedCopies:
         wide, high = (max(1, length // first) for length in self.size)
         width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
         rows = max(1, STRIP // self.size[0] // first)
-        parts = []
+        copy = torch.empty(high, wide, 3, dtype=torch.uint8)
         for top in range(0, high, rows):
             bottom = min(top + rows, high)
             # The filter reaches over the borders of a strip by less than one pixel of the copy.
             low, end = max(top - 1, 0), min(bottom + 1, high)
             strip = bytes_of(self._read((0, low * first, width, min(end * first, height))))
             part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
-            parts.append(part.permute(1, 2, 0))
-        return torch.cat(parts).permute(2, 0, 1)
+            copy[top:bottom] = part.permute(1, 2, 0)
+        return copy.permute(2, 0, 1)

@@ -55,10 +55,10 @@ def test_gain_is_summed_over_all_cells(model, dtype, device):
         one = belief[episode : episode + 1]
         for fixation in range(20):
             distance = GRID.distance(GRID.centres[fixation])[None].to(one.closest)
+            gains = model.gain(one.probabilities, one.closest, one.looks, distance)[0, 0]
             total = 0.0
-            for cell in range(20):
+            for cell, told in enumerate(gains):
                 nearer = float(distance[0, cell]) < float(one.closest[0, cell]) - 1e-6
-                told = model.gain(one.probabilities, one.closest, one.looks, distance)[0, 0, cell]
                 assert nearer == (float(told) != 0)
                 total += float(told)
             assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
