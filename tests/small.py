@@ -1,5 +1,7 @@
 """Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
+import hashlib
+
 import torch
 from torch import Tensor, nn
 
@@ -7,6 +9,7 @@ from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Gri
 from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
+from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import NonPredictive, Random
 
@@ -215,3 +218,30 @@ def agent(detector: Detector, *, grid=(8, 6), sigma=40.0, reference=160.0) -> Ac
     """An agent with the beliefs of the paper from raw scores; it explores at random."""
     observer, eye = Semantic(len(detector.classes) + 1), Eye(Foveation(sigma), detector, reference=reference)
     return ActivePerception(eye, (observer, NonPredictive()), (observer, Random()), grid=grid).eval()
+
+
+class RedBoxes:
+    """Dark photographs of 200 × 150 px with red boxes: one alone, and two of another class that overlap."""
+
+    classes = ("box", "pair")
+    ids = tuple(range(6))
+    fingerprint = "red boxes"
+
+    def __len__(self):
+        return len(self.ids)
+
+    def annotation(self, index):
+        x = 8.0 * index
+        boxes = torch.tensor([[20.0 + x, 20, 60 + x, 70], [80 + x, 90, 120 + x, 130], [100 + x, 90, 140 + x, 130]])
+        return Annotation(boxes, torch.tensor([1, 2, 2]), torch.zeros(3).bool(), (200, 150))
+
+    def __getitem__(self, index):
+        generator = torch.Generator().manual_seed(index)
+        image = 0.1 * torch.rand(3, 150, 200, generator=generator)
+        told = self.annotation(index)
+        for x1, y1, x2, y2 in told.boxes.int().tolist():
+            image[0, y1:y2, x1:x2] = 1
+        return Scene(index, str(index), image, told.boxes, told.labels)
+
+    def digest(self, index):
+        return hashlib.sha256(bytes([index])).hexdigest()

@@ -35,6 +35,7 @@ def object_record(
     annotation: Annotation,
     passes: int,
     certainty: Certainty | None,
+    ahead: Sequence[tuple[float, float]] = (),
 ) -> ResultRecord:
     """Compare the objects after some numbers of passes with the annotated ones.
 
@@ -46,21 +47,33 @@ def object_record(
         annotation: the annotated objects.
         passes: largest number of passes.
         certainty: gives objects probabilities; None leaves them the detector's scores.
+        ahead: after each look, the number of objects that further looks are expected to find, and the number that the
+            looks after the first were expected to find.
 
     Returns:
-        The record: for each number of passes the scores of the objects, and which of them are right. Objects in areas
-        that are annotated as crowds are left out.
+        The record: for each number of passes the scores of the objects, which of them are right, and the number of
+        objects that are expected in all, or None without `ahead`. Objects in areas that are annotated as crowds are
+        left out.
     """
     after = {}
     for number in sorted({n for n in AFTER if n < passes} | {passes}):
-        objects: Objects = (
-            merge(seen[:number], target)
-            if certainty is None
-            else probable_objects(seen[:number], lattice, target, certainty)[0]
-        )
+        objects: Objects
+        unseen: float | None = None
+        if certainty is None:
+            objects = merge(seen[:number], target)
+        else:
+            remaining, promised = ahead[min(number, len(seen)) - 1] if ahead else (0.0, 0.0)
+            objects, (unseen, _) = probable_objects(
+                seen[:number], lattice, target, certainty, remaining=remaining, promised=promised
+            )
         right = right_boxes(objects, annotation)
         counts = right >= 0
-        after[str(number)] = {"scores": objects.scores[counts].tolist(), "right": right[counts].tolist()}
+        in_all = None if unseen is None else float(objects.scores[counts].sum()) + unseen
+        after[str(number)] = {
+            "scores": objects.scores[counts].tolist(),
+            "right": right[counts].tolist(),
+            "in all": in_all,
+        }
     single = len(annotation.boxes) - int(annotation.crowd.sum())
     return {"measure": "objects", "way": way, "objects": single, "after": after}
 
@@ -127,7 +140,9 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     groups: dict[str, list[ResultRecord]] = {}
     for record in records:
         # The bootstrap reads the numbers many times.
-        after = {n: {name: torch.tensor(each) for name, each in found.items()} for n, found in record["after"].items()}
+        after = {
+            n: {name: torch.tensor(found[name]) for name in ("scores", "right")} for n, found in record["after"].items()
+        }
         groups.setdefault(record["way"], []).append(record | {"after": after})
     first = next(iter(groups.values()))
     numbers = list(first[0]["after"])
@@ -143,6 +158,26 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
         f"after {numbers[-1]} passes, of the objects from {LIKELY} on, precision, recall, their number for each "
         "annotated object, and the mean absolute error of their number in a picture; that of the sum of all scores; "
         "and the expected calibration error of the scores. ± is the standard error by bootstrap over pictures.",
+        "",
+        *table(rows),
+        "",
+        *in_all_table(records, numbers),
+    ]
+
+
+def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> list[str]:
+    """Table of the number of objects that are expected in all after numbers of passes, as Markdown."""
+    rows = [["", *numbers]]
+    expecting = [record for record in records if record["after"][numbers[0]].get("in all") is not None]
+    if not expecting:
+        return []
+    told = torch.tensor([[record["after"][n]["in all"] for n in numbers] for record in expecting], dtype=torch.float64)
+    true = torch.tensor([[record["objects"]] for record in expecting], dtype=torch.float64)
+    rows.append(["expected in all", *(f"{each:.1f}" for each in told.mean(0).tolist())])
+    rows.append(["off by", *(f"{each:.1f}" for each in (told - true).abs().mean(0).tolist())])
+    return [
+        f"The number of objects that ours expects in all after n passes, those that no look has shown included: the "
+        f"mean over pictures, and the mean absolute error. There are {float(true.mean()):.1f} in the mean.",
         "",
         *table(rows),
         "",

@@ -135,9 +135,9 @@ class ZoomRun(WindowLooking, SceneRun):
         for name, turns in self._finding(index, glances) if {"objects", "recall"} & {*measures} else ():
             if "recall" not in measures and name not in _COMPARED:
                 continue
-            seen = [turn.glance for turn in islice(turns, self.config.passes)]
+            seen, ahead = looked(islice(turns, self.config.passes))
             if "objects" in measures:
-                records += self._objects(name, index, seen)
+                records += self._objects(name, index, seen, ahead)
             if "recall" not in measures:
                 if name == _COMPARED[-1]:  # the oracle is dear
                     break
@@ -210,7 +210,9 @@ class ZoomRun(WindowLooking, SceneRun):
         kept = annotation.labels == self.target
         return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
 
-    def _objects(self, name: str, index: int, seen: list[Glance]) -> Iterator[ResultRecord]:
+    def _objects(
+        self, name: str, index: int, seen: list[Glance], ahead: list[tuple[float, float]]
+    ) -> Iterator[ResultRecord]:
         """Compare the objects of ours, with probabilities and with scores, and of slices with the annotated ones."""
         if name not in _COMPARED:
             return
@@ -220,7 +222,7 @@ class ZoomRun(WindowLooking, SceneRun):
             {name: None} if name != "ours" else {"ours": self.evidence.certainty, "ours, scores of the detector": None}
         )
         for way, certainty in ways.items():
-            yield object_record(way, *given, certainty) | {"scene": self.scenes.ids[index]}
+            yield object_record(way, *given, certainty, ahead) | {"scene": self.scenes.ids[index]}
 
     def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
@@ -274,6 +276,26 @@ class ZoomRun(WindowLooking, SceneRun):
                     }
                 )
         return records
+
+
+def looked(turns: Iterator[Turn[Any]]) -> tuple[list[Glance], list[tuple[float, float]]]:
+    """The looks of turns; and after each, with a belief, the objects that looks are expected to find, and were so far.
+
+    Args:
+        turns: the turns.
+
+    Returns:
+        The looks; and pairs of numbers as for `semfov.zoom.objects.probable_objects`, none without a belief.
+    """
+    seen: list[Glance] = []
+    ahead: list[tuple[float, float]] = []
+    promised = 0.0
+    for turn in turns:
+        promised += turn.worth if seen else 0.0
+        seen.append(turn.glance)
+        if turn.belief is not None:
+            ahead.append((turn.belief.remaining(), promised))
+    return seen, ahead
 
 
 def without_cut(glance: Glance) -> Glance:

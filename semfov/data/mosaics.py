@@ -3,9 +3,11 @@
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -45,6 +47,8 @@ class Mosaics:
         count: number of mosaics.
         seed: seed of the compositions.
         fill: value of the pixels outside the photographs.
+        alike: whether the photographs of a mosaic share a class. It is drawn among those that a quarter as many
+            photographs show as there are slots; if there is none, any photographs are taken.
 
     >>> from semfov.data import EmbeddedScenes
     >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)
@@ -62,6 +66,7 @@ class Mosaics:
         count: int = 100,
         seed: int = 0,
         fill: float = 114 / 255,
+        alike: bool = False,
     ) -> None:
         check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
         check(min(tile) >= 1, "tile", "a width and a height in pixels", tile)
@@ -72,7 +77,8 @@ class Mosaics:
         self.ids = list(range(count))
         self.size = columns * tile[0], rows * tile[1]
         self._seed = seed
-        what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill]
+        self._alike = alike
+        what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill, *([alike] if alike else [])]
         self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -81,10 +87,21 @@ class Mosaics:
     def tiles(self, index: int) -> list[Tile]:
         """List the photographs of a mosaic, row by row."""
         generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
-        slots, known = self.columns * self.rows, len(self.scenes)
-        rounds = -(-slots // known)
+        slots, known = self.columns * self.rows, np.arange(len(self.scenes))
+        if self._alike and self._sharing:
+            known = self._sharing[int(generator.integers(len(self._sharing)))]
+        rounds = -(-slots // len(known))
         order = np.concatenate([generator.permutation(known) for _ in range(rounds)])[:slots]
         return [self._tile(int(scene), slot) for slot, scene in enumerate(order)]
+
+    @cached_property
+    def _sharing(self) -> list[NDArray[np.intp]]:
+        """The photographs of each class that enough of them show."""
+        shown = np.zeros((len(self.scenes), len(self.classes) + 1), np.bool_)
+        for index in range(len(self.scenes)):
+            shown[index, self.scenes.annotation(index).labels.numpy()] = True
+        least = -(-self.columns * self.rows // 4)
+        return [column.nonzero()[0] for column in shown.T if column.sum() >= least]
 
     def _tile(self, scene: int, slot: int) -> Tile:
         (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size

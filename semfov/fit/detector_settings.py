@@ -175,6 +175,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             crowded=max(1, kept // 10),
             judged=max(8, min(held_out // 3, 30)),
             judged_far=1,
+            kinds=(),
             searched=max(8, kept // 12),
             sought=3,
             passes=16,

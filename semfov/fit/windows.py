@@ -1,4 +1,4 @@
-"""Fit evidence by magnification on mosaics of photographs."""
+"""Fit evidence by magnification on mosaics of photographs, and on other kinds of large pictures."""
 
 import json
 import logging
@@ -15,13 +15,15 @@ import torch
 from semfov.belief.verification import Verification
 from semfov.data.crowded import Crowded
 from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Scenes
 from semfov.errors import check
 from semfov.fit.outputs import training_of, write_outputs
 from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_choice import choose_foresight, choose_patience, open_all
-from semfov.fit.windows_decision import fit_judge, judge_searches, search_mosaics
+from semfov.fit.windows_decision import Searches, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
+    Windows,
     ZoomExample,
     example_of,
     fit_presence,
@@ -32,6 +34,7 @@ from semfov.fit.windows_evidence import (
     rate_loss,
     windows_of,
 )
+from semfov.fit.windows_kinds import PICTURE_KINDS, PictureKind, compose_pictures
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
@@ -48,7 +51,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.survey import Survey
 
-RefitPart = Literal["decision", "survey", "verification", "certainty"]
+RefitPart = Literal["presence", "decision", "survey", "verification", "certainty"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,10 @@ class FitZoomConfig(FitConfig, WorkConfig):
         judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
             search and thresholds; and of the third of them that hold most objects.
         judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
+        kinds: kinds of pictures to fit on beside these mosaics (`semfov.fit.windows_kinds`): `few`, `many`,
+            `one class`, `photographs` and `objects`.
+        each: number of training pictures of each of these kinds.
+        judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
         tile: width in pixels of the slot of a photograph; its height is three quarters of that.
         searched: number of training mosaics of 4 × 4 photographs for fitting the decisions of searches.
         sought: number of present classes, and of absent classes, to search for in each of these mosaics.
@@ -76,10 +83,11 @@ class FitZoomConfig(FitConfig, WorkConfig):
         lost: maximum share of the targets that may be missed because the search gives up.
         place: least probability that the target is at a place, for a closer look there when no other look follows.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
-            probabilities after closer looks at places that seem to hold the target, `survey`, the number of objects
-            of any class that closer looks find, and `certainty`, the probability that an object is there. The
-            verification has to follow new decisions; without it they are made without closer looks.
+        refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
+            further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
+            closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
+            closer looks find, and `certainty`, the probability that an object is there. The verification has to
+            follow new decisions; without it they are made without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
@@ -97,6 +105,9 @@ class FitZoomConfig(FitConfig, WorkConfig):
     crowded: Count = 240
     judged: Count = 80
     judged_far: Count = 4
+    kinds: tuple[PictureKind, ...] = PICTURE_KINDS
+    each: Count = 20
+    judged_each: Count = 6
     tile: TileSize = 480
     searched: Count = 50
     sought: Count = 4
@@ -113,14 +124,23 @@ class FitZoomConfig(FitConfig, WorkConfig):
     out: Path = Path("runs/fit_zoom")
 
 
-DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
+_OTHER = ("kinds", "each", "judged_each", "tile", "seed")
+"""Settings of the pictures that are no mosaics."""
+
+PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
+"""Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
+
+DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
 """Settings that the thresholds and the probability of presence depend on."""
 
-VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
+VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", *_OTHER)
 """Settings that the verification depends on."""
 
-COUNTING = ("searched", "far", "judged", "passes", "tile", "seed")
+COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
 """Settings that the certainty depends on."""
+
+FURTHER = 1e-3
+"""Highest learning rate of a prediction that is fitted further."""
 
 SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
@@ -161,6 +181,24 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
     }
 
 
+def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
+    """Compose the pictures of other kinds.
+
+    Args:
+        config: the settings.
+        classes: names of the detector's classes.
+
+    Returns:
+        By kind, pictures to fit on; and as `judged` with the kind, pictures of held-out photographs.
+    """
+    kept, held = split_photographs(config.data, classes, config.holdout)
+    pictures: dict[str, Scenes] = {}
+    for kind in PICTURE_KINDS:
+        pictures[kind] = compose_pictures(kind, kept, config.each, config.seed, config.tile)
+        pictures[f"judged {kind}"] = compose_pictures(kind, held, config.judged_each, config.seed + 20, config.tile)
+    return pictures
+
+
 def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
     """Open the store of looks at mosaics."""
     return GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
@@ -173,43 +211,53 @@ def prepare_fit_process(config: FitZoomConfig) -> None:
     """Build the eye, the mosaics and the store once in this process."""
     prepare_worker()
     eye = make_window_eye(config)
-    _process.update(eye=eye, mosaics=make_mosaics(config, eye.detector.classes), store=make_store(config, eye))
+    classes = eye.detector.classes
+    pictures = {**make_mosaics(config, classes), **make_kinds(config, classes)}
+    _process.update(eye=eye, pictures=pictures, store=make_store(config, eye))
 
 
 def look(task: tuple[str, int]) -> bytes:
-    """Look at all windows of a mosaic that are not in the store yet; returns all looks at it."""
+    """Look at all windows of a picture that are not in the store yet; returns all looks at it."""
     kind, index = task
-    mosaics = _process["mosaics"][kind]
-    glances = StoredGlances(_process["eye"], mosaics, index, _process["store"])
-    glances.see(windows_of(mosaics, index, glances.lattice))
+    pictures = _process["pictures"][kind]
+    glances = StoredGlances(_process["eye"], pictures, index, _process["store"])
+    glances.see(windows_of(pictures, index, glances.lattice))
     glances.save()
-    return pack_tensors(_process["store"].read(mosaics.digest(index)))
+    return pack_tensors(_process["store"].read(pictures.digest(index)))
 
 
-def read_examples(mosaics: Mosaics, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
-    """Read the results of the looks at all mosaics."""
+def read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
+    """Read the results of the looks at all pictures in which looks can be closer than an overview."""
+    opened = {n: StoredGlances(eye, pictures, n, store) for n in range(len(pictures))}
     least = eye.detector.least
-    return [example_of(mosaics, n, StoredGlances(eye, mosaics, n, store), least) for n in range(len(mosaics))]
+    return [example_of(pictures, n, looks, least) for n, looks in opened.items() if looks.lattice.levels > 1]
 
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
     eye = make_window_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
+    pictures = {**mosaics, **make_kinds(config, eye.detector.classes)}
     store = make_store(config, eye)
     parts: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
     refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
-    examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
+    looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
+    looked += ["crowded", "judged crowded"] * ("survey" in refit)
+    looked += [*config.kinds] * ("presence" in refit)
+    looked += [f"judged {kind}" for kind in PICTURE_KINDS] * ("presence" in refit and config.evidence is not None)
+    examples = look_at_all(config, eye, pictures, store, looked)
     if config.evidence is None:
-        model = fit_looks(config, eye, mosaics, examples)
+        model = fit_looks(config, eye, mosaics["near"], examples)
         text, figures = judge_windows(model, examples["judged"])
         tried = choose_patience(model, eye, mosaics["judged"], store)
         parts += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
+        if "presence" in refit:
+            parts += fit_further(config, model, examples)
     if "survey" in refit:
         measured = survey_again(config, model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
@@ -217,15 +265,15 @@ def fit_zoom(config: FitZoomConfig) -> None:
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
         parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
-        parts += fit_decision(config, model, eye, mosaics, store)
+        parts += fit_decision(config, model, eye, pictures, store)
         # A verification belongs to the probability that it was fitted with.
         model.verification = None
         model.metadata.pop("verification", None)
     if "verification" in refit:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        parts += fit_closer_looks(config, model, eye, mosaics, store)
+        parts += fit_closer_looks(config, model, eye, pictures, store)
     if "certainty" in refit:
-        parts += fit_counts(config, model, eye, mosaics, store)
+        parts += fit_counts(config, model, eye, pictures, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
@@ -234,12 +282,12 @@ def fit_zoom(config: FitZoomConfig) -> None:
 def look_at_all(
     config: FitZoomConfig,
     eye: WindowEye,
-    mosaics: dict[str, Mosaics],
+    pictures: Mapping[str, Scenes],
     store: GlanceStore,
-    kinds: Sequence[str] = ("near", "far", "crowded", "judged", "judged crowded"),
+    kinds: Sequence[str],
 ) -> dict[str, list[ZoomExample]]:
-    """Look at all mosaics of some kinds; returns the looks by kind of mosaic."""
-    looked = {kind: mosaics[kind] for kind in kinds}
+    """Look at all pictures of some kinds; returns the looks by kind."""
+    looked = {kind: pictures[kind] for kind in kinds}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     done = run_tasks(
         look,
@@ -248,11 +296,11 @@ def look_at_all(
         setup=prepare_fit_process,
         settings=(config,),
         title="looking",
-        unit="mosaic",
+        unit="picture",
     )
     with closing(done):
         for (kind, index), looks in done:
-            digest = mosaics[kind].digest(index)
+            digest = pictures[kind].digest(index)
             if store.read(digest) is None:
                 store.write(digest, unpack_tensors(looks))
     prepare_worker()
@@ -260,27 +308,68 @@ def look_at_all(
 
 
 def fit_looks(
-    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
+    config: FitZoomConfig, eye: WindowEye, near: Scenes, examples: Mapping[str, list[ZoomExample]]
 ) -> GlimpseEvidence:
     """Fit the prediction of closer looks, class by class."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
-    metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
+    metadata = {**eye.settings(), **training_of(config, near, "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
-    known = examples["near"] + examples["far"]
+    known = known_looks(config, examples)
     fit_presence(model, pair_windows(known), config.steps)
     fit_rates(model, known, config.steps)
     return model.eval().requires_grad_(False)
 
 
+def known_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
+    """The looks to learn from what closer looks show."""
+    return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
+
+
+def fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+    """Fit the prediction whether a closer look shows a class further from where it is, more slowly.
+
+    Args:
+        config: the settings.
+        model: the model; the prediction is replaced.
+        examples: the looks to learn from, and `judged` looks by kind.
+
+    Returns:
+        Lines of the report in Markdown: the cross-entropy before and after, by kind.
+    """
+    torch.manual_seed(config.seed)
+    judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
+    before = {kind: cross_entropies(model, windows) for kind, windows in judged.items()}
+    fit_presence(model.requires_grad_(True), pair_windows(known_looks(config, examples)), config.steps, rate=FURTHER)
+    model.requires_grad_(False)
+    model.metadata["presence"] = {name: getattr(config, name) for name in PREDICTING}
+    rows = [["", "overview, before", "after", "closer looks, before", "after"]]
+    for kind, windows in judged.items():
+        pairs = zip(before[kind], cross_entropies(model, windows), strict=True)
+        rows.append([kind, *(f"{each:.4f}" for pair in pairs for each in pair)])
+    return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
+
+
+@torch.no_grad()
+def cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
+    """The cross-entropy of whether a closer look shows a class, by overviews and by closer looks (NaN without any)."""
+    rows = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    first, later = (float(presence_loss(model, windows, some)) if len(some) else float("nan") for some in rows)
+    return first, later
+
+
 def survey_again(
-    config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
+    config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]
 ) -> dict[str, float]:
     """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
     survey = Survey(model.classes, foresight=model.survey.foresight)
-    kinds = {kind: [SurveyExample.of(example) for example in some] for kind, some in examples.items()}
+    kinds = {
+        kind: [SurveyExample.of(example) for example in examples[kind]]
+        for kind in ("near", "far", "crowded", "judged", "judged crowded")
+        if kind in examples
+    }
     fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
     model.survey = survey.eval().requires_grad_(False)
     model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
@@ -288,8 +377,13 @@ def survey_again(
     return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
 
 
+def searched_kinds(config: FitZoomConfig) -> dict[str, tuple[str, ...]]:
+    """Kinds of pictures to fit decisions on, and to choose thresholds on."""
+    return {"searched": ("searched", *config.kinds), "judged": ("judged", *(f"judged {kind}" for kind in config.kinds))}
+
+
 def fit_decision(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, pictures: Mapping[str, Scenes], store: GlanceStore
 ) -> list[str]:
     """Fit the decisions of searches: the probability of presence, and the thresholds.
 
@@ -297,7 +391,7 @@ def fit_decision(
         config: the settings.
         model: the model to complete.
         eye: the eye that looks.
-        mosaics: the mosaics (`make_mosaics`).
+        pictures: the pictures (`make_mosaics`, `make_kinds`).
         store: store of the looks.
 
     Returns:
@@ -306,16 +400,21 @@ def fit_decision(
     prepare_worker()
     torch.manual_seed(config.seed)
     searches = {
-        kind: search_mosaics(
-            model,
-            mosaics[kind],
-            open_all(eye, mosaics[kind], store),
-            classes=config.sought,
-            passes=config.passes,
-            seed=config.seed,
-            title=title,
+        use: Searches.join(
+            [
+                picture_searches(
+                    model,
+                    pictures[kind],
+                    open_all(eye, pictures[kind], store),
+                    classes=config.sought,
+                    passes=config.passes,
+                    seed=config.seed,
+                    title=f"searching, {kind}",
+                )
+                for kind in kinds
+            ]
         )
-        for kind, title in (("searched", "searching"), ("judged", "searching held-out mosaics"))
+        for use, kinds in searched_kinds(config).items()
     }
     fit_judge(model, searches["searched"], config.judging)
     rows = judge_searches(model, searches["judged"], config)
@@ -324,7 +423,7 @@ def fit_decision(
     fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
     return [
         f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them for "
-        f"absent classes, and evaluated on {held_out} searches in mosaics of held-out photographs.",
+        f"absent classes, and evaluated on {held_out} searches in pictures of held-out photographs.",
         "",
         *rows,
         "",
@@ -338,29 +437,36 @@ def fit_closer_looks(
     config: FitZoomConfig,
     model: GlimpseEvidence,
     eye: WindowEye,
-    mosaics: dict[str, Mosaics],
+    pictures: Mapping[str, Scenes],
     store: GlanceStore,
     prior: Verification | None = None,
 ) -> list[str]:
     """Fit the probabilities after closer looks, with the result of `fit_decision` and its arguments, and a prior."""
     prepare_worker()
-    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
-    text = fit_closer(model, mosaics, opened, config, prior)
+    searched = {
+        use: [(pictures[kind], open_all(eye, pictures[kind], store)) for kind in kinds]
+        for use, kinds in searched_kinds(config).items()
+    }
+    text = fit_closer(model, searched, config, prior)
     if model.verification is not None:
         model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
     return ["Closer looks:", "", text]
 
 
 def fit_counts(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
+    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, pictures: Mapping[str, Scenes], store: GlanceStore
 ) -> list[str]:
     """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
     prepare_worker()
-    opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "far", "small", "judged")}
+    fitted, judged = searched_kinds(config).values()
     # These mosaics have three and nine times as many photographs.
-    opened["far"] = opened["far"][: max(1, config.searched // 5)]
-    opened["small"] = opened["small"][: max(1, config.searched // 10)]
-    lines = certainty_again(model, mosaics, opened, passes=config.passes)
+    some = {"far": max(1, config.searched // 5), "small": max(1, config.searched // 10)}
+    names = dict.fromkeys((*fitted, *some)), dict.fromkeys(judged)
+    known, held_out = (
+        {kind: (pictures[kind], open_all(eye, pictures[kind], store)[: some.get(kind)]) for kind in kinds}
+        for kinds in names
+    )
+    lines = certainty_again(model, known, held_out, passes=config.passes)
     model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     return lines
 

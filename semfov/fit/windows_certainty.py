@@ -1,4 +1,4 @@
-"""Fit the probability that an object of a large picture is there, on explorations of mosaics."""
+"""Fit the probability that an object of a large picture is there, on explorations of pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import islice, product
 import torch
 from torch import Tensor
 
-from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Scenes
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.progress import track
 from semfov.runs.window_looking import right_boxes
@@ -59,22 +59,22 @@ class MosaicExploration:
 
 @torch.inference_mode()
 def mosaic_explorations(
-    model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], *, passes: int, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], *, passes: int, title: str
 ) -> Iterator[MosaicExploration]:
-    """Explore mosaics, for objects of all classes and for those of the most frequent class of each.
+    """Explore pictures, for objects of all classes and for those of the most frequent class of each.
 
     Args:
         model: the evidence that guides the explorations.
-        mosaics: the mosaics.
-        opened: the stored looks at each mosaic.
+        pictures: the pictures.
+        opened: the stored looks at each.
         passes: number of passes of the detector in each.
         title: label of the progress bar.
 
     Yields:
         Each exploration.
     """
-    for index, looks in enumerate(track(opened, title, "mosaic")):
-        annotation = mosaics.annotation(index)
+    for index, looks in enumerate(track(opened, title, "picture")):
+        annotation = pictures.annotation(index)
         for target in (None, int(annotation.labels.bincount().argmax())):
             glances: list[Glance] = []
             remaining, promised = [], [0.0]
@@ -172,36 +172,34 @@ def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> C
 
 def certainty_again(
     model: GlimpseEvidence,
-    mosaics: Mapping[str, Mosaics],
-    opened: Mapping[str, Sequence[StoredGlances]],
+    fitted: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]],
+    judged: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]],
     *,
     passes: int,
 ) -> list[str]:
-    """Fit the certainty of a model on the mosaics `searched`, `far` and `small`, and evaluate it on those `judged`.
+    """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
 
-    Pictures differ in how far the evidence can be believed, so mosaics of several kinds are needed.
+    Pictures differ in how far the evidence can be believed, so several kinds are needed.
 
     Args:
         model: the model; its certainty is replaced.
-        mosaics: the mosaics by kind.
-        opened: the stored looks by kind; of a kind, the first mosaics.
-        passes: number of passes of the detector in each mosaic.
+        fitted: pictures of each kind to fit on, and the stored looks at the first of them.
+        judged: likewise pictures of held-out photographs.
+        passes: number of passes of the detector in each picture.
 
     Returns:
         Lines of the report in Markdown.
     """
-    *kinds, held_out = (
-        list(mosaic_explorations(model, mosaics[kind], opened[kind], passes=passes, title=title))
-        for kind, title in (
-            ("searched", "exploring"),
-            ("far", "exploring far mosaics"),
-            ("small", "exploring small photographs"),
-            ("judged", "exploring held-out mosaics"),
-        )
+    known, held_out = (
+        [
+            each
+            for kind, (pictures, opened) in some.items()
+            for each in mosaic_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")
+        ]
+        for some in (fitted, judged)
     )
-    known = [each for kind in kinds for each in kind]
-    fitted = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
-    model.certainty = fit_unseen(fitted, known)
+    regression = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
+    model.certainty = fit_unseen(regression, known)
     facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
     chances = model.certainty.probability(facts)
     sure, error = chances >= 0.5, BinarySums.of(chances, right).ece
@@ -211,7 +209,7 @@ def certainty_again(
         f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
         f"strength {model.certainty.strength:g}.",
         "",
-        f"Of {len(right)} objects in mosaics of held-out photographs {int(right.sum())} are right and "
+        f"Of {len(right)} objects in pictures of held-out photographs {int(right.sum())} are right and "
         f"{float(chances.sum()):.0f} are expected; the expected calibration error is {error:.3f}. Of the "
         f"{int(sure.sum())} from probability 0.5 on, {int(right[sure].sum())} are right and "
         f"{float(chances[sure].sum()):.0f} expected.",

@@ -6,7 +6,7 @@ from itertools import chain, islice
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation
+from semfov.data.scene import Annotation, Scenes
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
@@ -83,9 +83,9 @@ def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store
     return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
 
 
-def open_all(eye: WindowEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
-    """Open the stored looks of each mosaic."""
-    return [StoredGlances(eye, mosaics, index, store) for index in range(len(mosaics))]
+def open_all(eye: WindowEye, pictures: Scenes, store: GlanceStore) -> list[StoredGlances]:
+    """Open the stored looks of each picture."""
+    return [StoredGlances(eye, pictures, index, store) for index in range(len(pictures))]
 
 
 def mean_recall(

@@ -1,4 +1,4 @@
-"""Fit the decisions of searches in large pictures, whether the target is found or absent, on searches of mosaics."""
+"""Fit the decisions of searches in large pictures: whether the target is found or absent."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation
+from semfov.data.scene import Annotation, Scenes
 from semfov.fit.descent import descend
 from semfov.fit.evidence import Bounds, choose_thresholds
 from semfov.metrics.calibration import BinarySums
@@ -57,7 +56,7 @@ class Searches:
 @torch.inference_mode()
 def searches_of(
     model: GlimpseEvidence,
-    mosaics: Mosaics,
+    pictures: Scenes,
     opened: Sequence[StoredGlances],
     *,
     classes: int,
@@ -65,24 +64,24 @@ def searches_of(
     seed: int,
     title: str,
 ) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn[ZoomBelief], SearchFacts]]]]:
-    """Search every mosaic for some present classes and for as many absent ones, without decisions.
+    """Search every picture for some present classes and for as many absent ones, without decisions.
 
     Args:
         model: the evidence that guides the search.
-        mosaics: the mosaics.
-        opened: the stored looks at each mosaic.
-        classes: maximum number of present classes to search for in a mosaic.
+        pictures: the pictures.
+        opened: the stored looks at each.
+        classes: maximum number of present classes to search for in a picture.
         passes: maximum number of passes of the detector in a search.
         seed: seed of the choice of classes.
         title: label of the progress bar.
 
     Yields:
-        For each search the number and the objects of the mosaic, the class, and the turns with the facts after each.
+        For each search the number and the objects of the picture, the class, and the turns with the facts after each.
         Looks that are made before the next search are stored.
     """
-    for index, looks in enumerate(track(opened, title, "mosaic")):
-        annotation = mosaics.annotation(index)
-        for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
+    for index, looks in enumerate(track(opened, title, "picture")):
+        annotation = pictures.annotation(index)
+        for target in choose_classes(pictures, index, annotation, classes, 1.0, seed):
             turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)
             yield index, annotation, target, _with_facts(turns)
         looks.save()
@@ -98,9 +97,9 @@ def _with_facts(turns: Iterable[Turn[ZoomBelief]]) -> Iterator[tuple[Turn[ZoomBe
 
 
 @torch.inference_mode()
-def search_mosaics(
+def picture_searches(
     model: GlimpseEvidence,
-    mosaics: Mosaics,
+    pictures: Scenes,
     opened: Sequence[StoredGlances],
     *,
     classes: int,
@@ -114,7 +113,7 @@ def search_mosaics(
         The searches.
     """
     rows: list[list[Tensor]] = []
-    searches = searches_of(model, mosaics, opened, classes=classes, passes=passes, seed=seed, title=title)
+    searches = searches_of(model, pictures, opened, classes=classes, passes=passes, seed=seed, title=title)
     for _, annotation, target, turns in searches:
         steps = [(facts.best, facts.case(turn.ahead), facts.detected, turn.ahead) for turn, facts in turns]
         steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation
+from semfov.data.scene import Annotation, Scenes
 from semfov.detection.objects import LEAST
 from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
@@ -100,18 +100,19 @@ def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: 
     return hits.any(0) if len(boxes) else torch.zeros(len(annotation.boxes), dtype=torch.bool)
 
 
-def windows_of(mosaics: Mosaics, index: int, lattice: Lattice) -> list[Window]:
-    """List the windows of a mosaic at steps of half a window, and one window for each photograph."""
-    slots: Any = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(index)]
+def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
+    """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
+    tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
+    slots: Any = [tuple(map(float, tile.slot)) for tile in tiles]
     return [*half_steps(lattice), *(around(lattice, slot) for slot in slots)]
 
 
-def example_of(mosaics: Mosaics, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:
-    """Look at all windows of a mosaic and collect the results; a look shows a class with a score of `least`."""
-    annotation = mosaics.annotation(index)
+def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:
+    """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`."""
+    annotation = pictures.annotation(index)
     looks = [
         WindowResult(glance.window, glance.gist, glance.show, found_by(glance, annotation))
-        for glance in glances.see(windows_of(mosaics, index, glances.lattice))
+        for glance in glances.see(windows_of(pictures, index, glances.lattice))
     ]
     return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
 
@@ -170,7 +171,7 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
     return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
 
 
-def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024) -> None:
+def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
     """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes.
 
     Args:
@@ -178,10 +179,11 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
         windows: the training windows.
         steps: number of steps.
         batch: rows of the overview in a step; there are half as many rows of later looks.
+        rate: highest learning rate.
     """
     own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
-    optimizer = torch.optim.AdamW(own, lr=8e-3, weight_decay=1.0)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 8e-3, total_steps=steps)
+    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=1.0)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
     for _ in track(range(steps), "learning what closer looks show", "step"):
         model.train()

@@ -1,4 +1,4 @@
-"""Fit the verification of targets in large pictures by closer looks, on searches of mosaics."""
+"""Fit the verification of targets in large pictures by closer looks, on searches of pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Scenes
 from semfov.decision import SAME, settle
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
@@ -137,14 +137,14 @@ class MosaicSearch(TargetSearch[WindowLook]):
 
 @torch.inference_mode()
 def mosaic_searches(
-    model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], config: Limits, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: Limits, title: str
 ) -> Iterator[MosaicSearch]:
-    """Search every mosaic, without closer looks (`semfov.fit.windows_decision.searches_of`).
+    """Search every picture, without closer looks (`semfov.fit.windows_decision.searches_of`).
 
     Args:
         model: the evidence that guides the search, with thresholds.
-        mosaics: the mosaics.
-        opened: the stored looks at each mosaic.
+        pictures: the pictures.
+        opened: the stored looks at each.
         config: the settings.
         title: label of the progress bar.
 
@@ -153,7 +153,7 @@ def mosaic_searches(
     """
     assert model.thresholds is not None
     searches = searches_of(
-        model, mosaics, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
+        model, pictures, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
     )
     for index, annotation, target, turns in searches:
         glances: list[Glance] = []
@@ -178,17 +178,16 @@ def shipped_verification() -> Verification:
 
 def fit_closer(
     model: GlimpseEvidence,
-    mosaics: Mapping[str, Mosaics],
-    opened: Mapping[str, Sequence[StoredGlances]],
+    pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
     config: Limits,
     prior: Verification | None = None,
 ) -> str:
-    """Fit the verification on some mosaics, choose its threshold on held-out ones, and add it to the model.
+    """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model.
 
     Args:
         model: the evidence, with thresholds.
-        mosaics: the mosaics `searched`, to fit to, and `judged`, of held-out photographs.
-        opened: the stored looks at each of them.
+        pictures: the pictures `searched`, to fit to, and `judged`, of held-out photographs: each kind with the stored
+            looks at each.
         config: the settings.
         prior: verification that the fitted one keeps close to, the more so the fewer the closer looks; None: none.
 
@@ -196,11 +195,15 @@ def fit_closer(
         The report in Markdown, which says so if there are too few places to fit to.
     """
     searches = {
-        kind: list(mosaic_searches(model, mosaics[kind], opened[kind], config, title))
-        for kind, title in (("searched", "looking closely"), ("judged", "looking closely at held-out mosaics"))
+        use: [
+            search
+            for scenes, opened in pictures[use]
+            for search in mosaic_searches(model, scenes, opened, config, title)
+        ]
+        for use, title in (("searched", "looking closely"), ("judged", "looking closely at held-out pictures"))
     }
-    known, held_out = (examine(searches[kind]) for kind in ("searched", "judged"))
-    looks_of = [*opened["searched"], *opened["judged"]]
+    known, held_out = (examine(searches[use]) for use in ("searched", "judged"))
+    looks_of = [looks for kinds in pictures.values() for _, opened in kinds for looks in opened]
     for looks in looks_of:
         looks.save()
     model.verification = None
@@ -215,6 +218,6 @@ def fit_closer(
     model.verification = fitted
     for looks in looks_of:
         looks.save()
-    how = f"The model was fitted to {len(known.fold)} closer looks at mosaics of other photographs."
-    pictures = f"{len(opened['judged'])} mosaics of held-out photographs"
-    return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), pictures, how)[0]
+    how = f"The model was fitted to {len(known.fold)} closer looks at pictures of other photographs."
+    judged = f"{sum(len(opened) for _, opened in pictures['judged'])} pictures of held-out photographs"
+    return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), judged, how)[0]

@@ -5,6 +5,7 @@ import torch
 
 from semfov.data import EmbeddedScenes
 from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
 
 SCENES = EmbeddedScenes(("person", "cat", "cup"), count=5, seed=3)
 
@@ -55,3 +56,32 @@ def test_boxes_are_scaled_with_their_photographs():
     count = len(SCENES.annotation(tile.index).boxes)
     corner = torch.tensor([*tile.box[:2], *tile.box[:2]])
     torch.testing.assert_close(annotation.boxes[:count], SCENES.annotation(tile.index).boxes / 2 + corner)
+
+
+class OneEach:
+    """Photographs of 40 × 30 px, each of which shows one of three classes; one shows a fourth."""
+
+    classes = ("a", "b", "c", "d")
+    ids = tuple(range(13))
+    fingerprint = "one each"
+
+    def __len__(self):
+        return len(self.ids)
+
+    def annotation(self, index):
+        label = torch.tensor([index % 3 + 1 if index < 12 else 4])
+        return Annotation(torch.tensor([[5.0, 5, 20, 20]]), label, torch.tensor([False]), (40, 30))
+
+
+def test_photographs_of_a_mosaic_can_share_a_class():
+    shown = []
+    for index in range(12):
+        mosaics = Mosaics(OneEach(), 3, 2, tile=(40, 30), count=12, alike=True)
+        labels = mosaics.annotation(index).labels
+        assert len(labels) == 6
+        assert len(set(labels.tolist())) == 1
+        shown.append(int(labels[0]))
+    # A single photograph of the fourth class is fewer than a quarter of the slots.
+    assert set(shown) == {1, 2, 3}
+    assert Mosaics(OneEach(), 3, 2, alike=True).fingerprint != Mosaics(OneEach(), 3, 2).fingerprint
+    assert len(set(Mosaics(OneEach(), 3, 2, tile=(40, 30)).annotation(0).labels.tolist())) > 1

@@ -38,6 +38,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=1, far=1, crowded=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48,
+        kinds=("few", "objects"), each=1, judged_each=1,
         steps=3, survey_steps=3, out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
@@ -56,11 +57,13 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     # Only one part is fitted again.
-    fit_zoom(replace(config, evidence=path, refit=("survey",), survey_steps=2, out=tmp_path / "again"))
-    other = GlimpseEvidence.from_pretrained(tmp_path / "again" / "bright.safetensors")
-    changed = {name for name, tensor in other.state_dict().items() if not torch.equal(before[name], tensor)}
-    assert changed
-    assert all(name.startswith("survey.") for name in changed)
+    for part, names in (("survey", ("survey.",)), ("presence", ("slope", "offset", "company.", "shape."))):
+        fit_zoom(replace(config, evidence=path, refit=(part,), survey_steps=2, out=tmp_path / "again"))
+        other = GlimpseEvidence.from_pretrained(tmp_path / "again" / "bright.safetensors")
+        changed = {name for name, tensor in other.state_dict().items() if not torch.equal(before[name], tensor)}
+        assert changed
+        assert all(name.startswith(names) for name in changed)
+        assert other.metadata[part]["seed"] == config.seed
     # Looks come from the store, and a fit with the same seed gives the same model.
     monkeypatch.setattr(Tiles, "propose", None)
     fit_zoom(config)
@@ -180,7 +183,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
     kinds = "searched", "judged"
-    text = fit_closer(model, dict.fromkeys(kinds, scenes), dict.fromkeys(kinds, opened), config)
+    text = fit_closer(model, {kind: [(scenes, opened)] for kind in kinds}, config)
     fitted = model.verification.thresholds
     assert (fitted.place, fitted.give_up) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
@@ -202,6 +205,6 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
 def test_without_right_and_wrong_places_there_is_no_verification():
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
     kinds = "searched", "judged"
-    text = fit_closer(model, dict.fromkeys(kinds, Squares()), dict.fromkeys(kinds, ()), FitZoomConfig(passes=8))
+    text = fit_closer(model, {kind: [(Squares(), ())] for kind in kinds}, FitZoomConfig(passes=8))
     assert text.startswith("None, since there are no places")
     assert model.verification is None

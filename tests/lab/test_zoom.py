@@ -8,7 +8,7 @@ import torch
 
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
-from eval.zoom.objects import average_precision, object_figures
+from eval.zoom.objects import average_precision, in_all_table, object_figures
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
@@ -70,6 +70,8 @@ def test_tables_match_records(config, capsys):
             assert 0 <= record["probability"] <= 1
         elif record["measure"] == "objects":
             assert all(len(found["scores"]) == len(found["right"]) for found in record["after"].values())
+            # The evidence of this run has no certainty.
+            assert all(found["in all"] is None for found in record["after"].values())
         else:
             assert 1 <= record["passes"] <= 5
 
@@ -100,6 +102,18 @@ def test_measures_can_be_left_out(config, capsys):
         "decision",
         "objects",
     }
+
+
+def test_the_number_in_all_is_compared_with_the_annotated_one():
+    """5 and 3 are expected where there are 4 each after a pass, 4 and 2 after more."""
+    numbers = [(5.0, 4.0), (3.0, 2.0)]
+    ours = [{"objects": 4, "after": {"1": {"in all": first}, "4": {"in all": last}}} for first, last in numbers]
+    others = [{"objects": 4, "after": {"1": {"in all": None}, "4": {"in all": None}}}]
+    text = in_all_table([*others, *ours], ["1", "4"])
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text if line.startswith("|")]
+    assert rows[-2:] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
+    assert "There are 4.0 in the mean." in text[0]
+    assert in_all_table(others, ["1", "4"]) == []
 
 
 def test_figures_of_objects_match_hand_calculations():

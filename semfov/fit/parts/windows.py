@@ -162,7 +162,7 @@ def fit_mosaics(
         The model and a report in Markdown.
     """
     examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
-    model = fit_looks(config, eye, mosaics, examples)
+    model = fit_looks(config, eye, mosaics["near"], examples)
     survey_again(config, model, examples)
     lines = [judge_windows(model, examples["judged"])[0]]
     lines += fit_decision(config, model, eye, mosaics, store)

@@ -1,0 +1,228 @@
+"""Large pictures of one scene, composed by a seed: parts of photographs scattered over one ground."""
+
+import hashlib
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.errors import check
+
+_VERSION = 1  # raise it whenever the same seed would give another picture
+_MARGIN = 0.15
+"""Share of the sides of an object by which it is cut out wider; the margin fades into the ground."""
+_SMALLEST = 24
+"""Longer side in pixels from which on an object of a photograph is cut out."""
+_SHARED = 0.15
+"""Largest share of a cutout that the boxes of other objects may cover."""
+_TRIES = 50
+_PATCHES = 4
+"""Number of textures of a ground."""
+_PLAIN = 0.2
+"""Share of the pictures with a plain ground."""
+
+_Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """A part of a photograph and its place in a picture.
+
+    Attributes:
+        index: index of the photograph in its set of scenes.
+        part: `(x1, y1, x2, y2)` in pixels of the photograph.
+        place: `(x1, y1, x2, y2)` in pixels of the picture.
+    """
+
+    index: int
+    part: _Box
+    place: _Box
+
+
+class Scattered:
+    """Pictures with few objects on a ground: single objects of one to three classes, or whole photographs.
+
+    The ground is made of patches of photographs without objects, each mirrored again and again, which pass into one
+    another; one of five grounds is plain. Objects stand alone in their photographs, and are about equally large in a
+    picture: between `sides` on the longer side. They stand in groups. Picture `i` depends only on the seed, on `i` and
+    on the photographs.
+
+    Args:
+        scenes: the photographs with their boxes.
+        whole: scatter whole photographs; false: single objects.
+        size: `(width, height)` of the pictures in pixels.
+        sides: smallest and largest longer side of an object, or of a photograph, in pixels.
+        most: largest number of objects or photographs of a picture.
+        count: number of pictures.
+        seed: seed of the compositions.
+
+    >>> from semfov.data import EmbeddedScenes
+    >>> pictures = Scattered(EmbeddedScenes(("person", "cat"), count=3), whole=True, size=(640, 480), sides=(90, 120))
+    >>> pictures[0].size, len(pictures[0].boxes) > 0
+    ((640, 480), True)
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        *,
+        whole: bool = False,
+        size: tuple[int, int] = (3840, 2160),
+        sides: tuple[int, int] = (32, 160),
+        most: int = 40,
+        count: int = 100,
+        seed: int = 0,
+    ) -> None:
+        check(min(size) >= 16, "size", "a width and a height of at least 16 pixels", size)
+        check(1 <= sides[0] <= sides[1], "sides", "two ascending numbers of pixels", sides)
+        check(most >= 1 and count >= 1, "most, count", "at least 1", (most, count))
+        check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
+        self.scenes, self.whole, self.size, self.sides, self.most = scenes, whole, size, sides, most
+        self.classes = scenes.classes
+        self.ids = list(range(count))
+        self._seed = seed
+        self._what = [_VERSION, scenes.fingerprint, whole, size, sides, most, seed]
+        self.fingerprint = hashlib.sha256(json.dumps([*self._what, count]).encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @cached_property
+    def alone(self) -> dict[int, list[tuple[int, _Box]]]:
+        """By class, the objects that stand alone: index of the photograph and the part of it to cut out."""
+        found: dict[int, list[tuple[int, _Box]]] = defaultdict(list)
+        for index in range(len(self.scenes)):
+            told = self.scenes.annotation(index)
+            sides = told.boxes[:, 2:] - told.boxes[:, :2]
+            wide = torch.cat([told.boxes[:, :2] - _MARGIN * sides, told.boxes[:, 2:] + _MARGIN * sides], -1)
+            low = torch.maximum(wide[:, None, :2], told.boxes[:, :2])
+            high = torch.minimum(wide[:, None, 2:], told.boxes[:, 2:])
+            shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)
+            alone = (shared.sum(1) <= _SHARED * (wide[:, 2:] - wide[:, :2]).prod(-1)) & ~told.crowd
+            alone &= sides.amax(-1) >= _SMALLEST
+            for n in alone.nonzero()[:, 0].tolist():
+                limits = told.size * 2
+                part = [min(max(round(edge), 0), limit) for edge, limit in zip(wide[n].tolist(), limits, strict=True)]
+                found[int(told.labels[n])].append((index, (part[0], part[1], part[2], part[3])))
+        return dict(found)
+
+    def cutouts(self, index: int) -> list[Cutout]:
+        """List the parts of photographs in a picture."""
+        draw = self._generator(index)
+        low, high = np.log(self.sides)
+        side = np.exp(draw.uniform(low, high))
+        count = round(np.exp(draw.uniform(0, np.log(self.most))))
+        if self.whole or not self.alone:
+            order = draw.permutation(len(self.scenes))[:count].tolist()
+            parts = [(n, (0, 0, *self.scenes.annotation(n).size)) for n in order]
+        else:
+            kinds = sorted(self.alone)
+            weights = np.sqrt([len(self.alone[kind]) for kind in kinds])
+            chosen = draw.choice(kinds, size=draw.integers(1, 4), p=weights / weights.sum())
+            rows = [self.alone[int(draw.choice(chosen))] for _ in range(count)]
+            parts = [row[int(draw.integers(len(row)))] for row in rows]
+        groups = draw.uniform(0, 1, (draw.integers(1, 5), 2)) * self.size
+        spread = draw.uniform(0.03, 0.2) * self.size[0]
+        placed: list[Cutout] = []
+        for number, part in parts:
+            scale = min(1.0, side * draw.uniform(0.7, 1.3) / max(part[2] - part[0], part[3] - part[1]))
+            wide, tall = (max(2, round(scale * (part[n + 2] - part[n]))) for n in (0, 1))
+            for _ in range(_TRIES):
+                x, y = draw.normal(groups[draw.integers(len(groups))], spread)
+                place = round(x), round(y), round(x) + wide, round(y) + tall
+                inside = x >= 0 and y >= 0 and place[2] <= self.size[0] and place[3] <= self.size[1]
+                if inside and not any(_meet(place, other.place) for other in placed):
+                    placed.append(Cutout(number, part, place))
+                    break
+        return placed
+
+    def __getitem__(self, index: int) -> Scene:
+        """Compose a picture."""
+        canvas = self._ground(index)
+        for cutout in self.cutouts(index):
+            x1, y1, x2, y2 = cutout.place
+            left, top, right, bottom = cutout.part
+            image = self.scenes[cutout.index].image[None, :, top:bottom, left:right]
+            image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)[0]
+            fade = 1.0 if self.whole else _fading(y2 - y1)[:, None] * _fading(x2 - x1)
+            canvas[:, y1:y2, x1:x2] += (image - canvas[:, y1:y2, x1:x2]) * fade
+        told = self.annotation(index)
+        return Scene(
+            self.ids[index], f"scattered {self.ids[index]}, seed {self._seed}", canvas, told.boxes, told.labels
+        )
+
+    def annotation(self, index: int) -> Annotation:
+        """Return the objects of a picture, without composing its image."""
+        boxes, labels, crowd = [torch.zeros(0, 4)], [torch.zeros(0, dtype=torch.long)], [torch.zeros(0).bool()]
+        for cutout in self.cutouts(index):
+            told = self.scenes.annotation(cutout.index)
+            low, high = (told.boxes.new_tensor(cutout.part[n : n + 2]) for n in (0, 2))
+            centre = (told.boxes[:, :2] + told.boxes[:, 2:]) / 2
+            kept = ((centre >= low) & (centre <= high)).all(-1)
+            x1, y1, x2, y2 = cutout.place
+            scale = told.boxes.new_tensor([x2 - x1, y2 - y1]) / (high - low)
+            edges = torch.minimum(torch.maximum(told.boxes[kept].view(-1, 2, 2), low), high)
+            boxes.append(((edges - low) * scale + told.boxes.new_tensor([x1, y1])).flatten(1))
+            labels.append(told.labels[kept])
+            crowd.append(told.crowd[kept])
+        return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
+
+    def targets(self, index: int) -> list[int]:
+        """List the classes of a picture that may be searched for, ascending."""
+        return legal_targets(self.annotation(index))
+
+    def digest(self, index: int) -> str:
+        """Compute a sha256 of everything that the pixels of a picture depend on."""
+        return hashlib.sha256(json.dumps([*self._what, self.ids[index]]).encode()).hexdigest()
+
+    def _generator(self, index: int, part: int = 0) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], part]))
+
+    def _ground(self, index: int) -> Tensor:
+        """The ground of a picture, `(3, height, width)`."""
+        draw = self._generator(index, 1)
+        ground = self._texture(draw)
+        for _ in range(_PATCHES - 1):
+            noise = torch.from_numpy(draw.normal(size=(1, 1, *draw.integers(4, 16, 2)))).float()
+            share = (6 * F.interpolate(noise, self.size[::-1], mode="bilinear")[0]).sigmoid()
+            ground = torch.lerp(ground, self._texture(draw), share)
+        if draw.random() < _PLAIN:
+            return ground.mean((-2, -1), keepdim=True).expand_as(ground).clone()
+        return ground
+
+    def _texture(self, draw: np.random.Generator) -> Tensor:
+        """A patch of a photograph without objects, mirrored until it fills a picture."""
+        patch = torch.full((3, 16, 16), float(draw.random()))
+        for _ in range(_TRIES):
+            index = int(draw.integers(len(self.scenes)))
+            told = self.scenes.annotation(index)
+            side = min(*told.size, int(draw.integers(48, 256)))
+            x, y = (int(draw.integers(length - side + 1)) for length in told.size)
+            if not any(_meet((x, y, x + side, y + side), box) for box in told.boxes.tolist()):
+                patch = self.scenes[index].image[:, y : y + side, x : x + side]
+                break
+        across, down = (_mirrored(length, side) for length, side in zip(self.size, patch.shape[:0:-1], strict=True))
+        return patch[:, down][:, :, across]
+
+
+def _mirrored(length: int, side: int) -> Tensor:
+    """Indices `(length,)` that run through a side back and forth."""
+    place = torch.arange(length) % (2 * side)
+    return torch.minimum(place, 2 * side - 1 - place)
+
+
+def _fading(length: int) -> Tensor:
+    """Weights `(length,)` along a side of a cutout that rise from its border to the object in it."""
+    margin = max(1.0, length * _MARGIN / (1 + 2 * _MARGIN))
+    place = torch.arange(length) + 0.5
+    return (torch.minimum(place, length - place) / margin).clamp(max=1)
+
+
+def _meet(box: _Box, other: _Box) -> bool:
+    return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
