@@ -7,6 +7,14 @@ import pytest
 import torch
 from torch import nn
 from transformers import (
+    ConditionalDetrConfig,
+    ConditionalDetrForObjectDetection,
+    ConditionalDetrImageProcessor,
+    DabDetrConfig,
+    DabDetrForObjectDetection,
+    DeformableDetrConfig,
+    DeformableDetrForObjectDetection,
+    DeformableDetrImageProcessor,
     DetrConfig,
     DetrForObjectDetection,
     DetrImageProcessor,
@@ -21,11 +29,28 @@ from transformers import (
     RTDetrResNetConfig,
     RTDetrV2Config,
     RTDetrV2ForObjectDetection,
+    TableTransformerConfig,
+    TableTransformerForObjectDetection,
+    YolosConfig,
+    YolosForObjectDetection,
+    YolosImageProcessor,
 )
 from transformers.models.hgnet_v2 import HGNetV2Config
 
 from semfov import load_detector
+from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD
+from semfov.detection.transformers import SOFTMAX
 from semfov.errors import DataError, InputError
+
+PROCESSORS = {
+    "detr": DetrImageProcessor,
+    "table-transformer": DetrImageProcessor,
+    "yolos": YolosImageProcessor,
+    "conditional_detr": ConditionalDetrImageProcessor,
+    "dab-detr": ConditionalDetrImageProcessor,
+    "deformable_detr": DeformableDetrImageProcessor,
+}
+"""Whose `post_process_object_detection` a kind of model uses, if it is not RT-DETR's."""
 
 NAMES = {0: "N/A", 1: "cat", 2: "dog", 3: "cup"}
 SMALL = {"d_model": 16, "encoder_attention_heads": 2, "decoder_attention_heads": 2, "decoder_ffn_dim": 32}
@@ -70,19 +95,37 @@ def hgnet():
     )
 
 
-def detr():
+def like_detr(config, model, stages=("stage4",), **more):
+    """A model of the family of DETR, with one layer each in its encoder and its decoder."""
     backbone = ResNetConfig(
-        embedding_size=8, hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], layer_type="basic", out_features=["stage4"]
+        embedding_size=8, hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], layer_type="basic", out_features=[*stages]
     )
-    sizes = {"encoder_layers": 1, "decoder_layers": 1, "encoder_ffn_dim": 32, "num_queries": 12}
-    config = DetrConfig(
-        **SMALL, **sizes, use_timm_backbone=False, backbone_config=backbone, backbone=None, id2label=NAMES
+    sizes = {"encoder_layers": 1, "decoder_layers": 1, "encoder_ffn_dim": 32, "num_queries": 12, "id2label": NAMES}
+    settings = {**SMALL, **sizes, **more}
+    return model(config(**settings, use_timm_backbone=False, backbone_config=backbone, backbone=None))
+
+
+def yolos():
+    sizes = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 32}
+    config = YolosConfig(
+        **sizes, image_size=[96, 128], num_detection_tokens=12, use_mid_position_embeddings=False, id2label=NAMES
     )
-    return DetrForObjectDetection(config)
+    return YolosForObjectDetection(config)
 
 
 MODELS = {
-    "detr": detr,
+    "detr": lambda: like_detr(DetrConfig, DetrForObjectDetection),
+    "table-transformer": lambda: like_detr(TableTransformerConfig, TableTransformerForObjectDetection),
+    "yolos": yolos,
+    "conditional_detr": lambda: like_detr(ConditionalDetrConfig, ConditionalDetrForObjectDetection),
+    "dab-detr": lambda: like_detr(DabDetrConfig, DabDetrForObjectDetection, hidden_size=16),
+    "deformable_detr": lambda: like_detr(
+        DeformableDetrConfig,
+        DeformableDetrForObjectDetection,
+        ("stage2", "stage3", "stage4"),
+        d_model=32,
+        decoder_layers=2,
+    ),
     "rt_detr": lambda: RTDetrForObjectDetection(RTDetrConfig(backbone_config=resnet(), **HYBRID)),
     "rt_detr_v2": lambda: RTDetrV2ForObjectDetection(RTDetrV2Config(backbone_config=resnet(), **HYBRID)),
     "d_fine": lambda: DFineForObjectDetection(DFineConfig(backbone_config=hgnet(), **HYBRID)),
@@ -111,13 +154,13 @@ def test_boxes_and_scores_are_those_of_transformers(kind):
     model = small(kind)
     detector = load_detector(model, processor={"size": {"height": 96, "width": 128}}, threshold=0.0, iou=1.0)
     assert (detector.name, detector.classes) == (kind, ("cat", "dog", "cup"))
-    assert detector.background == ("own" if kind == "detr" else "residual")
+    assert detector.background == ("own" if kind in SOFTMAX else "residual")
     canvas, _ = detector.fit(torch.rand(2, 3, 60, 80))
     assert canvas.shape == (2, 3, 96, 128)
     found = detector.propose(canvas)
     with torch.no_grad():
         outputs = model(pixel_values=detector.preprocessing(canvas))
-    processor = DetrImageProcessor() if kind == "detr" else RTDetrImageProcessor()
+    processor = PROCESSORS.get(kind, RTDetrImageProcessor)()
     theirs = processor.post_process_object_detection(outputs, threshold=0.0, target_sizes=[(96, 128)] * 2)
     for image, each in enumerate(theirs):
         compared = 0
@@ -128,7 +171,7 @@ def test_boxes_and_scores_are_those_of_transformers(kind):
                 torch.testing.assert_close(found.classes[image, row, int(label) - 1], score)
                 compared += 1
         assert compared
-    if kind == "detr":
+    if kind in SOFTMAX:
         softmax = outputs.logits.softmax(-1)
         torch.testing.assert_close(found.background, softmax[..., -1])
     detections = detector(torch.rand(1, 3, 60, 80))
@@ -160,17 +203,21 @@ class Outputs(nn.Module):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", MODELS)
+# onnxruntime does not sample at points of float64, as the graph of Deformable DETR does.
+@pytest.mark.parametrize("kind", [kind for kind in MODELS if kind != "deformable_detr"])
 def test_exported_models_give_the_same_candidates(kind, tmp_path):
     model, canvas = small(kind), torch.rand(1, 3, 96, 128)
     names = {"input_names": ["pixel_values"], "output_names": ["logits", "pred_boxes"]}
     with torch.no_grad():
         torch.onnx.export(Outputs(model), (canvas,), tmp_path / "model.onnx", dynamo=False, **names)
+    if kind in PROCESSORS and kind not in SOFTMAX:  # ONNX models with sigmoids are taken for RT-DETR's
+        means = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
+        (tmp_path / "model.json").write_text(json.dumps({"preprocessing": means}))
     exported = load_detector(tmp_path / "model.onnx", classes=[*NAMES.values()])
     detector = load_detector(model, processor={"size": {"height": 96, "width": 128}})
     assert exported.background == detector.background
     found, wanted = exported.propose(canvas), detector.propose(canvas)
-    assert (wanted.classes - detector.propose(canvas.flip(-1)).classes).abs().max() > 0.01
+    assert (wanted.classes - detector.propose(canvas.flip(-1)).classes).abs().max() > 1e-3
     torch.testing.assert_close(found.boxes, wanted.boxes, atol=1e-2, rtol=1e-3)
     torch.testing.assert_close(found.classes, wanted.classes, atol=1e-4, rtol=1e-3)
 
