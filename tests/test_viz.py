@@ -16,7 +16,7 @@ from semfov.gaze.saliency import cell_saliency
 from semfov.metrics.calibration import BinarySums
 from semfov.viz import (
     COLOURS,
-    entropy,
+    cell_entropy,
     plot_belief,
     plot_belief_bars,
     plot_belief_strip,
@@ -274,7 +274,7 @@ def test_semantic_map_names_classes_that_are_more_probable_than_background():
     assert texts["cup"] == (15, 15)
     np.testing.assert_allclose(np.asarray(named.images[-1].get_array()).ravel(), p[:, 1:].amax(-1), rtol=1e-6)
     bits = -(p * p.log2()).sum(-1)
-    np.testing.assert_allclose(entropy(scanpath)[0], bits, rtol=1e-5)
+    np.testing.assert_allclose(cell_entropy(scanpath)[0], bits, rtol=1e-5)
     np.testing.assert_allclose(np.asarray(unsure.images[-1].get_array()).ravel(), bits, rtol=1e-5)
 
 
