@@ -98,8 +98,10 @@ class BaseTester:
         assert torch.equal(host(*inputs), before)
 
     def test_device(self, device: torch.device) -> None:
-        """It runs on the device of its inputs, and gives the values of the CPU there."""
-        result = self.host().to(device)(*(x.to(device) for x in self.inputs()))
+        """It runs on the device of its inputs, gives the values of the CPU there, and stays where it was put."""
+        host = self.host().to(device)
+        result = host(*(x.to(device) for x in self.inputs()))
+        assert {tensor.device.type for tensor in host.parameters()} <= {device.type}
         assert result.device.type == ("cpu" if self.on_cpu else device.type)
         torch.testing.assert_close(result.cpu(), self.host()(*self.inputs()), rtol=1e-3, atol=1e-4)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
+from semfov.agents.placement import on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
@@ -155,7 +156,7 @@ class HeadAgent(nn.Module):
         check_number(foresight, "foresight", 0, 1e6)
         limits = self._limits(passes, seconds, on_look)
         views = self.views(scene, color)
-        evidence = self.target_evidence.cpu()  # where the geometry of the scene is
+        evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
         gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
         sure = CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
@@ -250,7 +251,7 @@ class HeadAgent(nn.Module):
         seed: int,
     ) -> HeadPath:
         check_number(worth, "worth", 0, float("inf"))
-        evidence = self.map_evidence.cpu()
+        evidence = on_cpu(self.map_evidence)
         gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
         return self._look(observer, gain, targets, start, limits, duration, seed, worth=worth)
 

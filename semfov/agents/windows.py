@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
+from semfov.agents.placement import on_cpu
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
@@ -156,12 +157,12 @@ class ZoomAgent(nn.Module):
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
-        glances = self._open(picture)
+        glances, evidence = self._open(picture), self._evidence()
         with torch.inference_mode():
-            if self.evidence is None:
+            if evidence is None:
                 return search_slices(glances, self.classes, index, limits, confirm)
             return search_windows(
-                glances, self.evidence, self.classes, index, limits, confirm=confirm, give_up=give_up, closer=closer
+                glances, evidence, self.classes, index, limits, confirm=confirm, give_up=give_up, closer=closer
             )
 
     def find_all(
@@ -206,13 +207,14 @@ class ZoomAgent(nn.Module):
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:
             check_number(least, "least", 0, 1)
-        glances, one = self._open(picture), targets[0] if len(targets) == 1 else None
+        glances, evidence = self._open(picture), self._evidence()
+        one = targets[0] if len(targets) == 1 else None
         turns: Iterator[WindowStep[Any]]
-        if self.evidence is None:
+        if evidence is None:
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
-            turns = find_everything(glances, self.evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), self.evidence, least)
+            turns = find_everything(glances, evidence, one, batch=batch, worth=worth)
+        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), evidence, least)
         ending: Ending | None = None
         with torch.inference_mode():
             for turn in turns:
@@ -220,7 +222,7 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.seen), path.record)
                 if ending is not None:
                     break
-        return path.record(ending or ("windows" if self.evidence is None else "worth"))
+        return path.record(ending or ("windows" if evidence is None else "worth"))
 
     def explore(
         self,
@@ -255,9 +257,11 @@ class ZoomAgent(nn.Module):
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         return self.find_all(picture, None, batch=batch, worth=worth, least=least, **limits)
 
+    def _evidence(self) -> GlimpseEvidence | None:
+        """The evidence on the CPU, where the looks are that it reads."""
+        return None if self.evidence is None else on_cpu(self.evidence)
+
     def _open(self, picture: _Picture) -> LiveGlances:
-        if self.evidence is not None:
-            self.evidence.cpu()  # where the looks are that it reads
         return LiveGlances(self.eye, self.eye.open(picture))
 
 

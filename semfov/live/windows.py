@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.agents.placement import on_cpu
 from semfov.agents.windows import NEW_OBJECTS, ZoomAgent, least_of, window_objects
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import LargePicture, open_large
@@ -78,7 +79,7 @@ class WindowPerception(FramePerception):
         color: Color = "rgb",
     ) -> None:
         super().__init__(agent.classes, target, targets, rate, color)
-        self.eye, self.evidence = agent.eye, None if agent.evidence is None else agent.evidence.cpu()
+        self.eye, self.evidence = agent.eye, None if agent.evidence is None else on_cpu(agent.evidence)
         self._thresholds = confirm, give_up
         self._decisions: WindowDecisions | None = None
         if self.evidence is not None and target is not None:
