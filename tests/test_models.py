@@ -1,6 +1,7 @@
 """The models that the package ships: their size, names and metadata, and plausible outputs."""
 
 import json
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -171,12 +172,13 @@ def test_every_detector_has_all_kinds_of_models():
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
     at_thresholds = (f"-published-{threshold}" for threshold in (0.1, 0.25, 0.5))
     kinds = ("", "-sharp", "-published", "-published-narrow", *at_thresholds)
-    every = {name + kind for name in names for kind in kinds}
-    assert {path.stem for path in OBSERVATION} == every | {f"{name}-zoom" for name in names}
+    every = {name + kind for name in names for kind in (*kinds, "-zoom")}
+    assert {path.stem for path in OBSERVATION} == every | {"nanodet-plus-m-1.5x", "nanodet-plus-m-1.5x-published"}
 
 
-@pytest.mark.parametrize("growth", [1.0, 2.0])
-@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+@pytest.mark.parametrize(
+    ("detector", "growth"), [*product(("yolov3-tiny", "yolox-nano"), (1.0, 2.0)), ("nanodet-plus-m-1.5x", 2.0)]
+)
 def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
     model = semfov.FovealObservationModel.from_pretrained(recommended_model(detector, growth))
     assert model.metadata["sensor"]["growth"] == growth
@@ -184,8 +186,10 @@ def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
     assert model.metadata["method"] == "discriminative"
 
 
-@pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
-@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+@pytest.mark.parametrize(
+    ("detector", "sensor"),
+    [*product(("yolov3-tiny", "yolox-nano"), PUBLISHED_SENSORS), ("nanodet-plus-m-1.5x", "published")],
+)
 def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(detector, sensor):
     model = semfov.FovealObservationModel.from_pretrained(f"{detector}-{sensor}")
     fitted = model.metadata["sensor"]
