@@ -29,10 +29,7 @@ from semfov.io.files import sha256
 from semfov.io.schema import excerpt
 
 ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
-"""Published models that `load_onnx` knows by name."""
-
-RESIZABLE = {"nanodet-plus-m-1.5x": STRIDES}
-"""Published models with a fixed input whose size can be changed all the same, with the strides of their maps."""
+"""Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
 
 class OnnxDetector(Detector):
@@ -198,7 +195,7 @@ def load_onnx(
         classes: name of each score in order, `"N/A"` for scores that do not stand for a class. None is enough for
             models with 80 or 91 scores, which are taken as COCO's.
         input_size: size of the canvas in pixels, one side or `(width, height)`, for models that take any size, and for
-            those of `RESIZABLE`.
+            those of `ONNX_MODELS`.
         stride: for models that take any size: pad the canvas only to a multiple of this number of pixels.
         preprocessing: settings of `Preprocessing` that differ from those of the family.
         logits: whether the model returns scores before the sigmoid.
@@ -224,8 +221,8 @@ def load_onnx(
     digest = sha256(file) if file.is_file() else ""
     known_as = name if name in ONNX_MODELS else NETWORKS.get(digest)
     path = file
-    if known_as in RESIZABLE and input_size is not None:
-        path = with_input_size(file, _sides(input_size), RESIZABLE[known_as])
+    if known_as in ONNX_MODELS and input_size is not None:
+        path = with_input_size(file, _sides(input_size), STRIDES)
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(file, session.metadata)
     options = {

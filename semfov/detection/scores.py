@@ -42,11 +42,7 @@ class Candidates:
         return best if self.objectness is None else best * self.objectness
 
     def precise(self) -> "Candidates":
-        """Convert half precision, which is too coarse for pixels, to float32; other precisions stay as they are.
-
-        Returns:
-            The candidates in full precision.
-        """
+        """Convert half precision, which is too coarse for pixels, to float32; other precisions stay as they are."""
         if self.boxes.dtype not in HALVES and self.classes.dtype not in HALVES:
             return self
         objectness, background = (None if x is None else x.float() for x in (self.objectness, self.background))

@@ -1,8 +1,8 @@
 """Conversion of detections to and from the formats of Supervision, torchvision and COCO, tested with these packages."""
 
-import builtins
 import contextlib
 import io
+import sys
 
 import numpy as np
 import pytest
@@ -180,13 +180,6 @@ def test_inconsistent_arguments_are_refused_by_name():
 
 
 def test_to_supervision_without_the_package_names_the_remedy(monkeypatch):
-    importing = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "supervision":
-            raise ImportError(name)
-        return importing(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "supervision", None)
     with pytest.raises(InputError, match="pip install supervision"):
         some().to_supervision()

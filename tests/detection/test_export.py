@@ -1,5 +1,4 @@
 import json
-import subprocess
 import sys
 
 import numpy as np
@@ -7,7 +6,7 @@ import pytest
 import torch
 
 from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.export import export_onnx, largest_difference
+from semfov.detection.export import export_onnx, largest_difference, main
 from semfov.detection.export_graph import OUTPUTS
 from semfov.detection.load import load_detector, load_yolo
 from semfov.detection.onnx import load_onnx
@@ -91,19 +90,11 @@ def test_other_detectors_and_unwritable_files_are_refused(small, tmp_path, make_
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_command_line_exports_an_equal_model(tiny_weights, tmp_path):
+def test_command_line_exports_an_equal_model(tiny_weights, tmp_path, monkeypatch, capsys):
     path = tmp_path / "tiny.onnx"
-    command = [
-        sys.executable,
-        "-m",
-        "semfov.detection.export",
-        "yolov3-tiny",
-        str(path),
-        "--weights",
-        str(tiny_weights),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "largest difference" in done.stdout
+    monkeypatch.setattr(sys, "argv", ["export", "yolov3-tiny", str(path), "--weights", str(tiny_weights)])
+    main()
+    assert "largest difference" in capsys.readouterr().out
     detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch"), load_detector(path)
     assert exported.classes == COCO_CLASSES
     assert exported.name == "yolov3-tiny"
