@@ -15,6 +15,8 @@ from torch import Tensor
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
 from eval.zoom.objects import object_record
+from eval.zoom.observed import ObservedRates, make_zoom_observation
+from eval.zoom.orders import in_order, oracle, quad_tree, shuffled, sparse
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
@@ -25,7 +27,6 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
-from semfov.runs.setup import make_zoom_observation
 from semfov.runs.window_looking import (
     LEAST_CONFIDENCE,
     TileSize,
@@ -34,13 +35,11 @@ from semfov.runs.window_looking import (
     found_in,
     right_boxes,
 )
-from semfov.runs.zoom_orders import in_order, oracle, quad_tree, shuffled, sparse
 from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import adaptive_slices, ranked, slices
 
@@ -62,12 +61,6 @@ class ZoomConfig(WindowLookingConfig):
     """Large pictures: recall against detector passes, passes to the first confirmed hit, and decisions.
 
     Args:
-        data: the photographs (without a root: the embedded scenes).
-        detector: the detector.
-        mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
-        columns: number of photographs in a row of a mosaic.
-        rows: number of photographs in a column of a mosaic.
-        tile: width in pixels of a photograph's slot in a mosaic; the height is three quarters of it.
         target: class whose objects are to be found (None: objects of any class).
         slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
         overlap: overlap of neighbouring slices, as a share of their side.
@@ -77,17 +70,11 @@ class ZoomConfig(WindowLookingConfig):
             in mosaics, for classes that a slice shows; the `decision` at the end of a search.
         sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
             until a decision (with `target`, only that class is searched for).
-        cut: what to do with boxes at a window's border.
-        model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         closer: largest number of closer looks of a search.
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
         seed: random seed of mosaics and random orders.
         out: folder for tables, records and figures.
-        cache: folder for the stored looks, shared between runs (None: the user's cache).
-        store: keep looks on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     target: str | None = None

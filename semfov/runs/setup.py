@@ -27,7 +27,6 @@ from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
-from semfov.zoom.eye import WindowEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -166,16 +165,6 @@ def growth_of(eye: Eye) -> float:
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
     model = FovealObservationModel.from_pretrained(observation_name(eye) if name is None else name)
-    model.check_compatible(eye.settings(), eye.detector.classes)
-    return model.requires_grad_(False)
-
-
-def make_zoom_observation(name: str | None, eye: WindowEye) -> FovealObservationModel | None:
-    """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
-    own = f"{eye.detector.name}-zoom"
-    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
-        return None
-    model = FovealObservationModel.from_pretrained(name or own)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 

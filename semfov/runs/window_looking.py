@@ -38,7 +38,6 @@ class WindowLookingConfig(WorkConfig):
 
     Args:
         data: the photographs (without a root: the embedded scenes).
-        detector: the detector.
         mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
         columns: number of photographs in a row of a mosaic.
         rows: number of photographs in a column of a mosaic.
@@ -46,11 +45,8 @@ class WindowLookingConfig(WorkConfig):
         cut: what to do with boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         seed: random seed of mosaics.
-        out: folder of the outcomes.
-        cache: folder for the stored looks (None: the user's cache).
-        store: keep looks on disk; false computes them anew (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
+        cache: folder for the stored looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false computes them anew in each run (the result is the same).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

@@ -101,14 +101,7 @@ class StoredGlances(Glances):
 
 
 def gist_fields(kinds: int) -> dict[str, Field]:
-    """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file.
-
-    Args:
-        kinds: number of classes.
-
-    Returns:
-        The fields by name.
-    """
+    """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file."""
     return {
         "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
         "gist.counts": Field(("N", 2), torch.int64, low=0),
@@ -120,15 +113,7 @@ def gist_fields(kinds: int) -> dict[str, Field]:
 
 
 def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Pack gists into the tensors of `gist_fields`; a look without a gist has no cells.
-
-    Args:
-        gists: the gists of the looks.
-        kinds: number of classes.
-
-    Returns:
-        The tensors by name.
-    """
+    """Pack gists into the tensors of `gist_fields`; a look without a gist has no cells."""
     frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
     cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
     scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]

@@ -35,18 +35,6 @@ def belief(glances, evidence):
     return known
 
 
-def test_expected_finds_are_tapered_sums_over_cells(belief, evidence):
-    lattice = belief.lattice
-    for level in range(1, lattice.levels):
-        span, values, cells = lattice.span(level), belief.finds(level), belief.expected(level)
-        taper = evidence.taper(span)
-        assert values.shape == lattice.places(level)[::-1]
-        for row, column in ((0, 0), (values.shape[0] - 1, values.shape[1] // 2)):
-            part = cells[row : row + span, column : column + span]
-            weight = taper[: part.shape[0], None] * taper[None, : part.shape[1]]
-            torch.testing.assert_close(values[row, column], (part * weight).sum())
-
-
 def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
@@ -172,67 +160,6 @@ def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
     assert value > 0
 
 
-def test_kept_values_equal_recomputed_values(belief, glances, evidence):
-    """After looks of all levels in any order, and after plans that were dropped."""
-    lattice, generator = belief.lattice, torch.Generator().manual_seed(6)
-    seen = glances.see([on_lattice(lattice, (0, 0, 0))])
-    for turn in range(12):
-        action = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
-        seen += glances.see([on_lattice(lattice, tuple(action))])
-        belief.add(seen[-1])
-        jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + turn % 3)
-        anew = ZoomBelief(lattice, evidence, 1)
-        for glance in seen:
-            anew.add(glance)
-        for level in range(1, lattice.levels):
-            np.testing.assert_allclose(belief.value(level, 0.5), anew.value(level, 0.5), rtol=1e-4, atol=1e-6)
-            assert torch.equal(belief.expected(level), anew.expected(level))
-
-
-def test_no_finds_are_expected_in_a_window_seen_at_the_finest_level(belief, glances):
-    """Up to its borders: objects that they cut are expected of the next window."""
-    lattice = belief.lattice
-    finest = lattice.levels - 1
-    belief.add(glances.see([on_lattice(lattice, (finest, 5, 7))])[0])
-    expected = belief.expected(finest)
-    assert (expected[7 : 7 + CELLS, 5 : 5 + CELLS] == 0).all()
-    assert (expected[7 : 7 + CELLS, 5 + CELLS : -1] > 0).all()
-
-
-@pytest.mark.slow
-def test_cached_odds_equal_recomputed_odds(belief, glances, evidence):
-    """After looks of all levels in any order, and after plans that were dropped."""
-    lattice, generator = belief.lattice, torch.Generator().manual_seed(5)
-    seen = glances.see([on_lattice(lattice, (0, 0, 0))])
-    for turn in range(25):
-        action = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
-        seen += glances.see([on_lattice(lattice, tuple(action))])
-        belief.add(seen[-1])
-        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + turn % 3)
-        if turn % 4 == 0:
-            anew = ZoomBelief(lattice, evidence, 1)
-            for glance in seen:
-                anew.add(glance)
-            for level in range(1, lattice.levels):
-                torch.testing.assert_close(belief.odds(level), anew.odds(level))
-
-
-def test_a_window_counts_for_the_share_that_no_look_at_its_level_or_closer_has_shown(belief, glances):
-    lattice, generator = belief.lattice, torch.Generator().manual_seed(2)
-    closest = np.full((lattice.rows, lattice.columns), 0)
-    for _ in range(8):
-        level, column, row = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
-        belief.add(glances.see([on_lattice(lattice, (level, column, row))])[0])
-        shown = closest[row : row + lattice.span(level), column : column + lattice.span(level)]
-        shown[:] = np.maximum(shown, level)
-        for at in range(1, lattice.levels):
-            span, (across, down) = lattice.span(at), lattice.places(at)
-            expected = [[(closest[y : y + span, x : x + span] < at).mean() for x in range(across)] for y in range(down)]
-            np.testing.assert_allclose(belief.unseen(at), expected, atol=1e-6)
-            chances = torch.from_numpy(np.array(expected)) * belief.odds(at).double().sigmoid()
-            np.testing.assert_allclose(belief.chances(at), chances, atol=1e-6)
-
-
 @pytest.mark.parametrize("target", [1, 2, 3])
 def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(glances, evidence, target):
     lattice = glances.lattice
@@ -283,15 +210,6 @@ def test_batches_are_chosen_jointly(belief):
     assert chosen[0][0] == first
     values = [value for _, value in chosen]
     assert values == sorted(values, reverse=True)
-
-
-def test_closer_looks_replace_the_evidence_of_the_overview(belief, glances):
-    lattice = belief.lattice
-    belief.add(glances.see([on_lattice(lattice, (1, 0, 0))])[0])
-    span = lattice.span(1)
-    assert (belief.source[:span, :span] == 1).all()
-    assert (belief.source[:, span:] == 0).all()
-    assert float(belief.expected(1)[:span, :span].sum()) == 0
 
 
 def test_a_saved_model_is_loaded_unchanged(tmp_path, evidence):

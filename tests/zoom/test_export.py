@@ -55,6 +55,18 @@ def colours():
     return (smooth[0].permute(1, 2, 0) * 255).round().byte().numpy()
 
 
+SELECTION = Selection(threshold=0.3, iou=0.4, limit=40)
+
+
+@pytest.fixture(scope="module")
+def exported(network, tmp_path_factory):
+    """A file with a look of the network with this selection."""
+    path = tmp_path_factory.mktemp("exported") / "look.onnx"
+    network.selection = SELECTION
+    export_look(WindowEye(network), path)
+    return path
+
+
 def run(path, picture, fixation):
     session = ort.InferenceSession(path, providers=["CPUExecutionProvider"])
     names = [value.name for value in session.get_outputs()]
@@ -88,11 +100,10 @@ def compare(found, glance, pixels, score):
         ((300.2, 400.7, 3.3), 0.1, 0.01),
     ],
 )
-def test_the_exported_look_detects_the_same_as_the_eye(network, colours, tmp_path, fixation, pixels, score):
-    network.selection = Selection(threshold=0.3, iou=0.4, limit=40)
+def test_the_exported_look_detects_the_same_as_the_eye(network, exported, colours, fixation, pixels, score):
+    network.selection = SELECTION
     eye = WindowEye(network)
-    export_look(eye, tmp_path / "look.onnx")
-    found = run(tmp_path / "look.onnx", colours, fixation)
+    found = run(exported, colours, fixation)
     assert set(found) == {"boxes", "scores", "cut", "window"}
     compare(found, eye.glance(eye.open(colours), torch.tensor([fixation])), pixels, score)
 
@@ -112,46 +123,46 @@ def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network,
             assert len(found["boxes"]) == 3 or name == "each class"
 
 
-def test_a_picture_without_objects_gives_no_boxes(network, tmp_path):
-    export_look(WindowEye(network), tmp_path / "look.onnx")
-    found = run(tmp_path / "look.onnx", np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
+def test_a_picture_without_objects_gives_no_boxes(exported):
+    found = run(exported, np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
     assert found["boxes"].shape == (0, 4)
     assert found["scores"].shape == (0, 4)
 
 
-@pytest.mark.parametrize("finest", [1.0, 4.0])
-def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path, finest):
-    """With a torch detector, in windows of 32 cells: at reduced resolution, and with native pixels."""
+def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
+    """With a torch detector, in windows of 32 cells."""
     torch.manual_seed(3)
     evidence = GlimpseEvidence(3, 8).eval().requires_grad_(False)
     # With equal parameters, a mix-up of them would not be noticed.
     for parameter in evidence.parameters():
         parameter.add_(0.1 * torch.randn_like(parameter))
-    eye = WindowEye(detector, finest=finest)
-    view = eye.open((picture * 0.9 + 0.05 * torch.rand_like(picture)).clamp(0, 1))
-    lattice = view.lattice
-    level = lattice.levels - 3
-    assert lattice.span(level) == 32
-    # Around the red square.
-    column, row = (int(middle / pitch) - 13 for middle, pitch in zip((656, 336), lattice.pitch, strict=True))
-    window = on_lattice(lattice, (level, column, max(row, 0)))
-    glance = LiveGlances(eye, view).see([window])[0]
-    export_look(eye, tmp_path / "look.onnx", evidence)
-    pixels = view.picture.pixels((0, 0, *view.picture.size))
-    found = run(tmp_path / "look.onnx", pixels, window.fixation)
-    gist = glance.gist
-    assert gist.scores.shape[:2] == (32, 32)
-    assert float(gist.scores.max()) > 0.1
-    rates = torch.cat([evidence.survey.rates(gist), evidence.rates(gist, torch.arange(1, 4))])
-    tolerance = 2e-5 if lattice.magnifications[level] == 1 else 0.005
-    torch.testing.assert_close(found["rates"], rates, rtol=0, atol=tolerance)
-    assert float(rates.std()) > 20 * tolerance
-    for step in (1, 2, 3):
-        span = 32 >> step
-        scores, summary = pool_all(gist.scores, span)
-        odds = evidence.presence(scores, summary, torch.full((len(scores),), step))
-        expected = odds.mT.unflatten(-1, (33 - span, 33 - span))
-        torch.testing.assert_close(found[f"odds_{step}"], expected, rtol=0, atol=tolerance)
+    picture = (picture * 0.9 + 0.05 * torch.rand_like(picture)).clamp(0, 1)
+    export_look(WindowEye(detector), tmp_path / "look.onnx", evidence)
+    # At reduced resolution, and with native pixels.
+    for finest in (1.0, 4.0):
+        eye = WindowEye(detector, finest=finest)
+        view = eye.open(picture)
+        lattice = view.lattice
+        level = lattice.levels - 3
+        assert lattice.span(level) == 32
+        # Around the red square.
+        column, row = (int(middle / pitch) - 13 for middle, pitch in zip((656, 336), lattice.pitch, strict=True))
+        window = on_lattice(lattice, (level, column, max(row, 0)))
+        gist = LiveGlances(eye, view).see([window])[0].gist
+        pixels = view.picture.pixels((0, 0, *view.picture.size))
+        found = run(tmp_path / "look.onnx", pixels, window.fixation)
+        assert gist.scores.shape[:2] == (32, 32)
+        assert float(gist.scores.max()) > 0.1
+        rates = torch.cat([evidence.survey.rates(gist), evidence.rates(gist, torch.arange(1, 4))])
+        tolerance = 2e-5 if lattice.magnifications[level] == 1 else 0.005
+        torch.testing.assert_close(found["rates"], rates, rtol=0, atol=tolerance)
+        assert float(rates.std()) > 20 * tolerance
+        for step in (1, 2, 3):
+            span = 32 >> step
+            scores, summary = pool_all(gist.scores, span)
+            odds = evidence.presence(scores, summary, torch.full((len(scores),), step))
+            expected = odds.mT.unflatten(-1, (33 - span, 33 - span))
+            torch.testing.assert_close(found[f"odds_{step}"], expected, rtol=0, atol=tolerance)
 
 
 def test_the_file_records_classes_input_size_and_cells(network, tmp_path):

@@ -169,21 +169,6 @@ def make_glance(level, column, row, boxes, scores, cut):
     return Glance(on_lattice(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
 
 
-def test_merging_prefers_the_closer_look():
-    far = make_glance(0, 0, 0, [[100.0, 100, 200, 200]], [0.9], [False])
-    near = make_glance(2, 0, 0, [[105.0, 102, 198, 199]], [0.6], [False])
-    objects = merge([far, near])
-    assert objects.boxes.tolist() == [[105.0, 102, 198, 199]]
-    assert objects.passes.tolist() == [1]
-
-
-def test_merging_prefers_whole_boxes_to_cut_boxes():
-    far = make_glance(0, 0, 0, [[100.0, 100, 200, 200]], [0.4], [False])
-    near = make_glance(2, 0, 0, [[100.0, 100, 140, 200]], [0.9], [True])
-    assert merge([far, near]).boxes.tolist() == [[100.0, 100, 200, 200]]
-    assert merge([near]).boxes.tolist() == [[100.0, 100, 140, 200]]
-
-
 def test_merging_keeps_small_objects_in_front_of_large_ones():
     look = make_glance(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
     assert len(merge([look])) == 2

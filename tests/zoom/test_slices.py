@@ -7,9 +7,8 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.agents.limits import EpisodeLimits
 from semfov.errors import InputError
-from semfov.runs.zoom_orders import sparse
 from semfov.zoom import WindowEye
-from semfov.zoom.glances import LiveGlances, overview
+from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import adaptive_slices, ranked, raw, usual_slices
 from tests.small import Coloured
@@ -51,32 +50,6 @@ def test_adaptive_slices_are_as_many_as_the_size_asks_and_cover_the_picture(size
         assert starts[0] == 0
         assert starts[-1] + side == max(length, side)
         assert (np.diff(starts) <= side * 0.85 + 1).all()
-
-
-def test_sparse_slices_are_those_in_which_the_overview_shows_enough(agent):
-    """The highest score of a slice, by a loop over the boxes of the hints and not over the cells."""
-    glances = LiveGlances(agent.eye, agent.eye.open(picture((900, 600, 90, "green"), (100, 100, 60, "red"))))
-    windows = usual_slices(glances.lattice)
-    (look,) = glances.see([overview(glances.lattice)])
-    (hints,) = agent.eye.glance(glances.view, torch.tensor([look.window.fixation])).hints
-    wide, high = glances.lattice.pitch
-    for targets in ([], [1], [2]):
-        for least in (0.05, 0.5):
-            order, done, chosen = sparse(windows, targets, least), set(), []
-            while choice := order([look] * (len(done) + 1), done):
-                done.add(choice[0][0])
-                chosen.append(choice[0][0])
-            expected = []
-            for window in windows:
-                x1, y1, x2, y2 = window.cells
-                best = 0.0
-                for box, scores in zip(hints.boxes.tolist(), hints.scores, strict=True):
-                    column, row = (box[0] + box[2]) / 2 // wide, (box[1] + box[3]) / 2 // high
-                    if x1 <= column < x2 and y1 <= row < y2:
-                        best = max(best, float(max(scores[[t - 1 for t in targets]] if targets else scores)))
-                expected += [window] if best >= least else []
-            assert chosen == expected
-    assert 0 < len(expected) < len(windows)
 
 
 def test_windows_come_in_the_order_of_the_summed_scores(agent):

@@ -1,21 +1,17 @@
-"""Looks by magnification: labelled windows, misses in them, and what an observation model expects of closer looks."""
+"""Looks by magnification: labelled windows, and misses in them."""
 
 import math
 
 import pytest
 import torch
 
-from semfov import FovealObservationModel
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.errors import InputError
 from semfov.fit.misses import count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows
-from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.observed import ObservedRates
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
@@ -95,41 +91,3 @@ def test_misses_are_counted_in_the_cells_that_a_window_shows(sampler):
     assert counts.total[0].sum() < cells.sum()
     assert (counts.missed <= counts.total).all()
     assert len(samples.fixations) == 1 + 2 * (Lattice.over(size, (128, 128)).levels - 1)
-
-
-def observation():
-    torch.manual_seed(0)
-    miss = torch.rand(3, 4).double().clamp(0.1, 0.9)
-    alpha = 1 + torch.rand(3, 4, 3).double()
-    cells = {"cells": [97, 1, 2]}
-    return FovealObservationModel(alpha, [0.5, 1.5, 2.5], ("red", "blue"), miss_rate=miss, metadata=cells)
-
-
-def test_expected_finds_of_closer_looks_follow_from_the_model():
-    model = observation()
-    rates = ObservedRates(model, LATTICE)
-    span = LATTICE.span(1)
-    scores, found = torch.zeros(span, span, 2), torch.zeros(span, span, 2, dtype=torch.bool)
-    scores[3, 4, 0] = 0.2
-    found[10, 10, 1] = True
-    look = Gist(1, (0, 0), 1, scores, torch.zeros(span, span), found)
-    expected_finds = rates.rates(look, torch.tensor([0, 1, 2])).exp()
-    level = [sum(float(octave) > edge for edge in (0.5, 1.5, 2.5)) for octave in LATTICE.octaves]
-    miss, share = model.miss_rate, torch.tensor([98.0, 2, 3]).double() / 103
-    nothing = share * miss[:, level[1]]
-    nothing = nothing / nothing.sum()
-    seen = model.calibrate(torch.tensor([0.8, 0.2, 0.0]).double(), LATTICE.octaves[1].double()).detach()
-    for cell, held in (((20, 20), nothing), ((3, 4), seen)):
-        for t in (1, 2):
-            expected = held[t] * (1 - miss[t, level[2]])
-            assert float(expected_finds[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
-        assert float(expected_finds[0, 0, *cell]) == pytest.approx(float(expected_finds[1:, 0, *cell].sum()), rel=1e-4)
-    # Objects already found are not expected again, and no look is closer than the finest level.
-    assert expected_finds[2, 0, 9:12, 9:12].max() < 1e-6
-    assert expected_finds[:, LATTICE.levels - 2 :].max() < 1e-6
-    assert rates.taper(5).tolist() == [1.0] * 5
-
-
-def test_a_model_without_counts_of_cells_is_refused():
-    with pytest.raises(InputError, match=r"train\.fit_fom fitted with --mosaics"):
-        ObservedRates(FovealObservationModel.identity(("red", "blue"), [0.5]), LATTICE)

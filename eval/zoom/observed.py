@@ -6,6 +6,7 @@ from torch.nn import functional as F
 
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
@@ -65,3 +66,13 @@ class ObservedRates:
     def taper(self, span: int) -> Tensor:
         """Weights of the cells along a side of a window, `(span,)`: ones."""
         return torch.ones(span)
+
+
+def make_zoom_observation(name: str | None, eye: WindowEye) -> FovealObservationModel | None:
+    """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
+    own = f"{eye.detector.name}-zoom"
+    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
+        return None
+    model = FovealObservationModel.from_pretrained(name or own)
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
