@@ -5,7 +5,6 @@ It needs no prior and no fusion rule. One confident look outweighs any number of
 Run it from a checkout: python -m examples.own_observer
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,15 +23,6 @@ class ScoreLook(semfov.observers.Look):
     scores: Tensor  # (B, X·Y, K+1)
     distance: Tensor  # (B, X·Y), from the fixation
 
-    def __getitem__(self, index: Tensor | slice) -> "ScoreLook":
-        """The selected looks of the batch."""
-        return ScoreLook(self.scores[index], self.distance[index])
-
-    @classmethod
-    def join(cls, looks: Sequence["ScoreLook"]) -> "ScoreLook":
-        """Concatenate several batches of looks."""
-        return cls(torch.cat([look.scores for look in looks]), torch.cat([look.distance for look in looks]))
-
 
 @dataclass(frozen=True)
 class ScoreBelief(semfov.Belief):
@@ -44,10 +34,6 @@ class ScoreBelief(semfov.Belief):
     def probability(self, target: int | Tensor) -> Tensor:
         """Largest score of the target in each cell, `(B, X·Y)`."""
         return self.scores[torch.arange(len(self.scores)), :, target]
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "ScoreBelief":
-        """Apply a function to every tensor of the belief."""
-        return ScoreBelief(function(self.scores), function(self.closest))
 
 
 class BestScore(semfov.observers.Observer):

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -15,7 +15,8 @@ from semfov.observation import dirichlet
 class Belief(ABC):
     """Base of all beliefs about the cells of an image, for a batch of episodes.
 
-    A subclass implements `probability` and `map`.
+    A subclass implements `probability`, and is a dataclass of tensors `(B, ...)`, of other beliefs, also in tuples, and
+    of values that all episodes share. One that holds its tensors in another way implements `map`, too.
 
     Attributes:
         closest: `(B, X·Y)`, distance from each cell to the closest fixation so far, in units of the image's longer
@@ -80,9 +81,8 @@ class Belief(ABC):
             f"{type(self).__name__}"
         )
 
-    @abstractmethod
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """Apply a function to every tensor of the belief.
+        """Apply a function to every tensor of the belief, and of the beliefs that it holds.
 
         Args:
             function: maps a tensor `(B, ...)` to another one.
@@ -90,6 +90,16 @@ class Belief(ABC):
         Returns:
             A new belief.
         """
+
+        def mapped(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return function(value)
+            if isinstance(value, Belief):
+                return value.map(function)
+            return tuple(mapped(each) for each in value) if isinstance(value, tuple) else value
+
+        changed = {each.name: mapped(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **changed)  # type: ignore[type-var]
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The belief of the selected episodes."""
@@ -150,10 +160,6 @@ class DirichletBelief(Belief):
     def __post_init__(self) -> None:
         if self.closest is None:
             object.__setattr__(self, "closest", torch.full_like(self.beta[..., 0], torch.inf))
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "DirichletBelief":
-        """The belief with both tensors replaced."""
-        return DirichletBelief(function(self.beta), function(self.closest))
 
     @classmethod
     def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "DirichletBelief":

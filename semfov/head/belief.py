@@ -1,6 +1,5 @@
 """The belief about a scene that is seen through one window at a time."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -86,12 +85,6 @@ class SceneBelief(Belief):
     def class_probabilities(self) -> Tensor:
         """Probabilities of all classes, `(1, S, K+1)`."""
         return self.values if self.about_all else super().class_probabilities()
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "SceneBelief":
-        """The belief with all tensors replaced."""
-        values, closest, owner = function(self.values), function(self.closest), function(self.owner)
-        views = tuple(None if view is None else view.map(function) for view in self.views)
-        return SceneBelief(values, closest, owner, function(self.examined), function(self.looks), views)
 
 
 class SceneObserver(Observer):

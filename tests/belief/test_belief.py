@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, InputError
-from semfov.belief import Belief, ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.belief import dirichlet_belief, pick
 from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
 from tests import small
@@ -201,18 +201,6 @@ def test_before_the_first_look_all_distances_are_infinite(dtype):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_every_kind_has_a_probability_of_the_target_and_can_be_indexed(kind):
-    belief = seen(OBSERVERS[kind]())
-    assert isinstance(belief, Belief)
-    present = belief.probability(2)
-    assert present.shape == belief.closest.shape == (2, 12)
-    assert bool(((present >= 0) & (present <= 1)).all())
-    for index in (slice(1, 2), torch.tensor([1])):
-        torch.testing.assert_close(belief[index].probability(2), present[1:2])
-        torch.testing.assert_close(belief[index].closest, belief.closest[1:2])
-
-
-@pytest.mark.parametrize("kind", OBSERVERS)
 def test_map_is_applied_to_every_tensor_of_every_kind(kind):
     belief = seen(OBSERVERS[kind]())
     met = []
@@ -290,15 +278,6 @@ def test_pick_selects_one_component_per_row():
     for row in range(2):
         assert torch.equal(got[row], values[row, ..., target[row]])
     assert torch.equal(pick(values, torch.tensor(3)), values[..., 3])
-
-
-def test_beliefs_can_be_created_inside_a_compiled_graph():
-    def present(beta):
-        return DirichletBelief(beta).probability(2)
-
-    torch.compiler.reset()
-    compiled = torch.compile(present, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(rand(2, 3, 4)), present(rand(2, 3, 4)))
 
 
 def test_put_replaces_the_beliefs_of_the_given_episodes():

@@ -143,18 +143,6 @@ def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
-def test_looks_joined_over_targets_equal_those_of_each_target(prior, looks, kind):
-    observer = Context(observers()[kind], prior)
-    said = [observer.weigh(looks, FIXATIONS, GRID, target) for target in (1, 3)]
-    joined = type(said[0]).join(said)
-    start = observer.start(2, GRID, looks.scores)
-    both = observer.update(start, joined[torch.tensor([1, 4])])
-    for row in range(2):
-        alone = observer.update(start[row : row + 1], said[row][1:2])
-        torch.testing.assert_close(both[row : row + 1].present, alone.present)
-
-
-@pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
 def test_belief_before_the_first_look_has_even_odds_and_shows_nothing(prior, kind):
     belief = Context(observers()[kind], prior).start(2, GRID, torch.empty(0, dtype=torch.float64))
     even = torch.full((2, 20), 0.5, dtype=torch.float64)

@@ -81,24 +81,6 @@ def stacked_maps(soft):
     return beta, likelihood, footprint if soft else footprint > 0
 
 
-def test_fuse_gradients():
-    torch.manual_seed(1)
-    beta = (torch.rand(1, 3, 3, dtype=torch.float64) + 0.2).requires_grad_()
-    likelihood = (torch.rand(1, 4, 3, dtype=torch.float64) + 0.1).requires_grad_()
-    footprint = torch.rand(1, 4, 3) < 0.6
-    assert torch.autograd.gradcheck(lambda b, l: fuse(b, l, footprint), (beta, likelihood))
-
-
-def test_300_updates_in_float32_stay_close_to_float64():
-    torch.manual_seed(3)
-    likelihood = torch.rand(1, 300, 81)
-    likelihood[..., 2:] *= 1e-4
-    footprint = torch.ones(1, 300, 1, dtype=torch.bool)
-    single = fuse(torch.full((1, 1, 81), 0.5), likelihood, footprint)
-    double = fuse(torch.full((1, 1, 81), 0.5, dtype=torch.float64), likelihood.double(), footprint)
-    torch.testing.assert_close(single.double(), double, rtol=2e-4, atol=0)
-
-
 def seen(grid: Grid) -> Detections:
     boxes = torch.tensor([[[0.0, 0, 30, 30], [20, 20, 90, 60], [0, 0, 0, 0]]])
     scores = torch.tensor([[[0.1, 0.6, 0.3], [0.5, 0.1, 0.4], [0, 0, 0]]])
@@ -233,11 +215,3 @@ def test_invalid_dirichlet_parameters_are_refused(value):
 def test_an_error_says_what_is_wrong_with_likelihoods(bad, words):
     with pytest.raises(InputError, match=rf"^likelihood: .*, got {words}$"):
         fusion.scale_likelihood(torch.tensor([[1.0, 2.0], bad]))
-
-
-@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
-def test_one_detection_changes_only_its_cell(name):
-    beta, likelihood = torch.tensor([[[0.5, 1.5], [1.0, 2.0]]]), torch.tensor([[[0.2, 0.8]]])
-    got = fuse(beta, likelihood, torch.tensor([[[False, True]]]), name)
-    assert torch.equal(got[0, 0], beta[0, 0])
-    torch.testing.assert_close(got[0, 1], getattr(fusion, name)(beta[0, 1], likelihood[0, 0]))

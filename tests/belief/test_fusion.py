@@ -68,13 +68,6 @@ def test_kaplan_mean_equals_that_of_the_integrated_posterior():
     torch.testing.assert_close(after / after.sum(), posterior, atol=2e-3, rtol=0)
 
 
-def test_raw_scores_update_a_cell_as_in_equation_7():
-    """Three classes at the prior of 0.5 see s = (0.2, 0.7, 0.1), so that D = 0.5: every step by hand."""
-    beta, scores = torch.full((3,), 0.5, dtype=torch.float64), torch.tensor([0.2, 0.7, 0.1], dtype=torch.float64)
-    expected = torch.tensor([0.5 * (1 + s / 0.5) / (1 + 0.1 / 0.5) for s in (0.2, 0.7, 0.1)], dtype=torch.float64)
-    torch.testing.assert_close(fusion.kaplan(beta, scores), expected, rtol=1e-14, atol=0)
-
-
 def test_kaplan_depends_on_the_order_of_detections():
     """Section IV-A applies it "in no particular order": the caller has to choose one."""
     beta = torch.full((3,), 0.5, dtype=torch.float64)

@@ -50,26 +50,6 @@ def test_log_odds_of_a_class_depend_on_its_strongest_rival(toy_map, gathered, re
         np.testing.assert_allclose(reference.array(got[episode]), expected, atol=1e-6)
 
 
-def test_a_rival_changes_only_its_own_cell(toy_map, gathered):
-    """The rival is the strongest other class: the second class changes the odds of the first, the third none."""
-    model, said = toy_map().double(), gathered(episodes=1)
-    with torch.no_grad():
-        model.read[0].weight[:, :-1] = 0  # the network reads only the rival
-    before = model.log_odds(said, 6, 4)[0]
-    order = said.nearest[:, 7].argsort(descending=True)
-    changes = []
-    for rank in range(4):
-        changed = said.nearest.clone()
-        # Small changes, which keep the order of the classes.
-        changed[order[rank], 7] += 0.1 * (said.nearest[order[rank - 1], 7] - changed[order[rank], 7]) if rank else 0.1
-        after = model.log_odds(type(said)(changed, *[getattr(said, name) for name in REST]), 6, 4)[0]
-        moved = (after - changed - before + said.nearest).abs() > 1e-12
-        assert not moved[:, [c for c in range(24) if c != 7]].any()
-        changes.append({int(row) for row in moved[:, 7].nonzero()[:, 0]})
-    first, second, third, fourth = order.tolist()
-    assert changes == [{second, third, fourth}, {first}, set(), set()]
-
-
 REST = ("best", "mean", "distance", "score", "looks", "visited", "target")
 
 
@@ -95,34 +75,6 @@ def test_emptiness_equals_numpy(toy_map, reference, columns, stands_for):
             model, reference.array(odds[row]), reference.array(distance[row]), float(looks[row]), columns, stands_for
         )
         np.testing.assert_allclose(reference.array(got[row]), expected, atol=1e-6)
-
-
-def test_a_class_that_stands_for_several_counts_several_times(toy_map):
-    """The same as repeating the class that often, in cells where it is not the most probable one."""
-    model, distance, looks = toy_map().double(), draw(2, 24, seed=4).abs(), torch.tensor([2.0, 5.0]).double()
-    odds = 2 * draw(2, 4, 24)
-    odds[:, 2:] -= 2
-    times = torch.tensor([1, 1, 4, 3])
-    repeated = odds.repeat_interleave(times, 1)
-    assert repeated.shape == (2, 9, 24)
-    got = model.emptiness(odds, distance, looks, 6, times.double().expand(2, -1))
-    expected = model.emptiness(repeated, distance, looks, 6)
-    one_for_all = odds.argmax(1) < 2
-    assert 0.5 < float(one_for_all.double().mean()) < 1
-    torch.testing.assert_close(got[one_for_all], expected[one_for_all])
-    assert torch.equal(
-        model.emptiness(odds, distance, looks, 6, torch.ones(2, 4)), model.emptiness(odds, distance, looks, 6)
-    )
-
-
-def test_emptiness_without_a_correction_is_the_probability_of_no_class(toy_map):
-    model = toy_map().double()
-    with torch.no_grad():
-        model.void[-1].weight.zero_()
-        model.void[-1].bias.zero_()
-    odds = draw(2, 4, 24)
-    got = model.emptiness(odds, draw(2, 24).abs(), torch.ones(2).double(), 6).sigmoid()
-    torch.testing.assert_close(got, (1 - odds.sigmoid()).prod(1))
 
 
 def test_emptiness_is_finite_for_certain_cells():

@@ -1,5 +1,7 @@
 """Evidence and observers as submodules of other modules."""
 
+from functools import partial
+
 import torch
 
 from semfov.belief import Verification
@@ -62,20 +64,15 @@ class ObserverTester(LookTester):
     """An observer's belief about class 2 after the same detections from two fixations."""
 
     @staticmethod
-    def call(module, scores, boxes, fixation):
+    def call(module, scores, boxes, fixation, looks=2):
         belief, seen = module.start(len(scores), GRID, scores), detections(scores, boxes)
-        for point in (fixation, fixation + 15):
-            belief = module(belief, seen, point, GRID, 2)
+        for number in range(looks):
+            belief = module(belief, seen, fixation + 15 * number, GRID, 2)
         return belief.probability(2)
 
-
-class TestSemanticOfAllClasses(LookTester):
-    def make(self):
-        return observing()
-
-    @staticmethod
-    def call(module, scores, boxes, fixation):
-        return module(module.start(len(scores), GRID, scores), detections(scores, boxes), fixation, GRID).beta
+    def traced(self):
+        """Both looks have the same graph."""
+        return self.host(partial(self.call, looks=1))
 
 
 globals().update(

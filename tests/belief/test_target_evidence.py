@@ -117,35 +117,6 @@ def test_belief_equals_a_loop_over_looks_and_cells(looks, model, reference, orde
     assert belief.presence(7) is belief.presence(torch.tensor([2])) is belief.anywhere
 
 
-def test_without_learned_corrections_the_closest_look_decides(looks, model):
-    """Without corrections a cell has the evidence of its closest look, and the image that of its most probable cell."""
-    with torch.no_grad():
-        for network in (model.read, model.guide, model.judge):
-            network[-1].weight.zero_()
-            network[-1].bias.zero_()
-        belief = believe(Target(model), looks, (0, 1, 2), 2)
-        said = model(looks, FIXATIONS, GRID, 2)
-    closest = torch.cdist(GRID.centres, FIXATIONS).argmin(1)
-    expected = said.t().gather(1, closest[:, None])[:, 0].sigmoid()
-    torch.testing.assert_close(belief.present[0], expected)
-    # For the next look, fixated cells are assumed not to hold the target.
-    expected[FIXATED] = torch.tensor(-8.0).sigmoid()
-    torch.testing.assert_close(belief.following[0], expected)
-    torch.testing.assert_close(belief.anywhere, belief.present.amax(-1))
-
-
-def test_the_prior_of_a_class_changes_only_that_class(looks, model):
-    observer = Target(model)
-    with torch.no_grad():
-        before = {target: believe(observer, looks, (0, 1), target) for target in (1, 2)}
-        model.prior[2] += 3
-        after = {target: believe(observer, looks, (0, 1), target) for target in (1, 2)}
-    assert torch.equal(before[1].present, after[1].present)
-    assert torch.equal(before[1].anywhere, after[1].anywhere)
-    assert not torch.isclose(before[2].present, after[2].present).any()
-    assert not torch.isclose(before[2].anywhere, after[2].anywhere).any()
-
-
 def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
     observer, cell = Target(small.score_evidence(TargetEvidence)), 9
     x, y = GRID.centres[cell].tolist()

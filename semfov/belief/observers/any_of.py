@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -33,16 +32,6 @@ class AnyLook(Look):
     """
 
     inner: tuple[Look, ...]
-
-    def __getitem__(self, index: Tensor | slice) -> "AnyLook":
-        """The selected looks of the batch."""
-        return AnyLook(tuple(look[index] for look in self.inner))
-
-    @classmethod
-    def join(cls, looks: Sequence[Self]) -> "AnyLook":
-        """Concatenate several batches of looks."""
-        parts = zip(*(look.inner for look in looks), strict=True)
-        return AnyLook(tuple(type(part[0]).join(part) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -86,10 +75,6 @@ class AnyBelief(Belief):
         """
         peaks = [weight * belief.probability(index).amax(-1) for belief, index, weight in self._each()]
         return torch.tensor(list(self.weights), device=peaks[0].device)[torch.stack(peaks).argmax(0)]
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "AnyBelief":
-        """Apply a function to every tensor of the belief."""
-        return AnyBelief(tuple(belief.map(function) for belief in self.inner), self.weights, function(self.closest))
 
     def _each(self) -> list[tuple[Belief, int, float]]:
         beliefs = self.inner if len(self.inner) > 1 else self.inner * len(self.weights)

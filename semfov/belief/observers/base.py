@@ -2,8 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Self, TypeVar
+from dataclasses import fields, replace
+from typing import Any, ClassVar, Self, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from semfov.belief.belief import Belief
@@ -15,24 +17,30 @@ from semfov.errors import InputError
 Kind = TypeVar("Kind")
 
 
-class Look(ABC):
+class Look:
     """Base of the evidence of a batch of looks about the cells. `Observer.weigh` returns it, `Observer.update` uses it.
 
-    A subclass implements indexing and `join`.
+    A subclass is a dataclass of tensors `(B, ...)`, of other looks, also in tuples, and of values that all looks share.
+    One that holds its tensors in another way implements indexing and `join`.
 
-    >>> import torch
     >>> from semfov.belief.observers import SemanticLook
     >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
     >>> SemanticLook.join([look[:1], look]).distance.shape
     torch.Size([3, 4])
     """
 
-    @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The selected looks of the batch."""
 
+        def selected(value: Any) -> Any:
+            if isinstance(value, Tensor | Look):
+                return value[index]
+            return tuple(selected(each) for each in value) if isinstance(value, tuple) else value
+
+        chosen = {each.name: selected(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **chosen)  # type: ignore[type-var]
+
     @classmethod
-    @abstractmethod
     def join(cls, looks: Sequence[Self]) -> Self:
         """Concatenate several batches of looks.
 
@@ -42,6 +50,17 @@ class Look(ABC):
         Returns:
             One batch with all looks, in order.
         """
+
+        def joined(values: Sequence[Any]) -> Any:
+            first = values[0]
+            if isinstance(first, Tensor):
+                return torch.cat(list(values))
+            if isinstance(first, Look):
+                return type(first).join(values)
+            return tuple(joined(part) for part in zip(*values, strict=True)) if isinstance(first, tuple) else first
+
+        names = [each.name for each in fields(cls)]  # type: ignore[arg-type]
+        return replace(looks[0], **{name: joined([getattr(look, name) for look in looks]) for name in names})  # type: ignore[type-var]
 
 
 class Observer(nn.Module, ABC):

@@ -1,6 +1,5 @@
 """An observer that adds context to another observer's belief about the target."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,17 +29,6 @@ class ContextLook(Look):
     presence: Tensor
     target: Tensor
     grid: Grid
-
-    def __getitem__(self, index: Tensor | slice) -> "ContextLook":
-        """The selected looks of the batch."""
-        return replace(self, inner=self.inner[index], presence=self.presence[index], target=self.target[index])
-
-    @classmethod
-    def join(cls, looks: Sequence["ContextLook"]) -> "ContextLook":
-        """Concatenate several batches of looks."""
-        inner = [look.inner for look in looks]
-        presence = torch.cat([look.presence for look in looks])
-        return cls(type(inner[0]).join(inner), presence, torch.cat([look.target for look in looks]), looks[0].grid)
 
 
 @dataclass(frozen=True)
@@ -77,13 +65,6 @@ class ContextBelief(Belief):
     def presence(self, target: int | Tensor) -> Tensor:
         """Probability of the inner observer: context changes where the target is, not whether it is there."""
         return self.inner.presence(target)
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "ContextBelief":
-        """Apply a function to every tensor of the belief and of the inner belief."""
-        inner = self.inner.map(function)
-        return ContextBelief(
-            function(self.present), function(self.following), function(self.closest), inner, function(self.scores)
-        )
 
 
 class Context(Observer):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,22 +39,6 @@ class EvidenceLook(Look):
     target: Tensor
     columns: int
 
-    def __getitem__(self, index: Tensor | slice) -> Self:
-        """The selected looks of the batch."""
-        chosen: dict[str, Any] = {name: tensor[index] for name, tensor in self._tensors().items()}
-        return replace(self, **chosen)
-
-    @classmethod
-    def join(cls, looks: Sequence[Self]) -> Self:
-        """Concatenate several batches of looks."""
-        names = looks[0]._tensors()
-        joined: dict[str, Any] = {name: torch.cat([getattr(look, name) for look in looks]) for name in names}
-        return replace(looks[0], **joined)
-
-    def _tensors(self) -> dict[str, Tensor]:
-        """All attributes except the number of columns, which is the same for all looks."""
-        return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "columns"}
-
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
@@ -79,10 +63,6 @@ class GatheredBelief(Belief, ABC):
     score: Tensor
     looks: Tensor
     visited: Tensor
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """Apply a function to every tensor of the belief."""
-        return replace(self, **{each.name: function(getattr(self, each.name)) for each in fields(self)})
 
 
 class Gatherer(Observer):

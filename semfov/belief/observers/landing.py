@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,15 +32,6 @@ class LandingLook(Look):
     evidence: Tensor
     distance: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> LandingLook:
-        """The selected looks of the batch."""
-        return LandingLook(self.evidence[index], self.distance[index])
-
-    @classmethod
-    def join(cls, looks: Sequence[LandingLook]) -> LandingLook:
-        """Concatenate several batches of looks."""
-        return cls(torch.cat([look.evidence for look in looks]), torch.cat([look.distance for look in looks]))
-
 
 @dataclass(frozen=True)
 class LandingBelief(Belief):
@@ -66,10 +56,6 @@ class LandingBelief(Belief):
     def probability(self, target: int | Tensor) -> Tensor:
         """The evidence for the target in each cell, `(B, X·Y)`."""
         return pick(self.class_probabilities(), torch.as_tensor(target))
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> LandingBelief:
-        """Apply a function to every tensor of the belief."""
-        return LandingBelief(function(self.evidence), function(self.closest))
 
 
 class Landing(Observer):

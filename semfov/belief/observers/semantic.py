@@ -47,10 +47,6 @@ class SemanticLook(Look):
     footprint: Tensor
     distance: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> "SemanticLook":
-        """The selected looks of the batch."""
-        return SemanticLook(self.likelihood[index], self.footprint[index], self.distance[index])
-
     @classmethod
     def join(cls, looks: Sequence["SemanticLook"]) -> "SemanticLook":
         """Concatenate several batches of looks, padded to the largest number of detections."""
@@ -170,9 +166,5 @@ class Semantic(Observer):
         return torch.where(nothing[..., None], unseen, fused)
 
     def extra_repr(self) -> str:
-        """Settings for the `repr` of the module.
-
-        Returns:
-            Prior, fusion rule, footprint and tempering.
-        """
+        """Prior, fusion rule, footprint and tempering."""
         return f"prior={self.prior:g}, fusion={self.fusion}, footprint={self.footprint}, tempering={self.tempering:g}"

@@ -122,25 +122,6 @@ def sequence(looks):
         yield looks[index], FIXATIONS[index]
 
 
-def run(observer, looks, rows=slice(None)):
-    count = len(range(4)[rows])
-    belief = observer.start(count, GRID, looks.scores)
-    for seen, fixation in sequence(looks):
-        belief = observer(belief, seen[rows], fixation[rows], GRID)
-    return belief
-
-
-def test_belief_does_not_depend_on_the_order_of_looks_at_different_cells(random_looks, toy_map):
-    looks, observer = random_looks(dtype=torch.float64), LearnedMap(toy_map().double())
-    distance = torch.cdist(GRID.centres.double(), FIXATIONS.double())
-    clear = distance.sort(-1).values.diff().abs()[:, 0] > 1e-6  # cells equally far from two looks keep the first
-    with torch.no_grad():
-        one, other = believe(observer, looks, (0, 1, 3)), believe(observer, looks, (3, 0, 1))
-    for name in ("best", "total", "weight", "score", "closest", "looks"):
-        torch.testing.assert_close(getattr(one, name), getattr(other, name))
-    torch.testing.assert_close(one.nearest[..., clear], other.nearest[..., clear])
-
-
 def test_several_classes_share_a_cell():
     """A cup on a table: the cell holds both, and neither lowers the probability of the other."""
     observer, cell = LearnedMap(small.score_evidence(MapEvidence)), 9
@@ -166,25 +147,6 @@ def test_several_classes_share_a_cell():
     assert float(belief.probabilities[0, 23, 0]) > 0.9
 
 
-def test_gradients_through_the_scores(toy_map):
-    """Two looks of two episodes at a grid of 3 × 2, on a tiny model."""
-    model, grid = toy_map(components=3, widths=(3, 3)).double().requires_grad_(False), Grid(3, 2, (30, 20))
-    generator = torch.Generator().manual_seed(0)
-    boxes = torch.tensor([[1.0, 2, 17, 18], [12, 1, 29, 13]]).double().expand(2, 2, 4)
-    scores = (2 * torch.randn(2, 2, 2, 3, generator=generator).double()).softmax(-1)
-    mask = torch.tensor([[True, True], [True, False]])
-    fixations = grid.centres[[0, 4]].double()
-
-    def map_of(scores):
-        observer = LearnedMap(model)
-        belief = observer.start(2, grid, scores)
-        for look in range(2):
-            belief = observer(belief, Detections(boxes, scores[look], mask), fixations.roll(look, 0), grid)
-        return belief.probabilities, belief.total
-
-    assert torch.autograd.gradcheck(map_of, scores.requires_grad_(), fast_mode=True)
-
-
 def test_gradients_reach_every_parameter(random_looks, toy_map):
     model = toy_map().double()
     looks = random_looks(dtype=torch.float64)
@@ -199,40 +161,6 @@ def test_gradients_reach_every_parameter(random_looks, toy_map):
         assert float(parameter.grad.abs().sum()) > 0, name
     # In the prior only the classes have gradients: background has none.
     assert model.prior.grad.nonzero()[:, 0].tolist() == [1, 2, 3, 4]
-
-
-def test_the_prior_of_a_class_changes_only_that_class_and_background(random_looks, toy_map):
-    """It changes the odds of its own class and of an empty cell, but of no other class."""
-    looks, model = random_looks(), toy_map()
-    with torch.no_grad():
-        before = believe(LearnedMap(model), looks, (0, 1)).probabilities
-        model.prior[3] += 2
-        after = believe(LearnedMap(model), looks, (0, 1)).probabilities
-    same = torch.isclose(before, after, rtol=0, atol=0).all(1)[0]
-    assert same.tolist() == [False, True, True, False, True]
-
-
-@pytest.mark.slow
-def test_a_look_compiles_to_one_graph_and_vectorises(random_looks, toy_map):
-    """A whole look is one graph without breaks; it computes the same as the eager code."""
-    looks, observer = random_looks(), LearnedMap(toy_map().requires_grad_(False))
-
-    def look(boxes, scores, mask, fixation):
-        belief = observer.start(4, GRID, scores)
-        belief = observer(belief, Detections(boxes, scores, mask), fixation, GRID)
-        belief = observer(belief, Detections(boxes.flip(0), scores.flip(0), mask), fixation.flip(0), GRID)
-        return belief.probabilities, belief.nearest
-
-    rows = looks.boxes, looks.scores, looks.mask, FIXATIONS
-    torch.compiler.reset()
-    compiled = torch.compile(look, fullgraph=True, backend="eager")
-    for got, expected in zip(compiled(*rows), look(*rows), strict=True):
-        torch.testing.assert_close(got, expected, atol=1e-5, rtol=1e-4)
-    vectorised = torch.func.vmap(look, in_dims=(None, 0, None, None))(
-        looks.boxes, torch.stack([looks.scores, looks.scores.flip(1)]), looks.mask, FIXATIONS
-    )
-    for got, expected in zip(vectorised, look(*rows), strict=True):
-        torch.testing.assert_close(got[0], expected, atol=1e-5, rtol=1e-4)
 
 
 def test_policies_that_need_a_dirichlet_belief_refuse_the_map(toy_map, random_looks):
