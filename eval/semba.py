@@ -16,11 +16,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
-from semfov.belief.observers.base import Observer
-from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, rollout
+from semfov.episode import Step, rollout
 from semfov.errors import DataError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
@@ -28,7 +25,7 @@ from semfov.io.files import write_text
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.command import run_command
 from semfov.runs.config import BeliefConfig, DetectorConfig, ProtocolConfig, ScenesConfig, SensorConfig
-from semfov.runs.looking import Looking
+from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.remembered import RememberedLooks
@@ -45,15 +42,10 @@ class SembaConfig(ScenesConfig):
     """Search as SemBA does, with both rules of fusion.
 
     Args:
-        data: the photographs to search.
-        detector: the detector.
-        sensor: the sensor.
         belief: the belief; `columns`, `rows` and `prior` are used.
         protocol: the protocol; `shifts`, `ties` and `seed` are used.
         stop: probability of the target in the fixated cell at which a search ends.
         out: folder for the table.
-        cache: folder for the stored detections, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
         workers: ignored; the photographs are searched in this process.
         scheduler: ignored.
     """
@@ -64,18 +56,6 @@ class SembaConfig(ScenesConfig):
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=6))
     stop: Share = 0.1
     out: Path = Path("runs/semba")
-
-
-class _Looks(Looks):
-    """Looks at one photograph from the cells that searches choose, each made once."""
-
-    def __init__(self, looks: RememberedLooks[int, Detections], grid: Grid, like: Tensor) -> None:
-        self.looks, self.grid, self.like = looks, grid, like
-
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Look, or remember, and weigh."""
-        seen = Detections.stack([self.looks(number) for number in cell.tolist()])
-        return Sight(observer.weigh(seen, fixation, self.grid), lambda: seen, {})
 
 
 def search_as_semba(config: SembaConfig) -> None:
@@ -146,7 +126,7 @@ def search_scene(config: SembaConfig, run: Looking, index: int) -> list[Tensor]:
         fixated = torch.zeros(len(targets), shifts + 1, dtype=torch.bool)
         stopped = torch.zeros(len(targets), 2, dtype=torch.bool)
         steps = rollout(
-            _Looks(remembered, grid, image),
+            CellLooks(remembered, grid, image),
             observer,
             lambda episodes, cell: TargetPosterior(targets[episodes]),
             middle.expand(len(targets)),

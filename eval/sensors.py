@@ -101,10 +101,6 @@ class SensorsConfig(ScenesConfig):
         classes: largest number of classes of a photograph that are told present or absent, and as many that it lacks.
         candidates: the sensors to compare, of `CANDIDATES`.
         out: folder for models, records and the table.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     fit: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

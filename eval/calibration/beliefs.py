@@ -16,10 +16,8 @@ from torch import Tensor
 from eval.comparison.run import Run
 from eval.decide.run import landing, seen_on_landing
 from eval.search.config import SearchConfig
-from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Observer, Target
-from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
+from semfov.episode import Step, Stopwatch, rollout
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
@@ -27,6 +25,7 @@ from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import PolicyConfig
+from semfov.runs.looking import CellLooks
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import choose_classes
@@ -128,12 +127,13 @@ class BeliefCalibrationRun(Run):
             noise = noise_for(protocol, len(grid), scene, target, 0)[None]
             goal = covered[annotation.labels == target].any(0)
             with torch.inference_mode():
-                search = self._search(target, start, noise, goal, KnownLooks(detections, grid, target))
+                looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, target)
+                search = self._search(target, start, noise, goal, looks)
             records.append({"scene": scene, "target": target, "present": bool(goal.any()), **search})
         watch.lap("believe")
         return records, watch.seconds
 
-    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: KnownLooks) -> ResultRecord:
+    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: CellLooks) -> ResultRecord:
         most = min(self.config.protocol.shifts + 1, COUNTS[-1])
 
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
@@ -147,25 +147,6 @@ class BeliefCalibrationRun(Run):
             judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
             beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
         return {"seen": seen_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
-
-
-class KnownLooks(Looks):
-    """Precomputed looks at one image from the centres of its cells; likelihoods are computed look by look.
-
-    Args:
-        detections: detections from every cell, a batch of X·Y.
-        grid: the grid over the image.
-        target: the class to search for.
-    """
-
-    def __init__(self, detections: Detections, grid: Grid, target: int) -> None:
-        self.detections, self.grid, self.target = detections, grid, target
-        self.like = detections.scores
-
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """The precomputed looks from `cell`; the fixations are the centres of the cells."""
-        detections = self.detections[cell]
-        return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
 
 
 def judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:

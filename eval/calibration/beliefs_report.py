@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,14 +11,13 @@ import torch
 from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
-from eval.comparison.summary import MANIFEST, manifest, sensing
+from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TOLD, landing_cells
 from semfov.errors import DataError
-from semfov.io.files import write_text
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
-from semfov.runs.tables import table
+from semfov.runs.tables import csv_text, table
 from semfov.viz import plot_cell_reliability
 from semfov.viz.style import save_figure
 
@@ -49,13 +46,12 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     text = beliefs_summary(records, sums, run)
     files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
     files[MANIFEST] = manifest(run, "eval.calibration", seconds)
-    for name, content in files.items():
-        write_text(run.config.out / name, content)
+    written = write_texts(run.config.out, files)
     groups = (
         f"distance from the closest fixation, as a fraction of the longer side, after {judged_after(sums)[-1]} looks"
     )
     figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
-    return text, [*(run.config.out / name for name in files), figure]
+    return text, [*written, figure]
 
 
 def add_up(records: Iterable[ResultRecord]) -> Sums:
@@ -143,13 +139,13 @@ def landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
 
 def beliefs_csv(sums: Sums) -> str:
     """All measures as CSV: a row for each belief, number of looks and group of cells."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"])
+    rows: list[list[object]] = [
+        ["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"]
+    ]
     for belief, looks, group, each in sums_by_name(sums):
         values = each.nll, each.brier, each.ece, each.probability, each.rate
-        rows.writerow([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
-    return text.getvalue()
+        rows.append([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
+    return csv_text(rows)
 
 
 def beliefs_json(sums: Sums) -> str:

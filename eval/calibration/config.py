@@ -27,8 +27,6 @@ class CalibrationConfig(WorkConfig):
         out: folder for the tables and the figures.
         cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the
             former, the user's cache for the latter).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

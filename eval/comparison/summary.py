@@ -1,12 +1,10 @@
 """Output that all runs share: tables, per-episode records and the manifest."""
 
-import csv
-import io
 import json
 import platform
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,7 +22,7 @@ from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
 from semfov.runs.setup import observation_name, plain
-from semfov.runs.tables import percent
+from semfov.runs.tables import csv_text, percent
 from semfov.version import __version__
 
 _Value = TypeVar("_Value", float, FloatArray)
@@ -87,12 +85,21 @@ def by_scene(values: Iterable[tuple[Any, _Value]]) -> dict[Any, _Value]:
     return {scene: np.mean(group, axis=0) for scene, group in scenes.items()}
 
 
+def write_texts(folder: Path, files: Mapping[str, str]) -> list[Path]:
+    """Write texts by the names of their files into a folder; returns the paths."""
+    for name, text in files.items():
+        write_text(inside(folder, name), text)
+    return [folder / name for name in files]
+
+
 def write_summary(out: Path, name: str, text: str, records: list[ResultRecord]) -> list[Path]:
     """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
-    files = {f"{name}.md": text, "records.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
-    for file, content in files.items():
-        write_text(out / file, content)
-    return [out / file for file in files]
+    return write_texts(out, {f"{name}.md": text, "records.jsonl": json_lines(records)})
+
+
+def json_lines(records: Iterable[ResultRecord]) -> str:
+    """Records as JSON, one in a line."""
+    return "".join(json.dumps(record) + "\n" for record in records)
 
 
 def write_files(
@@ -101,17 +108,17 @@ def write_files(
     tables: dict[str, str],
     records: list[ResultRecord],
     seconds: dict[str, float],
+    config: Any = None,
 ) -> list[Path]:
-    """Write tables (text by file name), records, settings and manifest; returns the paths of all files."""
+    """Write tables (text by file name), records, settings (None: the run's own) and manifest; returns the paths."""
+    config = run.config if config is None else config
     files = {
         **tables,
-        "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
-        "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
+        "episodes.jsonl": json_lines(records),
+        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
         MANIFEST: manifest(run, program, seconds),
     }
-    for name, text in files.items():
-        write_text(inside(run.config.out, name), text)
-    return [run.config.out / name for name in files]
+    return write_texts(config.out, files)
 
 
 def announce(summary: str, written: Iterable[Path]) -> None:
@@ -123,26 +130,16 @@ def announce(summary: str, written: Iterable[Path]) -> None:
 
 
 def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
-    """The curves as CSV, with one row for each average, policy and number of gaze shifts.
-
-    Args:
-        curves: curves by average and policy.
-        head: column headings of the averages and of the values.
-
-    Returns:
-        The text of the CSV file.
-    """
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
+    """The curves by average and policy as CSV, a row for each number of shifts; `head` names averages and values."""
     average, value = head
     errors = ["error_over_images", "error_over_repetitions"]
-    rows.writerow([average, "policy", "shifts", value, *errors, "images", "episodes"])
+    rows: list[list[object]] = [[average, "policy", "shifts", value, *errors, "images", "episodes"]]
     for average, policies in curves.items():
         for policy, curve in policies.items():
             for shift in range(len(curve.mean)):
                 figures = (f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions))
-                rows.writerow([average, policy, shift, *figures, curve.images, curve.episodes])
-    return text.getvalue()
+                rows.append([average, policy, shift, *figures, curve.images, curve.episodes])
+    return csv_text(rows)
 
 
 def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:

@@ -34,14 +34,7 @@ FREQUENCY = "class frequency"
 
 
 def class_frequencies(scenes: Scenes) -> list[Tensor]:
-    """For each scene, the share of the other scenes that hold each class, `(K+1,)`; 0 for background.
-
-    Args:
-        scenes: the scenes.
-
-    Returns:
-        The shares by index of the scene.
-    """
+    """For each scene, the share of the other scenes that hold each class, `(K+1,)`; 0 for background."""
     held = torch.zeros(len(scenes), len(scenes.classes) + 1, dtype=torch.float64)
     for index in range(len(scenes)):
         held[index, scenes.annotation(index).labels] = 1
@@ -99,14 +92,7 @@ class Telling:
         return spanned(self.figures.value[way, -1], *self.figures.interval()[:, way, -1], digits=1)
 
     def differences(self, name: str) -> list[str]:
-        """Table of the differences of all ways to one of them, paired over the searches.
-
-        Args:
-            name: the way that is subtracted.
-
-        Returns:
-            Lines of Markdown.
-        """
+        """Table of the differences of all ways to one of them, paired over the searches."""
         apart = self.figures.less(self.names.index(name))
         heads = [*TELLING, *(["place right"] if self.places else [])]
         rows = [[f"difference to {name}", *heads]]

@@ -70,15 +70,7 @@ class ThresholdEyes:
         return self._eye.open(image)
 
     def look(self, view: View, fixation: Tensor) -> list[Detections]:
-        """Look from one fixation; returns the detections at each threshold, batches of one without padding.
-
-        Args:
-            view: the opened image.
-            fixation: `(1, 2)`, in pixels of the image.
-
-        Returns:
-            The detections, in the order of the thresholds.
-        """
+        """Look from one fixation `(1, 2)`; returns detections at each threshold, batches of one without padding."""
         canvas = self._eye.foveated(view, fixation)
         candidates = self._eye.detector.propose(canvas)
         found = []
@@ -93,14 +85,10 @@ class ThresholdLooksConfig(ScenesConfig):
     """Look at scenes from every cell, and store the looks for each of several score thresholds.
 
     Args:
-        data: the scenes.
         detector: the detector; `thresholds` replace its threshold.
-        sensor: the foveal sensor.
         belief: the belief; its columns and rows are the cells.
         out: folder in which finished scenes are noted.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: must be true.
-        workers: number of processes (None: one per CPU core).
         thresholds: the score thresholds.
     """
 

@@ -16,9 +16,6 @@ class DecideConfig(ScenesConfig):
     """Search for present and for absent classes, each until a decision.
 
     Args:
-        data: the scenes to search.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
         belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
         protocol: the protocol; `shifts` and `seed` are used.
         confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
@@ -31,10 +28,6 @@ class DecideConfig(ScenesConfig):
         verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
             one that is shipped for detector and sensor, if there is one).
         out: folder for tables, records and the figure.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
             verification.
     """

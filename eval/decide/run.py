@@ -291,14 +291,7 @@ LANDINGS_TOLD = (
 
 
 def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
-    """Cells of a table row: number of landings and mean probabilities before and after, of all, seen, and not seen.
-
-    Args:
-        landed: for each landing, the probabilities before and after it (`landing`), and whether the target was seen.
-
-    Returns:
-        The cells under the headings `LANDINGS`.
-    """
+    """Cells under `LANDINGS`: number and mean probabilities before and after, of all landings, seen, and not seen."""
     cells: list[str] = []
     for group in (landed, [each for each in landed if each[1]], [each for each in landed if not each[1]]):
         means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]

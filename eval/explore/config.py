@@ -13,12 +13,6 @@ class ExploreConfig(RunConfig):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:
-        data: the scenes to explore.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief, a grid of class distributions.
-        saliency: the saliency baselines.
-        protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
             (kl-calibrated); and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
@@ -27,11 +21,6 @@ class ExploreConfig(RunConfig):
             `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
             `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
-        models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
     """
 
     task: ClassVar[Task] = "exploration"

@@ -73,8 +73,6 @@ class HeadConfig(WorkConfig):
         out: folder for tables, records and figures.
         cache: folder for the stored looks, shared between runs (None: the user's cache).
         store: keep looks on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

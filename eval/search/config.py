@@ -12,12 +12,6 @@ class SearchConfig(RunConfig):
     """Visual search: find a target class by moving a fovea, and count the gaze shifts that this takes.
 
     Args:
-        data: the scenes to search.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief, a grid of class distributions.
-        saliency: the saliency baselines.
-        protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
             `published` (predictive-calibrated), `target-evidence`, `ivsn`, `random`, `vocus2`, `itti-koch`;
@@ -27,12 +21,7 @@ class SearchConfig(RunConfig):
             `maximum-a-posteriori-learned` is `target-evidence` itself.
         templates: class templates of `ivsn`, by name or file (None: those shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         scanpaths: number of episodes to draw as figures.
-        models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
     """
 
     policies: tuple[str | PolicyConfig, ...] = (

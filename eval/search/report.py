@@ -69,12 +69,13 @@ def search_report(run: SearchRun, *, pictures: bool = True) -> None:
 
 def performance(records: list[ResultRecord], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
     """Cumulative performance of each policy, over all targets or over the commonest target of each image."""
-    measure = partial(_found, shifts=shifts)
+    measure = partial(found, shifts=shifts)
     counted = [record for record in records if record["commonest"] or average == "all targets"]
     return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
 
 
-def _found(record: ResultRecord, shifts: int) -> FloatArray:
+def found(record: ResultRecord, shifts: int) -> FloatArray:
+    """Whether a search has found its target after 0, 1, … gaze shifts."""
     return cumulative_performance(np.array([record["found_at"]]), shifts)
 
 

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from eval.comparison.summary import MANIFEST, Curve, announce, collect_records, curve_of, manifest, sensing
+from eval.comparison.summary import Curve, announce, collect_records, curve_of, sensing, write_files
 from eval.search.config import SearchConfig
+from eval.search.report import found
 from eval.search.run import SearchRun
 from semfov.belief import ContextPrior
 from semfov.belief.look_features import highest_score
 from semfov.errors import DataError, check
-from semfov.io.files import clean, inside, write_text
-from semfov.metrics.averages import FloatArray
-from semfov.metrics.search import cumulative_performance
+from semfov.io.files import clean, inside
 from semfov.runs.config import ContextKind, PolicyConfig, ProtocolConfig, ScenesConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Seed, Share, Weight
-from semfov.runs.setup import plain
 from semfov.runs.tables import table
 
 _SHIFTS = (1, 3, 5, 10, 30)
@@ -35,10 +31,6 @@ class WordsConfig(ScenesConfig):
     """Search without context, with context counted from annotations, and with context from tables, each with a control.
 
     Args:
-        data: the scenes to search.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief, a grid of class distributions.
         protocol: the protocol of the experiment.
         policy: the policy to which context is added: `target-evidence`, or a mapping such as `{policy: non-predictive,
             tempering: 0.25, footprint: box_centre}`.
@@ -49,10 +41,6 @@ class WordsConfig(ScenesConfig):
         permuted: random seed of the control, in which the classes of each table are permuted.
         missed: the first look counts as missing the target if the target's highest score in it is below this.
         out: folder for tables, per-episode records and the manifest.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
@@ -93,15 +81,7 @@ def words(config: WordsConfig) -> None:
     for record in records:
         record["arm"] = named[record.pop("policy")]
     text = "\n".join([f"{sensing(run)}, context: {config.context}", "", *outcome_tables(records, list(arms), config)])
-    files = {
-        "words.md": text,
-        "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
-        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
-        MANIFEST: manifest(run, "eval.words", seconds),
-    }
-    for name, content in files.items():
-        write_text(config.out / name, content)
-    announce(text, [config.out / name for name in files])
+    announce(text, write_files(run, "eval.words", {"words.md": text}, records, seconds, config))
 
 
 def arms_of(config: WordsConfig) -> dict[str, PolicyConfig]:
@@ -172,11 +152,6 @@ def differences(records: Sequence[ResultRecord], arm: str, shifts: int) -> Curve
 
 def _search(record: ResultRecord) -> tuple[object, ...]:
     return record["scene"], record["target"], record["repetition"]
-
-
-def found(record: ResultRecord, shifts: int) -> FloatArray:
-    """Whether a search has found its target after 0, 1, … gaze shifts."""
-    return cumulative_performance(np.array([record["found_at"]]), shifts)
 
 
 def signed(value: float, error: float) -> str:

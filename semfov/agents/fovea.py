@@ -43,7 +43,9 @@ Start = int | tuple[int, int] | None
 
 @dataclass(frozen=True)
 class FoveaAgent:
-    """An agent that moves its gaze over a photograph.
+    """An agent that moves its gaze over a photograph `(1, 3, H, W)`.
+
+    The arguments of its methods are those of `ActivePerception`, which makes it.
 
     Args:
         eye: sensor and detector.
@@ -83,23 +85,7 @@ class FoveaAgent:
         give_up: float | None = None,
         closer: int = 0,
     ) -> Scanpath:
-        """Search a photograph for a target, and decide whether it is there; see `ActivePerception.search`.
-
-        Args:
-            image: `(1, 3, H, W)`.
-            target: a class by name or index, or several with weights.
-            limits: limits of the episode.
-            start: first cell.
-            shifts: largest number of gaze shifts.
-            seed: of the generator that draws the start and breaks ties.
-            boxes: `(M, 4)`, true boxes of the target that end the search.
-            confirm: least probability for `found`; None takes that of the model.
-            give_up: probability below which a cell is not worth a look; None takes that of the model.
-            closer: largest number of closer looks.
-
-        Returns:
-            The scanpath, with its decision.
-        """
+        """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`)."""
         strategy, index, wanted = self.searching.sought(target, self.classes)
         grid = self.grid(image)
         goal = None if boxes is None else goal_cells(boxes, grid, image)
@@ -142,22 +128,7 @@ class FoveaAgent:
         seed: int = 0,
         worth: float | None = None,
     ) -> Scanpath:
-        """Explore a photograph; see `ActivePerception.explore`.
-
-        Args:
-            image: `(1, 3, H, W)`.
-            limits: limits of the episode.
-            start: first cell.
-            shifts: largest number of gaze shifts.
-            seed: of the generator that draws the start and breaks ties.
-            worth: least expected increase in the number of correctly classified cells for which a look is worth it.
-
-        Returns:
-            The scanpath, without target and decision.
-
-        Raises:
-            InputError: `worth` is given, and the agent has no learned map.
-        """
+        """Explore a photograph, without a target (`ActivePerception.explore`)."""
         grid, observer, outcome = self.grid(image), self.exploring.observer, None
         if isinstance(observer, LearnedMap):
             outcome = outcome_by_gain(ExpectedGain(observer.model, grid), WORTH if worth is None else worth)
@@ -170,17 +141,7 @@ class FoveaAgent:
         return replace(scanpath, ending="worth") if ended else scanpath
 
     def find_all(self, image: Tensor, targets: tuple[int, ...], limits: EpisodeLimits, *, shifts: int = 20) -> Scanpath:
-        """Look for all objects of some classes, or of all classes; see `ActivePerception.find_all`.
-
-        Args:
-            image: `(1, 3, H, W)`.
-            targets: classes 1..K; none stand for all classes.
-            limits: limits of the episode.
-            shifts: largest number of gaze shifts.
-
-        Returns:
-            The scanpath, without a decision.
-        """
+        """Look for all objects of classes 1..K; none stand for all classes (`ActivePerception.find_all`)."""
         one = targets[0] if len(targets) == 1 else None
         strategy = self.exploring if one is None else self.searching
         episode = _Episode(self, image, self.grid(image), strategy, one, limits, None, None)

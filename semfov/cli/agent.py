@@ -62,15 +62,7 @@ def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str
 
 
 def one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
-    """The class that a text names; None for none.
-
-    Args:
-        text: the text.
-        classes: names of the detector's classes; None does not check it.
-
-    Returns:
-        Its name.
-    """
+    """The class that a text names, None for none; without names of classes it is not checked."""
     if text is None or classes is None:
         return text
     return classes[class_index(text, classes, "target") - 1]

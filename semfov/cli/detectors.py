@@ -25,14 +25,7 @@ PURPOSES: dict[str, type[Pretrained]] = {
 
 
 def list_detectors(options: DetectorsOptions) -> int:
-    """List the detectors, or the classes of one.
-
-    Args:
-        options: the options.
-
-    Returns:
-        The exit code.
-    """
+    """List the detectors, or the classes of one."""
     if options.name is not None:
         name = fspath(options.name)
         folder = options.name.is_dir()

@@ -74,14 +74,7 @@ class PictureJob(ABC):
         """Look at a picture, with the arguments that all subcommands share, and return the record."""
 
     def outcome(self, number: int) -> PictureOutcome | SemfovError:
-        """Look at a picture and make what is wanted of it; an error says why it cannot be looked at.
-
-        Args:
-            number: number of the picture.
-
-        Returns:
-            The outcome, or the error.
-        """
+        """Look at the picture of this number and make what is wanted of it, or return the error that prevents it."""
         source, began = self.sources[number], time.perf_counter()
         try:
             with torch.inference_mode():

@@ -62,16 +62,7 @@ def open_live(options: LiveOptions) -> Stream:
 
 
 def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
-    """Look at every frame and print detections and belief; Ctrl-C ends it in good order.
-
-    Args:
-        live: the running agent.
-        stream: the frames.
-        path: video to write, with any suffix, or a folder for it; None writes none.
-
-    Returns:
-        The path of the video.
-    """
+    """Look at every frame, print detections and belief until Ctrl-C, and return the path of the video, if any."""
     if path is not None:
         path = (path / "live" if path.is_dir() or not path.suffix else path).with_suffix(video_suffix())
     rate = FrameRate()
@@ -91,14 +82,7 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
 
 
 def moment_line(moment: Moment) -> str:
-    """Detections and belief at a frame, as one line.
-
-    Args:
-        moment: the frame.
-
-    Returns:
-        The line.
-    """
+    """Detections and belief at a frame, as one line."""
     if isinstance(moment, WindowMoment):
         x, y, magnification = moment.window.fixation
         look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {magnification:.2f}: "

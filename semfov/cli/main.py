@@ -38,22 +38,10 @@ class Subcommand:
     goes_on: str = ""
 
 
-def _search(options: Any) -> int:
-    from semfov.cli.search import search_pictures
+def _pictures(options: Any) -> int:
+    from semfov.cli.search import look_at
 
-    return search_pictures(options)
-
-
-def _find(options: Any) -> int:
-    from semfov.cli.search import find_objects
-
-    return find_objects(options)
-
-
-def _explore(options: Any) -> int:
-    from semfov.cli.search import explore_pictures
-
-    return explore_pictures(options)
+    return look_at(options)
 
 
 def _live(options: Any) -> int:
@@ -84,9 +72,9 @@ _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none:
 _MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
 SUBCOMMANDS: dict[str, Subcommand] = {
-    "search": Subcommand(texts.SEARCH, lambda: SearchOptions, _search, _PICTURES),
-    "find": Subcommand(texts.FIND, lambda: FindOptions, _find, _PICTURES),
-    "explore": Subcommand(texts.EXPLORE, lambda: ExploreOptions, _explore, _PICTURES),
+    "search": Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
+    "find": Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
+    "explore": Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
     "live": Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
     "fit": Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
     "detectors": Subcommand(
@@ -118,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("--help", "-h", "--help-all"):
         print(texts.OVERVIEW, end="")
         return 0
-    refused = _of_other_commands(SUBCOMMANDS[name], rest) if name in SUBCOMMANDS else _unknown(name, rest)
+    refused = _of_other_commands(SUBCOMMANDS[name], rest) if name in SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
@@ -137,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(command.run, options, command.text, rest, words=words, **names)
 
 
-def _unknown(name: str, rest: Sequence[str]) -> str:
+def _unknown(name: str) -> str:
     """What to type instead of a name that is no subcommand."""
     if Path(name).exists():
         return f"expected a command before {name!r}; try `semfov search {name} --target CLASS`"

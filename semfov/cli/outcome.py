@@ -99,17 +99,7 @@ def picture_outcome(
 def draw_episode(
     record: GazeRecord, boxes: Tensor | None, views: list[Tensor], wanted: Sequence[Drawing]
 ) -> dict[str, bytes]:
-    """Draw the wanted figures and the animation of an episode.
-
-    Args:
-        record: the record.
-        boxes: true boxes of the target, if they are known.
-        views: foveated views of a scanpath.
-        wanted: names of the figures; those that a record of this kind has not are left out.
-
-    Returns:
-        The files by name.
-    """
+    """Draw those wanted figures and the animation that a record of this kind has; returns the files by name."""
     if not wanted:
         return {}
     figures: dict[str, Callable[[], Any]] = {"scanpath": record.plot}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -15,42 +16,6 @@ from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check
 from semfov.paths import GazeRecord
-
-
-def search_pictures(options: SearchOptions) -> int:
-    """Search pictures for a class.
-
-    Args:
-        options: the options.
-
-    Returns:
-        The exit code.
-    """
-    return look_at_pictures(SearchJob(options))
-
-
-def find_objects(options: FindOptions) -> int:
-    """Find all objects in pictures.
-
-    Args:
-        options: the options.
-
-    Returns:
-        The exit code.
-    """
-    return look_at_pictures(FindJob(options))
-
-
-def explore_pictures(options: ExploreOptions) -> int:
-    """Explore pictures.
-
-    Args:
-        options: the options.
-
-    Returns:
-        The exit code.
-    """
-    return look_at_pictures(ExploreJob(options))
 
 
 class SearchJob(PictureJob):
@@ -132,6 +97,18 @@ class ExploreJob(PictureJob):
         """Explore a picture."""
         given = {name: getattr(self.options, name) for name in ("seed", "worth", "least")}
         return self.agent.explore(picture, start=self.start, **given, **shared)
+
+
+_JOBS: dict[type[PictureOptions], Callable[[Any], PictureJob]] = {
+    SearchOptions: SearchJob,
+    FindOptions: FindJob,
+    ExploreOptions: ExploreJob,
+}
+
+
+def look_at(options: PictureOptions) -> int:
+    """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
+    return look_at_pictures(_JOBS[type(options)](options))
 
 
 def _check(options: PictureOptions) -> Any:

@@ -75,16 +75,7 @@ def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
 
 
 def start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
-    """A random first cell off the target of an embedded scene; None for other pictures.
-
-    Args:
-        agent: the agent.
-        source: the picture.
-        seed: seed of the draw.
-
-    Returns:
-        The number of the cell.
-    """
+    """A random first cell off the target of an embedded scene; None for other pictures."""
     if source.scene is None or source.boxes is None:
         return None
     grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))

@@ -15,16 +15,7 @@ OBJECTS_LISTED = 20
 
 
 def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
-    """Say what was found where, with what, and in how many passes and seconds.
-
-    Args:
-        record: the record.
-        name: name of the picture.
-        seconds: time that it took.
-
-    Returns:
-        Lines of text.
-    """
+    """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
     lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
@@ -42,15 +33,7 @@ def _headline(record: GazeRecord) -> str:
 
 
 def decision_text(record: GazeRecord, decision: Decision) -> str:
-    """Say whether the target was found, and where.
-
-    Args:
-        record: the record of a search.
-        decision: its decision.
-
-    Returns:
-        The text.
-    """
+    """Say whether the target was found, and where."""
     name, probability = record.target_name, f"probability {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
@@ -83,14 +66,7 @@ def found_place(
 
 
 def objects_lines(record: GazeRecord) -> list[str]:
-    """A line for each of the most confident objects.
-
-    Args:
-        record: the record.
-
-    Returns:
-        The lines.
-    """
+    """A line for each of the most confident objects."""
     rows = record.object_rows()
     lines = [
         f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
@@ -118,14 +94,7 @@ def box_text(box: Sequence[float]) -> str:
 
 
 def regions_lines(scanpath: Scanpath) -> list[str]:
-    """A line for each class that the final map of an exploration names, with its most probable cell.
-
-    Args:
-        scanpath: the exploration.
-
-    Returns:
-        The lines.
-    """
+    """A line for each class that the final map of an exploration names, with its most probable cell."""
     parts: dict[str, list[int]] = {}
     for label, cells, _ in named_regions(scanpath):
         parts.setdefault(label, []).extend(cells)
@@ -139,14 +108,7 @@ def regions_lines(scanpath: Scanpath) -> list[str]:
 
 
 def looks_text(record: GazeRecord) -> str:
-    """The looks as a table: where, which part of the picture, what was detected, and how long it took.
-
-    Args:
-        record: the record.
-
-    Returns:
-        Lines of text.
-    """
+    """The looks as a table: where, which part of the picture, what was detected, and how long it took."""
     width, height = record.size
     rows = [["look", "at (x, y)", "shows", "detections", "value", "ms"]]
     for look in record:

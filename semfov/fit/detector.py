@@ -153,16 +153,7 @@ def _tell(counts: dict[str, int]) -> None:
 
 
 def manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> Manifest:
-    """Build the manifest of the model folder.
-
-    Args:
-        config: the settings.
-        run: the finished looks.
-        folder: the fitted parts.
-
-    Returns:
-        The manifest.
-    """
+    """Build the manifest of the model folder."""
     detector = run.eye.detector
     options = plain(detector_options(config.detector))
     weights = options.pop("weights", None)

@@ -17,16 +17,7 @@ from semfov.runs.tables import percent, table
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
-    """Format a paired difference with its standard error and number of photographs.
-
-    Args:
-        gain: the difference.
-        unit: unit to print after the number.
-        scale: factor from the difference to that unit.
-
-    Returns:
-        The text.
-    """
+    """Format a paired difference, times `scale`, with its unit, its standard error and its number of photographs."""
     digits = 1 if scale > 1 else 3
     return (
         f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
@@ -83,17 +74,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
 
 
 def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, PartResult], seconds: float) -> str:
-    """Write the report as Markdown.
-
-    Args:
-        config: the settings.
-        run: the finished looks.
-        parts: the fitted parts by their names.
-        seconds: duration of this run.
-
-    Returns:
-        The text.
-    """
+    """Write the report as Markdown."""
     photographs = len(run.scenes)
     holdout = config.observation.holdout
     held_out = [index for index in range(photographs) if index % holdout == 0]
@@ -128,15 +109,7 @@ def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Pa
 
 
 def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
-    """Write warnings about classes with few objects to learn from.
-
-    Args:
-        counts: objects of each class in the training photographs.
-        thin: a class with fewer objects is listed.
-
-    Returns:
-        Lines of Markdown.
-    """
+    """Write warnings, as lines of Markdown, about classes with fewer than `thin` objects to learn from."""
     none = [name for name, count in counts.items() if count == 0]
     few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
     lines = []

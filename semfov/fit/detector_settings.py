@@ -47,8 +47,6 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         thin: the report lists classes with fewer objects than this in the training photographs.
         out: folder to write the models to.
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
-        workers: number of processes that look (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     model: Path | None = None

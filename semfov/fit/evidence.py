@@ -66,15 +66,7 @@ def fit_search(config: FitSearchConfig) -> None:
 
 
 def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
-    """Fit the model and its thresholds.
-
-    Args:
-        config: the settings.
-        run: the finished looks from every cell.
-
-    Returns:
-        The model with its evaluation.
-    """
+    """Fit the model and its thresholds."""
     examples = make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
@@ -172,17 +164,7 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
 def judge_evidence(
     config: FitSearchConfig, model: TargetEvidence, examples: TargetExamples, grid: Grid
 ) -> tuple[list[dict[str, float]], Thresholds]:
-    """Evaluate the model on held-out searches and choose its thresholds.
-
-    Args:
-        config: the settings.
-        model: the target evidence.
-        examples: the held-out examples.
-        grid: the grid of cells.
-
-    Returns:
-        The measures after each number of looks in `JUDGED`, and the thresholds.
-    """
+    """Evaluate the model on held-out searches, after each number of looks in `JUDGED`, and choose its thresholds."""
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []

@@ -58,15 +58,7 @@ def fit_map(config: FitMapConfig) -> None:
 
 
 def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
-    """Fit the model.
-
-    Args:
-        config: the settings.
-        run: the finished looks from every cell.
-
-    Returns:
-        The model with its evaluation.
-    """
+    """Fit the model."""
     examples = make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
@@ -186,17 +178,7 @@ def right(step: Step, answers: Tensor) -> Tensor:
 
 @torch.no_grad()
 def judge_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
-    """Evaluate the model on held-out explorations.
-
-    Args:
-        config: the settings.
-        model: the map evidence.
-        examples: the held-out examples.
-        grid: the grid of cells.
-
-    Returns:
-        The measures after each number of looks in `_JUDGED`.
-    """
+    """Evaluate the model on held-out explorations, after each number of looks in `_JUDGED`."""
     generator = torch.Generator().manual_seed(config.seed)
     judged = []
     answers = examples.answers

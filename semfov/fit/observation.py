@@ -1,7 +1,5 @@
 """Fit a foveal observation model to labelled detections, and report on it."""
 
-import csv
-import io
 import json
 import platform
 import sys
@@ -33,7 +31,7 @@ from semfov.runs.config import WorkConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.setup import plain
-from semfov.runs.tables import table
+from semfov.runs.tables import csv_text, table
 from semfov.runs.zoom_samples import MosaicSettings
 from semfov.version import __version__
 from semfov.viz import plot_reliability
@@ -72,8 +70,6 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
         shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
         out: folder for the model, the report and the figures.
         cache: folder for the labelled detections (None: `out`).
-        workers: number of processes (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
@@ -250,17 +246,7 @@ def write_report(
     models: _Models,
     judged: Samples,
 ) -> list[Path]:
-    """Evaluate the models on held-out samples, print the tables, and write the report.
-
-    Args:
-        config: the settings.
-        model: the fitted model.
-        models: all models to compare, the fitted one last.
-        judged: the held-out detections.
-
-    Returns:
-        The files that were written.
-    """
+    """Evaluate the models (the fitted one last) on held-out samples, print the tables, and write all files."""
     with torch.inference_mode():
         predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
         likelihood = {
@@ -373,12 +359,9 @@ def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tenso
 
 def counts_csv(model: FovealObservationModel) -> str:
     """Write the number of detections of each true class at each level in the fit as CSV."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["class", *(f"level {n}" for n in range(len(model.edges) + 1))])
-    for name, counts in zip(("background", *model.classes), model.metadata["counts"], strict=True):
-        rows.writerow([name, *counts])
-    return text.getvalue()
+    names = ("background", *model.classes)
+    rows = ([name, *counts] for name, counts in zip(names, model.metadata["counts"], strict=True))
+    return csv_text([["class", *(f"level {n}" for n in range(len(model.edges) + 1))], *rows])
 
 
 def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:

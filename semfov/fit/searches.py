@@ -19,10 +19,11 @@ from semfov.data.scene import Scenes
 from semfov.decision import CandidateCells, CandidatePlaces, cell_of, conclude, decide
 from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, rollout
+from semfov.episode import Step, rollout
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
+from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.remembered import RememberedLooks
@@ -60,15 +61,7 @@ class TargetSearch(ABC, Generic[LookType]):
 
     @abstractmethod
     def look(self, index: int, number: int) -> LookType:
-        """Return a look.
-
-        Args:
-            index: index of the look.
-            number: number of looks of both kinds up to it.
-
-        Returns:
-            The look.
-        """
+        """Return the look of this index; `number` looks of both kinds were made up to it."""
 
     @abstractmethod
     def candidates(self) -> CandidatePlaces[LookType]:
@@ -84,15 +77,7 @@ class TargetSearch(ABC, Generic[LookType]):
 
     @abstractmethod
     def last(self, index: int, room: float) -> bool:
-        """Whether no look follows.
-
-        Args:
-            index: index of the look.
-            room: number of looks of both kinds that are left.
-
-        Returns:
-            Whether it is the last one.
-        """
+        """Whether no look follows the one of this index, when `room` looks of both kinds are left."""
 
     @abstractmethod
     def outcome(self, index: int, thresholds: Thresholds) -> int:
@@ -182,24 +167,6 @@ class SearchedPhotograph:
         return self.looks(tuple(box.tolist()))
 
 
-class PhotographLooks(Looks):
-    """Looks at a photograph that are made only once, whatever is searched for.
-
-    Args:
-        photograph: the photograph.
-        target: class 1..K that is searched for.
-    """
-
-    def __init__(self, photograph: SearchedPhotograph, target: int) -> None:
-        self.photograph, self.grid, self.target = photograph, photograph.grid, target
-        self.like = photograph.grid.centres
-
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Look, or remember."""
-        seen = self.photograph.look(int(cell))
-        return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
-
-
 def open_photographs(
     eye: Eye,
     scenes: Scenes,
@@ -261,24 +228,11 @@ def search_photograph(
     target: SearchTarget,
     observer: Observer,
     looks: int,
-    ends: Callable[[Step], Tensor] | None = None,
 ) -> Iterator[Step]:
-    """Search a photograph for a class, where it is most probable.
-
-    Args:
-        photograph: the photograph.
-        target: the class.
-        observer: turns looks into a belief.
-        looks: maximum number of looks.
-        ends: maps a step to a number `(1,)` above 0 that ends the search; None makes all looks.
-
-    Returns:
-        The steps.
-    """
-    source = PhotographLooks(photograph, target.target)
+    """Search a photograph for a class, where it is most probable, in at most `looks` looks."""
+    source = CellLooks(photograph.look, photograph.grid, photograph.grid.centres, target.target)
     choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
-    rule = None if ends is None else lambda step: ends(step) > 0
-    return rollout(source, observer, TargetPosterior(target.target), target.start, choice, most=looks, ends=rule)
+    return rollout(source, observer, TargetPosterior(target.target), target.start, choice, most=looks)
 
 
 class PhotographSearch(TargetSearch[Step]):
@@ -342,17 +296,7 @@ class PhotographSearch(TargetSearch[Step]):
 def photograph_searches(
     seen: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
 ) -> Iterator[PhotographSearch]:
-    """Search photographs for all their classes; after the searches of a photograph, its looks are stored and freed.
-
-    Args:
-        seen: the photographs.
-        evidence: the target evidence.
-        looks: number of looks in a search.
-        title: label of the progress bar.
-
-    Yields:
-        The searches.
-    """
+    """Search photographs for all their classes; after the searches of one, its looks are stored and freed."""
     for photograph in track(seen, title, "photograph"):
         for target in photograph.targets:
             yield PhotographSearch(photograph, target, evidence, looks)

@@ -26,6 +26,7 @@ class FitConfig(OutcomeConfig):
     Args:
         data: photographs to learn from (by default all of them, however many objects they have).
         seed: seed of all random choices.
+        out: folder for the model and the report.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -59,10 +60,7 @@ class FitOnLooksConfig(FovealFitConfig, NameConfig, WorkConfig):
         batch: number of examples in a step.
         rate: highest learning rate.
         seed: seed of the choice of classes, the initial parameters and the training.
-        out: folder for the model and the report.
         cache: folder for the detections from every cell, shared with the evaluations (None: the user's cache).
-        workers: number of processes that look (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))

@@ -45,8 +45,6 @@ class FitTemperingConfig(FovealFitConfig, WorkConfig):
         holdout: one in every n photographs is held out for the evaluation.
         out: folder for the report.
         cache: folder for the labelled detections (None: `out`).
-        workers: number of processes that look (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     calibrated: bool = False

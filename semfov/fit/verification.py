@@ -67,7 +67,6 @@ class FitVerificationConfig(FovealFitConfig, NameConfig):
         false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
         folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
         seed: seed of the choice of classes and of the first fixations.
-        out: folder for the model and the report.
         cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
@@ -228,15 +227,7 @@ def fit_in_folds(
 
 @torch.inference_mode()
 def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLooks | None:
-    """Look closely at the most evident places after some looks of every search.
-
-    Args:
-        searches: the searches.
-        folds: number of parts of the pictures.
-
-    Returns:
-        The closer looks; None if no place is right, or none is wrong.
-    """
+    """Look closely at the most evident places of every search; None if no place is right, or none is wrong."""
     rows: list[tuple[Tensor, bool, bool, int]] = []
     for search in searches:
         if search.spare:
@@ -300,15 +291,7 @@ def verify(
 
 
 def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> SearchEnd:
-    """Decide along the looks of a search without closer looks; nothing is found without thresholds.
-
-    Args:
-        search: the search.
-        thresholds: thresholds of the evidence.
-
-    Returns:
-        The end of the search.
-    """
+    """Decide along the looks of a search without closer looks; nothing is found without thresholds."""
     if thresholds is None:
         return None, len(search)
     for index in range(len(search)):
@@ -319,16 +302,7 @@ def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> Sear
 
 
 def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, surest: float = LEVELS[-1]) -> float:
-    """Choose the least threshold at which few enough absent targets are found.
-
-    Args:
-        searches: the searches.
-        false_alarms: maximum share of absent targets that may be found.
-        surest: upper limit of the threshold.
-
-    Returns:
-        The threshold, from `LEVELS`; `surest` if no smaller one suffices.
-    """
+    """Choose from `LEVELS` the least threshold, at most `surest`, at which few enough absent targets are found."""
     absent = [each for each in searches if not each.present]
     for confirm in LEVELS:
         if sum(each.found(confirm)[0] is not None for each in absent) <= false_alarms * len(absent):

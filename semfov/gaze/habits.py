@@ -119,11 +119,7 @@ class GazeHabits(Pretrained):
         return self.pull * standardised(values) + (self.place + self.step[steps] + back).to(values)
 
     def extra_repr(self) -> str:
-        """Describe the grid for `repr`.
-
-        Returns:
-            Its columns and rows.
-        """
+        """Its columns and rows."""
         return f"columns={self.columns}, rows={len(self.place) // self.columns}"
 
     def _record(self) -> dict[str, Any]:

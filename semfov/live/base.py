@@ -56,11 +56,7 @@ class FramePerception(ABC):
         """
 
     def describe(self) -> str:
-        """What is done in a few words.
-
-        Returns:
-            The words.
-        """
+        """What is done in a few words."""
         wanted = self.targets or (() if self.target is None else (self.target,))
         names = ", ".join(f"“{self.classes[number]}”" for number in wanted)
         if not wanted:

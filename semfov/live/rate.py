@@ -62,11 +62,7 @@ class FrameRate:
         return "warming up" if self.now is None else f"{self.now:.1f} frames/s"
 
     def summary(self) -> str:
-        """Describe the whole stream in words, and say which frames do not count.
-
-        Returns:
-            The words.
-        """
+        """Describe the whole stream in words, and say which frames do not count."""
         frames = f"{self.frames} frame{'' if self.frames == 1 else 's'}"
         if self.mean is None:
             return f"{frames}, all of them while the detector got ready"

@@ -198,18 +198,10 @@ class Record(Conversion):
 
     @abstractmethod
     def describe(self) -> str:
-        """Describe the outcome in one line.
-
-        Returns:
-            The line.
-        """
+        """Describe the outcome in one line."""
 
     def summary(self) -> str:
-        """Describe the outcome, and explain why it ended if it did.
-
-        Returns:
-            A line of text.
-        """
+        """Describe the outcome, and explain why it ended if it did."""
         return self.describe()
 
     def __repr__(self) -> str:

@@ -191,11 +191,7 @@ class HeadPath(GazeRecord):
         return self.views.world.places(seen.boxes[0, kept], self.pose(look)), label[kept], best[kept]
 
     def describe(self) -> str:
-        """Describe the outcome in one line.
-
-        Returns:
-            The line.
-        """
+        """Describe the outcome in one line."""
         looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
         what = self.objects_in_words()

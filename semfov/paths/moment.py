@@ -162,11 +162,7 @@ class FoveaMoment(Moment):
         return merge_fixations([self.detections], [distances], self.closer_looks)
 
     def describe(self) -> str:
-        """Describe belief and decision at the frame in a few words.
-
-        Returns:
-            The words.
-        """
+        """Describe belief and decision at the frame in a few words."""
         highest = float(self.probability.max())
         if self.target is None:
             return f"p(object) up to {highest:.2f}"
@@ -282,11 +278,7 @@ class WindowMoment(ZoomPath, Moment):
         return last if last is not None and last.number == len(self.glances) - 1 else None
 
     def describe(self) -> str:
-        """Describe objects or decision at the frame in a few words.
-
-        Returns:
-            The words.
-        """
+        """Describe objects or decision at the frame in a few words."""
         return self._decided() or self.objects_in_words()
 
     def _lines(self) -> list[str]:

@@ -160,11 +160,7 @@ class ZoomPath(GazeRecord):
         return len(self.glances)
 
     def describe(self) -> str:
-        """Summarise the result.
-
-        Returns:
-            A line of text.
-        """
+        """Summarise the result."""
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
             outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"

@@ -71,15 +71,7 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
 
 
 def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
-    """A table whose first row is its head and whose first column names the rows.
-
-    Args:
-        rows: texts of the cells.
-        caption: text above the table.
-
-    Returns:
-        HTML.
-    """
+    """A table whose first row is its head and whose first column names the rows."""
     head = "".join(f'<th scope="col"{_number(n)}>{escape(cell)}</th>' for n, cell in enumerate(rows[0]))
     body = "".join(
         f'<tr><th scope="row">{escape(row[0])}</th>'

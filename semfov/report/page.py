@@ -110,14 +110,7 @@ def _place(number: int) -> str:
 
 
 def pictures_of(episode: Data) -> list[str]:
-    """The pictures of an episode as data URIs, each as often as it is shown.
-
-    Args:
-        episode: data of an episode.
-
-    Returns:
-        The data URIs.
-    """
+    """The pictures of an episode as data URIs, each as often as it is shown."""
     views = [each["view"] for each in episode["looks" if "looks" in episode else "fixations"]]
     return [picture for picture in (episode["image"], *views) if picture is not None]
 
@@ -149,16 +142,7 @@ def json_script(data: Any) -> str:
 
 
 def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
-    """Colours of a colour map at equal steps.
-
-    Args:
-        colours: matplotlib colour map, or its name.
-        opacity: factor on the opacity.
-        steps: number of colours.
-
-    Returns:
-        For each step red, green and blue from 0 to 255, and opacity from 0 to 1.
-    """
+    """Red, green and blue from 0 to 255 and opacity from 0 to 1 of a colour map of matplotlib, at equal steps."""
     from matplotlib import colormaps
 
     colours = colormaps[colours] if isinstance(colours, str) else colours

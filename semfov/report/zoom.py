@@ -133,15 +133,7 @@ class LookView(NamedTuple):
 
 @singledispatch
 def look_views(path: Record, source: LargePicture) -> Iterator[LookView]:
-    """The views of a record, from its picture.
-
-    Args:
-        path: the record.
-        source: the picture, which may be reduced.
-
-    Yields:
-        One view for each look.
-    """
+    """The views of all looks of a record, from its picture, which may be reduced."""
     for look in path:
         frame = _whole_pixels(look.region, path.size)
         across = frame[2] - frame[0]
@@ -293,17 +285,7 @@ def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int])
 
 
 def _pixels(source: LargePicture, frame: _Frame, size: tuple[int, int], across: int) -> Tensor:
-    """Pixels `(3, h, w)` of a window in [0, 1]; very large windows are read at a coarser resolution.
-
-    Args:
-        source: the picture, which may be reduced.
-        frame: the window, in pixels of the whole picture.
-        size: `(width, height)` of the whole picture.
-        across: number of pixels across that are wanted.
-
-    Returns:
-        The pixels.
-    """
+    """Pixels `(3, h, w)` of a window in [0, 1]; one wider than `across` is read at a coarser resolution."""
     scale = [there / here for there, here in zip(source.size, size, strict=True)] * 2
     x1, y1, x2, y2 = (n * by for n, by in zip(frame, scale, strict=True))
     frame = _whole_pixels((x1, y1, x2, y2), source.size)

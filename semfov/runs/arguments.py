@@ -61,16 +61,7 @@ def usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[st
 
 
 def in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str:
-    """Say in one line what is wrong with the arguments, and suggest names.
-
-    Args:
-        message: message of the parser.
-        config: dataclass of the settings.
-        options: options of the parser.
-
-    Returns:
-        The message.
-    """
+    """Say in one line what is wrong with the arguments, and suggest names."""
     unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
     if unknown:
         words = unknown[1].split()

@@ -64,8 +64,8 @@ class DetectorConfig(Settings):
         limit: keep at most this many boxes per view, the most confident ones.
         stride: pad the view to a multiple of this number of pixels (None: to the detector's square input, as Darknet
             pads it; `auto`: whatever is fastest, 32 for Darknet's networks).
-        input_size: longer side in pixels of the network's input, for networks that take any size, such as Darknet's and
-            NanoDet-Plus (None: the network's own, 416).
+        input_size: longer side in pixels of the network's input, for networks that take any size, such as Darknet's,
+            NanoDet-Plus and YOLOX (None: the network's own).
         runtime: what runs a Darknet network: `torch`, `onnxruntime`, or the faster of the two (`auto`).
         classes: names of the classes in the order of the scores (None: the network's own names, or those of COCO).
         head: output format of an ONNX model whose format is not recognised (docs/detectors.md).
@@ -278,9 +278,6 @@ class WorkConfig(OutcomeConfig):
     """What runs and fits in several processes have.
 
     Args:
-        detector: the detector.
-        out: folder of the outcomes.
-        cache: folder for what is stored, shared between runs (None: the user's cache).
         workers: number of processes (None: one per CPU core).
         scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
@@ -305,12 +302,9 @@ class LookingConfig(WorkConfig):
     Args:
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the belief; its columns and rows are the cells.
-        out: folder of the outcomes.
+        belief: the belief, a grid of class distributions; its columns and rows are the cells.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
@@ -324,14 +318,6 @@ class ScenesConfig(LookingConfig):
 
     Args:
         data: the scenes.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief; its columns and rows are the cells.
-        out: folder of the outcomes.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -342,14 +328,6 @@ class PoliciesConfig(LookingConfig):
     """Policies that choose among the cells, in the episodes of a protocol.
 
     Args:
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief, a grid of class distributions.
-        out: folder of the outcomes.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
@@ -370,18 +348,6 @@ class RunConfig(PoliciesConfig, ScenesConfig):
     """Policies that look at the scenes of a data set, in the episodes of a protocol.
 
     Args:
-        data: the scenes.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        belief: the belief, a grid of class distributions.
-        out: folder of the outcomes.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
-        store: keep detections on disk; false computes them anew in each run (the result is the same).
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
-        saliency: the saliency baselines.
-        protocol: the protocol of the episodes.
-        policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
         models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
 
     Attributes:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+from torch import Tensor
+
 from semfov.belief.grid import Grid
+from semfov.belief.observers import Observer
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
@@ -87,6 +92,25 @@ class Looking(SceneRun):
         """Store the looks at a scene, if this process does not see them."""
         if self.store.read(self.digest(index)) is None:
             self.store.write(self.digest(index), unpack_tensors(stored))
+
+
+class CellLooks(Looks):
+    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it.
+
+    Args:
+        look: gives the detections from a cell, a batch of one.
+        grid: the cells.
+        like: a tensor; beliefs take its dtype and device.
+        target: class 1..K that is searched for; None for an observer that does not ask for it.
+    """
+
+    def __init__(self, look: Callable[[int], Detections], grid: Grid, like: Tensor, target: int | None = None) -> None:
+        self.look, self.grid, self.like, self.target = look, grid, like, target
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Look, and weigh; the fixations are the centres of the cells."""
+        seen = Detections.stack([self.look(number) for number in cell.tolist()])
+        return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
 
 
 def looking_of(config: Any) -> Looking:

@@ -106,17 +106,7 @@ class _Task:
 
 
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
-    """A bar for a task; if a `WholeBar` is open, the task moves its bar instead.
-
-    Args:
-        total: number of units of the task.
-        title: title of the task.
-        unit: name of a unit.
-        hidden: show nothing.
-
-    Returns:
-        The bar.
-    """
+    """A bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
     whole = _whole.get()
     if whole is not None:
         return whole.task(title, total)

@@ -72,7 +72,11 @@ Workers = Annotated[int, Range(1, 1024)]
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of dataclasses of settings; it refuses values that are out of range."""
+    """Base of dataclasses of settings; it refuses values that are out of range.
+
+    A class documents its own settings, and inherited ones only where they mean something else: `--help` takes the
+    other descriptions from its bases.
+    """
 
     def __post_init__(self) -> None:
         """Check all values (`check_settings`)."""

@@ -1,7 +1,9 @@
-"""Tables in Markdown, and the figures in their cells."""
+"""Tables in Markdown and as CSV, and the figures in their cells."""
 
+import csv
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 def table(rows: list[list[str]]) -> list[str]:
@@ -11,6 +13,13 @@ def table(rows: list[list[str]]) -> list[str]:
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
     ]
     return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV; the first row holds the headings."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def percent(value: float, error: float) -> str:

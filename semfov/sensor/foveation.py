@@ -199,11 +199,7 @@ class Foveation(Sensor):
         )
 
     def extra_repr(self) -> str:
-        """Write the settings, for `repr`.
-
-        Returns:
-            The settings as text.
-        """
+        """The settings as text."""
         settings = f"levels={self.levels}, growth={self.growth:g}, convention={self.convention!r}"
         return f"sigma={float(self.sigma.detach()):g}, {settings}"
 

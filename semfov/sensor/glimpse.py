@@ -186,11 +186,7 @@ class Glimpse(nn.Module):
         return glimpse(image, boxes, self.size, padding_mode=self.padding_mode, fill_value=self.fill_value)
 
     def extra_repr(self) -> str:
-        """Write the settings, for `repr`.
-
-        Returns:
-            The settings as text.
-        """
+        """The settings as text."""
         return f"size={self.size}, padding_mode={self.padding_mode!r}, fill_value={self.fill_value:g}"
 
 

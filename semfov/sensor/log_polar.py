@@ -259,11 +259,7 @@ class LogPolar(Sensor):
         return float(settings["fovea"])
 
     def extra_repr(self) -> str:
-        """Write the settings, for `repr`.
-
-        Returns:
-            The settings as text.
-        """
+        """The settings as text."""
         own = self.retina
         return f"fovea={own.fovea:g}, spacing={own.spacing:g}, pooling={own.pooling:g}"
 

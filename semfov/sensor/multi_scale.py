@@ -176,11 +176,7 @@ class MultiScaleFovea(Sensor):
         return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
 
     def extra_repr(self) -> str:
-        """Write the settings, for `repr`.
-
-        Returns:
-            The settings as text.
-        """
+        """The settings as text."""
         return f"side={self.side}, scales={self.scales}"
 
     def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:

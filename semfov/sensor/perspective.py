@@ -140,9 +140,5 @@ class Perspective(nn.Module):
         return perspective(panorama, pose, self.size, antialias=self.antialias)
 
     def extra_repr(self) -> str:
-        """Write the settings, for `repr`.
-
-        Returns:
-            The settings as text.
-        """
+        """The settings as text."""
         return f"size={self.size}, antialias={self.antialias}"

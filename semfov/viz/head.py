@@ -175,15 +175,7 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
 
 
 def head_views(path: HeadPath, image: Tensor) -> Iterator[Tensor]:
-    """Render what the head saw in each look from a picture of the scene.
-
-    Args:
-        path: the record.
-        image: `(3, H, W)`, RGB in [0, 1], the scene's picture in any size.
-
-    Yields:
-        One view `(3, h, w)` in [0, 1] for each look.
-    """
+    """Render what the head saw in each look, `(3, h, w)`, from a picture `(3, H, W)` of the scene in any size."""
     world, (width, height) = path.views.world, path.size
     if world.closed:
         # Poses are angles, which do not depend on the size of the picture.

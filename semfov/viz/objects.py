@@ -24,14 +24,7 @@ _SMALL = 5.0  # font size of the labels of many objects
 
 
 def object_entries(record: Record) -> list[LegendEntry]:
-    """Entries of a legend for the objects of a record, and for its closer looks that confirmed none.
-
-    Args:
-        record: the record.
-
-    Returns:
-        The entries.
-    """
+    """Entries of a legend for the objects of a record, and for its closer looks that confirmed none."""
     sure = record.confirmed
     name = record.target_name or "objects"
     count, others = int(sure.sum()), int((~sure).sum())

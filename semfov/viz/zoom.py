@@ -62,16 +62,7 @@ def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None
 
 
 def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[LabelBox]:
-    """Draw the windows of looks, numbered in their order.
-
-    Args:
-        axes: axes that hold the picture.
-        path: the record.
-        last: number of the last look that is drawn, with a wider frame; None draws all.
-
-    Returns:
-        Rectangles of the numbers.
-    """
+    """Draw the windows of looks up to `last` (None: all), numbered; returns the rectangles of the numbers."""
     from matplotlib.patches import Rectangle
 
     width, height = path.size
@@ -91,16 +82,7 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
 
 
 def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
-    """Position for the number of a window: the corner farthest from other numbers, or the middle.
-
-    Args:
-        box: `(x1, y1, x2, y2)` of the window.
-        taken: positions of other numbers.
-        room: width that a number needs.
-
-    Returns:
-        `(x, y)`.
-    """
+    """Position `(x, y)` for the number of a window: the corner farthest from other numbers, or the middle."""
     x1, y1, x2, y2 = box
     left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
     places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]

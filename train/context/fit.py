@@ -77,15 +77,7 @@ def count_context(places: Sequence[ObjectPlaces], classes: Sequence[str], config
 
 
 def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrior | None:
-    """Make the prior from the table in the settings.
-
-    Args:
-        config: the settings.
-        classes: names of the K classes.
-
-    Returns:
-        The prior, or None if the settings name no table.
-    """
+    """Make the prior from the table in the settings; None if they name none."""
     table = config.table
     if table is None:
         return None

@@ -38,10 +38,7 @@ class FitContextConfig(FovealFitConfig, WorkConfig):
         shard: number of photographs in a unit of work.
         folds: number of folds for fitting the weights, so that they are fitted on photographs that were not counted.
         min_objects: photographs with fewer objects are used neither to fit the weights nor for the evaluation.
-        out: folder for the model and the report.
         cache: folder for the looks (None: `out`).
-        workers: number of processes that look (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
         table: CSV table of classes by classes to use instead of counting (`ContextPrior.from_table`).
         source: where the table comes from (None: its file name).
         heights: CSV table of classes by heights in a picture, to use with `table`.

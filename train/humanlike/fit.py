@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture, read_osie
 from semfov.data.pictures import Pictures
+from semfov.data.scene import Scenes
+from semfov.detection.load import check_detector
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, lookup
 from semfov.eye import Eye
 from semfov.fit.outputs import model_path, write_outputs
 from semfov.fit.settings import NameConfig
-from semfov.runs.candidates import Candidate, load_models, make_strategy
-from semfov.runs.config import (
-    BeliefConfig,
-    OutcomeConfig,
-    PolicyConfig,
-    RunConfig,
-    SaliencyConfig,
-    SensorConfig,
-)
-from semfov.runs.presets import label, resolve
-from semfov.runs.remembered import look_everywhere
-from semfov.runs.saliency_store import saliency_table
-from semfov.runs.scene_run import store_folder
+from semfov.gaze.policies import Task
+from semfov.runs.config import BeliefConfig, OutcomeConfig, PoliciesConfig, PolicyConfig, SaliencyConfig, SensorConfig
+from semfov.runs.policy_looking import PolicyLooking
+from semfov.runs.presets import label
 from semfov.runs.settings import Count, Positive
-from semfov.runs.setup import make_eye, prepare_worker
-from semfov.runs.store import cell_store
+from semfov.runs.setup import prepare_worker
 from train.humanlike.habits import Halves, fit_terms, habits_of
 from train.humanlike.report import humanlike_report
 from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
@@ -110,15 +101,15 @@ def gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int]
         DataError: pictures are missing, or their size differs from that in the file of fixations.
     """
     people = by_picture(read_osie(config.fixations))
-    viewer = Viewer(config, list(people)[: config.limit])
-    size = people[str(viewer.pictures.ids[0])][0].size
+    viewing = Viewing(config, list(people)[: config.limit])
+    size = people[str(viewing.scenes.ids[0])][0].size
     found = []
-    for number, name in enumerate(tqdm(viewer.pictures.ids, desc="looking as people did", unit="picture")):
-        found.append(viewer.choices(number, people[str(name)], size))
-    return Choices.join(found), size, viewer.eye
+    for number, name in enumerate(tqdm(viewing.scenes.ids, desc="looking as people did", unit="picture")):
+        found.append(viewing.choices(number, people[str(name)], size))
+    return Choices.join(found), size, viewing.eye
 
 
-class Viewer:
+class Viewing(PolicyLooking):
     """Compute the values that policies give to the cells of pictures whenever a person chose the next fixation.
 
     Args:
@@ -126,20 +117,20 @@ class Viewer:
         names: file names of the pictures.
     """
 
+    task: Task = "exploration"
+
     def __init__(self, config: FitHumanlikeConfig, names: list[str]) -> None:
-        self.config = config
-        self.eye = make_eye(config.detector, config.sensor)
-        self.pictures = Pictures(config.root, names, self.eye.detector.classes)
-        policies = config.policies
-        run = RunConfig(detector=config.detector, sensor=config.sensor, belief=config.belief, policies=policies)
-        models, components = load_models(run, "exploration", self.eye), len(self.pictures.classes) + 1
-        self.policies = {label(choice, "exploration"): resolve(choice, "exploration") for choice in policies}
-        self.strategies = {
-            name: make_strategy(policy, "exploration", config.belief, components, models, config.sensor.fovea)
-            for name, policy in self.policies.items()
-        }
-        size = config.belief.columns, config.belief.rows
-        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        self._fit, self._names = config, names
+        shared = (each.name for each in fields(PoliciesConfig) if hasattr(config, each.name))
+        super().__init__(PoliciesConfig(**{name: getattr(config, name) for name in shared}))
+
+    def check_sources(self) -> None:
+        """Check that the detector exists; the pictures are looked for when they are opened."""
+        check_detector(self.config.detector.name)
+
+    def open_scenes(self) -> Scenes:
+        """The pictures that people saw."""
+        return Pictures(self._fit.root, self._names, self.eye.detector.classes)
 
     def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
         """Gather the choices of all people in a picture.
@@ -155,31 +146,18 @@ class Viewer:
         Raises:
             DataError: the picture or its fixations have another size.
         """
-        image, digest = self.pictures[number].image, self.pictures.digest(number)
-        if any((each.size, (image.shape[-1], image.shape[-2])) != (size, size) for each in records):
+        if any((each.size, self.scenes.annotation(number).size) != (size, size) for each in records):
             raise DataError(
-                f"{self.config.fixations}: expected all pictures to have {size[0]} × {size[1]} pixels, got another "
+                f"{self._fit.fixations}: expected all pictures to have {size[0]} × {size[1]} pixels, got another "
                 f"size for {records[0].picture}"
             )
-        grid = Grid(self.config.belief.columns, self.config.belief.rows, size)
-        seen = look_everywhere(self.eye, lambda: image[None], grid, self.store, lambda: digest)
+        seen, grid = self.detections(number), self.grid(number)
         cells, count = fixated_cells(records, grid)
         values = {}
         for name in self.policies:
-            candidate = self.candidate(name, image, grid)
+            candidate = self.candidate(name, number)
             acquire = partial(candidate.acquisition, None, grid)
             with torch.inference_mode():
                 values[name] = values_in(StoredLooks(seen, grid), candidate.observer, acquire, cells, count)
         subject = torch.tensor([int(each.subject) for each in records])
         return replace(choices_in(cells, count, grid, number, subject), values=values)
-
-    def candidate(self, name: str, image: Tensor, grid: Grid) -> Candidate:
-        """Prepare a policy for a picture."""
-        policy, saliency = self.policies[name], self.config.saliency
-        strategy = self.strategies[name]
-        if policy.saliency is None:
-            return Candidate(strategy)
-        maps = saliency_table(policy.saliency, saliency, self.eye.sensor, self.config.sensor.reference, image, grid)
-        if strategy.policy.table == "saliency":
-            return Candidate(strategy, maps)
-        return Candidate(strategy, saliency=maps, weight=saliency.weight)

@@ -113,16 +113,7 @@ class FittedTerms:
 
 
 def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTerms]:
-    """Add the terms one after another, and fit all of them again each time.
-
-    Args:
-        halves: choices to fit on and to evaluate on.
-        policy: policy whose values are the first term (None: no such term).
-        ridge: penalty on the squares of the weights (`fit_log_linear`).
-
-    Returns:
-        The model after each added term.
-    """
+    """Add the terms one after another, the values of a policy first, and fit all of them again each time."""
     order = ORDER if policy is not None else ORDER[1:]
     base = _bits(halves, None, ("centre",), _fit(halves, None, ("centre",), ridge))[1]
     found = []

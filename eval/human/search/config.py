@@ -38,10 +38,8 @@ class PeopleSearchConfig(PoliciesConfig):
             model in the results.
         pictures: folders in which the pictures are looked for; policies search in the pictures that are found.
         screen: the screen.
-        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor; it sees the whole screen.
         belief: the belief, on a grid over the screen; the default of 32 × 24 cells is the grid of the models' files.
-        saliency: the saliency baselines.
         protocol: the protocol; a search has failed after `shifts` gaze shifts, and `seed` draws the random baselines.
         policies: policies to compare (`python -m eval.search --help`).
         bandwidth: bandwidth, in screen pixels, of the clusters of fixations that make up the letters of a sequence.
@@ -49,8 +47,6 @@ class PeopleSearchConfig(PoliciesConfig):
         out: folder for tables, figures and the manifest.
         cache: folder for the stored detections from every cell (None: the user's cache).
         store: keep detections on disk.
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     people: Path = Path("human_scanpaths")

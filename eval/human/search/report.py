@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import sys
@@ -12,14 +10,14 @@ from dataclasses import asdict
 
 import yaml
 
-from eval.comparison.summary import announce
+from eval.comparison.summary import announce, write_texts
 from eval.human.search.config import PeopleSearchConfig
 from eval.human.search.scores import DIMENSIONS, Beside
 from semfov.data.fixations import Fixations, write_table
 from semfov.io.code import commit
-from semfov.io.files import clean, sha256, write_text
+from semfov.io.files import clean, sha256
 from semfov.runs.setup import plain
-from semfov.runs.tables import table
+from semfov.runs.tables import csv_text, table
 from semfov.version import __version__
 from semfov.viz.style import save_figure
 
@@ -39,13 +37,7 @@ _HEAD = (
 def people_report(
     config: PeopleSearchConfig, tables: Mapping[str, Rows], scanpaths: Mapping[str, list[Fixations]]
 ) -> None:
-    """Write all output and print the tables.
-
-    Args:
-        config: the settings of the run.
-        tables: tables by title.
-        scanpaths: scanpaths of the random baselines and of the policies, by name.
-    """
+    """Write all output and print the tables; scanpaths are those of random baselines and policies, by name."""
     out = config.out
     summary = "\n".join(line for title, rows in tables.items() for line in [f"**{title}**", "", *_table(rows), ""])
     files = {
@@ -55,10 +47,7 @@ def people_report(
         "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
         "manifest.json": json.dumps(_manifest(config), indent=2) + "\n",
     }
-    written = []
-    for name, text in files.items():
-        write_text(out / name, text)
-        written.append(out / name)
+    written = write_texts(out, files)
     for name, searches in scanpaths.items():
         path = out / "scanpaths" / f"{clean(name)}.csv"
         write_table(path, searches)
@@ -96,7 +85,7 @@ def _csv(tables: Mapping[str, Rows]) -> str:
             if each.alike:
                 named |= {f"MultiMatch {what}": each.mean(n) for n, what in enumerate(DIMENSIONS)}
             lines += [[title, name, what, f"{value:.5f}", f"{error:.5f}"] for what, (value, error) in named.items()]
-    return _lines(lines)
+    return csv_text(lines)
 
 
 def _curves(tables: Mapping[str, Rows]) -> str:
@@ -104,13 +93,7 @@ def _curves(tables: Mapping[str, Rows]) -> str:
     for title, rows in tables.items():
         for name, each in rows.items():
             lines += [[title, name, str(n), f"{value:.5f}"] for n, value in enumerate(each.curve)]
-    return _lines(lines)
-
-
-def _lines(lines: list[list[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
+    return csv_text(lines)
 
 
 def _manifest(config: PeopleSearchConfig) -> dict[str, object]:

@@ -49,8 +49,6 @@ class ViewingConfig(PoliciesConfig):
     Args:
         people: fixations of all people: the JSON file of OSIE, or a table (`.csv`) as `semfov.data.fixations` reads it.
         data: the pictures.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
         belief: the belief of the policies; looks are taken from the centres of its cells.
         saliency: settings of the saliency maps that policies have as priors.
         protocol: the protocol; its seed draws the scanpaths.
@@ -68,8 +66,6 @@ class ViewingConfig(PoliciesConfig):
         out: folder for tables, figures and the manifest.
         cache: folder for the stored detections from every cell and for maps (None: the user's cache).
         store: keep detections and maps on disk; false computes them anew in each run.
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     people: Path = Path("fixations.json")

@@ -121,17 +121,7 @@ def blurred(maps: Tensor, sigma: float) -> Tensor:
 
 
 def enlarged(values: Tensor, grid: Grid, rows: int, columns: int) -> Tensor:
-    """Interpolate values `(E, X·Y)` of cells bilinearly between the cell centres, to maps `(E, H, W)`.
-
-    Args:
-        values: `(E, X·Y)`, values of the cells.
-        grid: the grid of the cells.
-        rows: H.
-        columns: W.
-
-    Returns:
-        The maps.
-    """
+    """Interpolate values `(E, X·Y)` of cells bilinearly between the cell centres, to maps `(E, rows, columns)`."""
     maps = values.reshape(-1, 1, grid.rows, grid.columns)
     if (grid.rows, grid.columns) == (rows, columns):
         return maps[:, 0]

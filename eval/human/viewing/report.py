@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from eval.human.viewing.sequences import drawn_scanpaths
 from semfov.io.files import clean
 from semfov.metrics.averages import standard_error
 from semfov.runs.scene_run import gather
-from semfov.runs.tables import table
+from semfov.runs.tables import csv_text, table
 from semfov.viz.style import save_figure
 
 _Array = NDArray[np.float64]
@@ -99,7 +97,7 @@ def summary_csv(scored: _Table) -> str:
             lines.append(
                 [name, group, figure, f"{values.mean():.6f}", f"{standard_error(values):.6f}", str(len(values))]
             )
-    return _csv(lines)
+    return csv_text(lines)
 
 
 def pictures_csv(run: ViewingRun, scored: _Table) -> str:
@@ -110,7 +108,7 @@ def pictures_csv(run: ViewingRun, scored: _Table) -> str:
         lines += [
             [str(i), name, group, *(f"{v:.5f}" for v in values)] for i, values in zip(ids, each.pictures, strict=True)
         ]
-    return _csv(lines)
+    return csv_text(lines)
 
 
 def weights_csv(scored: _Table) -> str:
@@ -120,7 +118,7 @@ def weights_csv(scored: _Table) -> str:
         weights = each.weights
         for term, value in zip(weights.terms, weights.values.tolist(), strict=True):
             lines.append([name, group, term, f"{value:.4f}", f"{weights.blur:g}", f"{weights.bits:.4f}"])
-    return _csv(lines)
+    return csv_text(lines)
 
 
 def sequences_csv(sequences: Mapping[str, _Array]) -> str:
@@ -128,7 +126,7 @@ def sequences_csv(sequences: Mapping[str, _Array]) -> str:
     lines = [["row", "picture number", "sequence score"]]
     for name, values in sequences.items():
         lines += [[name, str(number), f"{value:.5f}"] for number, value in enumerate(values)]
-    return _csv(lines)
+    return csv_text(lines)
 
 
 def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
@@ -179,9 +177,3 @@ def _signed(each: Scored, other: Scored) -> str:
         return ""
     mean, error = each.difference(other)
     return f"{mean:+.3f} ± {error:.3f}"
-
-
-def _csv(lines: list[list[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()

@@ -55,11 +55,7 @@ class CloserLook(AcquisitionFunction):
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:
-        """Describe the settings for `repr`.
-
-        Returns:
-            The width of the fovea.
-        """
+        """The width of the fovea."""
         return f"fovea={self.fovea:g}"
 
 

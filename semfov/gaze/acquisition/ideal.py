@@ -129,11 +129,7 @@ class CorrectLocalisation(SignalSearch):
         return torch.stack([correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
 
     def extra_repr(self) -> str:
-        """Describe the settings for `repr`.
-
-        Returns:
-            The number of nodes.
-        """
+        """The number of nodes."""
         return f"nodes={self.nodes}"
 
 

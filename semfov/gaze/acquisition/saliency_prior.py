@@ -56,9 +56,5 @@ class SaliencyPrior(AcquisitionFunction):
         return one_by_one(lambda row: row.clamp(min=least).log(), value) + self.weight * self.log_prior.to(value)
 
     def extra_repr(self) -> str:
-        """Describe the settings for `repr`.
-
-        Returns:
-            The weight of the saliency.
-        """
+        """The weight of the saliency."""
         return f"weight={self.weight:g}"

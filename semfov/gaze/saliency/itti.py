@@ -244,9 +244,5 @@ class IttiKoch(nn.Module):
         return itti_koch_saliency(image, normalise=self.normalise)
 
     def extra_repr(self) -> str:
-        """Describe the settings for `repr`.
-
-        Returns:
-            Whether maps are normalised.
-        """
+        """Whether maps are normalised."""
         return f"normalise={self.normalise}"

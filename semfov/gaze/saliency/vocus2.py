@@ -215,11 +215,7 @@ class VOCUS2(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        """Describe the settings for `repr`.
-
-        Returns:
-            All settings by name.
-        """
+        """All settings by name."""
         sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
         settings = f"layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
         return f"{sigmas}, {settings}, color_space={self.color_space!r}"
