@@ -15,12 +15,14 @@ import torch
 from benchmarks.beliefs import exploration, kaplan_update, predictive_search
 from benchmarks.fits import dirichlets
 from benchmarks.growth import grow
-from benchmarks.images import foveation, saliency, use_threads
+from benchmarks.images import use_threads
 from benchmarks.interleave import in_turn
 from benchmarks.limits import Path as HotPath
 from benchmarks.limits import limits
 from benchmarks.machine import copy_bandwidth, describe
 from benchmarks.rollouts import rollouts
+from benchmarks.saliency import saliency
+from benchmarks.sensor import foveation
 from benchmarks.tables import RESULTS, comparison_rows, number, spread, table, write
 from benchmarks.timing import Comparison, Measured, Spread, clock_for, measure
 

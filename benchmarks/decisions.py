@@ -61,7 +61,7 @@ PUBLISHED: dict[str, dict[str, float | None]] = {
 }
 
 
-def make_seen(grid: Grid, seed: int) -> Detections:
+def make_seen(seed: int) -> Detections:
     """Random detections of one look, with boxes of up to a tenth of the photograph."""
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(photograph().shape[:1:-1])
@@ -75,7 +75,7 @@ def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
     """The belief after `LOOKS` looks."""
     belief = observer.start(1, grid, torch.zeros(()))
     for seed in range(LOOKS):
-        belief = observer(belief, make_seen(grid, seed), grid.centres[seed : seed + 1], grid)
+        belief = observer(belief, make_seen(seed), grid.centres[seed : seed + 1], grid)
     return belief
 
 
@@ -108,7 +108,7 @@ def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], 
 
 def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) -> dict[str, Run]:
     """Programs of the steps that update a belief with one look of 30 detections."""
-    observer, seen, fixation = observers.Semantic(CLASSES + 1), make_seen(grid, LOOKS), torch.tensor([GAZE])
+    observer, seen, fixation = observers.Semantic(CLASSES + 1), make_seen(LOOKS), torch.tensor([GAZE])
     look, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
     return {
         f"cells and distances of {DETECTIONS} detections": lambda: observer.weigh(seen, fixation, grid),

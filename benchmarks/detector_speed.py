@@ -15,21 +15,14 @@ from concurrent.futures import ProcessPoolExecutor
 import torch
 from torch import Tensor
 
+from benchmarks.images import photograph
 from benchmarks.tables import number, spread, table
 from benchmarks.timing import Run, Spread, interleaved
 from semfov.detection import Detector
 from semfov.detection.load import load_yolo
 from semfov.detection.onnx_twin import Runtime
-from semfov.detection.placement import resize
 
 RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "torch")
-
-
-def photograph(width: int, height: int) -> Tensor:
-    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
-    from skimage import data
-
-    return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (width, height))
 
 
 def programs(detector: Detector, images: Tensor) -> dict[str, Run]:

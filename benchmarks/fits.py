@@ -5,10 +5,20 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 from scipy.special import digamma, gammaln
+from torch import Tensor
 
-from benchmarks.dirichlet_mle import draw
 from benchmarks.timing import Comparison
-from semfov.observation.dirichlet import mle
+from semfov.observation.dirichlet import floor, mle
+
+CLASSES, LEVELS, COMPONENTS = 81, 8, 81
+
+
+def draw(samples: int, seed: int) -> Tensor:
+    """Score vectors drawn from random Dirichlets, `(648, samples, 81)`, with values floored at 1e-6."""
+    rng = np.random.default_rng(seed)
+    alpha = np.exp(rng.normal(-1.0, 1.0, (CLASSES * LEVELS, COMPONENTS)))
+    scores = np.stack([rng.dirichlet(row, samples) for row in alpha])
+    return floor(torch.from_numpy(scores), 1e-6)
 
 
 def dirichlets(samples: int = 100) -> Comparison:
@@ -25,7 +35,7 @@ def dirichlets(samples: int = 100) -> Comparison:
         found = minimize(lost, np.zeros(len(logs)), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8})
         return np.exp(found.x)
 
-    def ours() -> torch.Tensor:
+    def ours() -> Tensor:
         return mle(scores.log().mean(1))
 
     def agree() -> None:

@@ -30,8 +30,8 @@ import torch
 from torch import Tensor
 
 import semfov
-from benchmarks.detector_speed import photograph
-from benchmarks.timing import Comparison
+from benchmarks.images import photograph
+from benchmarks.timing import Clock, Comparison, Spread, interleaved
 from semfov.detection import Detections
 from semfov.detection.export import export_onnx
 from semfov.detection.load import load_yolo
@@ -43,7 +43,6 @@ from semfov.strategy import Strategy
 
 COLUMNS, ROWS, TARGET = 10, 10, 1
 EDGES = [50 * level / 640 for level in range(1, 8)]
-Clock = Callable[[], float]
 PARTS = ("sensor", "detector", "belief", "policy")
 
 
@@ -63,21 +62,13 @@ def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, cloc
         "detector": lambda: [eye.detector.detect(canvas, view.placement) for canvas in canvases],
         "in turn": lambda: [eye.look(view, gaze) for gaze in gazes],
     }
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    names = list(runs)
-    for repetition in range(-1, repetitions):
-        first = repetition % len(names)
-        for name in names[first:] + names[:first]:
-            start = clock()
-            runs[name]()
-            if repetition >= 0:
-                times[name].append(1e3 * (clock() - start) / len(gazes))
-    return times
+    times = interleaved(runs, 0, clock, least=repetitions)
+    return {name: [each / len(gazes) for each in values] for name, values in times.items()}
 
 
 def in_turn(fixations: int = 10) -> Comparison:
     """Fixations in which sensor and detector alternate, compared with all sensor work first and then all detection."""
-    image = photograph(640, 480)
+    image = photograph()
     grid = semfov.Grid(COLUMNS, ROWS, (640, 480))
     order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
     gazes = grid.centres[order[:fixations]].split(1)
@@ -143,10 +134,8 @@ def scanpath(
 
 def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
     """Median and quartiles, as text."""
-    low, middle, high = (
-        f"{scale * value:.{digits}f}" for value in statistics.quantiles(values, n=4, method="inclusive")
-    )
-    return f"{middle} ({low}-{high})"
+    found = Spread.of([scale * value for value in values])
+    return f"{found.middle:.{digits}f} ({found.low:.{digits}f}-{found.high:.{digits}f})"
 
 
 def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
@@ -216,7 +205,7 @@ def main() -> None:
         options.threads, clock = [1], time.thread_time
     if options.keep_memory:
         torch.empty(31 << 20, dtype=torch.uint8)
-    image = photograph(640, 480)
+    image = photograph()
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         path = options.model
         if path is None:

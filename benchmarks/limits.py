@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from benchmarks.beliefs import DETECTIONS, make_belief, make_look, make_model, unvisited
-from benchmarks.dirichlet_mle import draw
+from benchmarks.fits import draw
 from benchmarks.images import GAZE, SIGMA, photograph
 from benchmarks.rollouts import SHIFTS, searches
 from benchmarks.timing import Clock, Run, Spread, interleaved

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from benchmarks.tables import table
 from eval.zoom.objects import AFTER, average_precision
+from eval.zoom.orders import in_order, quad_tree, sparse
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.large import to_bytes
 from semfov.data.scene import Annotation
@@ -33,7 +34,6 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import right_boxes
-from semfov.runs.zoom_orders import in_order, quad_tree, sparse
 from semfov.zoom.episode import Order, look_by_look
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import LiveGlances, Window

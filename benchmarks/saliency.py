@@ -1,14 +1,8 @@
-"""Milliseconds of both saliency models for one photograph, compared with the same models in OpenCV, in one run.
+"""Comparison of both saliency models with the same models in OpenCV, for one photograph.
 
-The OpenCV programs do the same work in the same order; they, too, average maps before enlarging them. Repetitions are
-interleaved. The table gives median and quartiles of the times, and of their ratios within a repetition.
-
-python -m benchmarks.saliency --size 640 480 --threads 2
+The OpenCV programs do the same work in the same order; they, too, average maps before enlarging them.
 """
 
-import argparse
-import statistics
-import time
 from collections.abc import Callable, Iterable
 from functools import reduce
 from typing import Any
@@ -18,19 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
+from benchmarks.images import photograph
+from benchmarks.timing import Comparison
 from semfov.gaze.saliency import VOCUS2, IttiKoch
 
 Array = NDArray[Any]
-
-
-def photograph(width: int, height: int) -> Tensor:
-    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
-    from skimage import data
-
-    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
-    return F.interpolate(image, (height, width), mode="area")
 
 
 def blur(image: Array, sigma: float) -> Array:
@@ -129,57 +116,17 @@ def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
     return stretch(cv2.resize(saliency, image.shape[1::-1]))
 
 
-def measure(
-    ours: Callable[[], object], theirs: Callable[[], object], repetitions: int
-) -> tuple[list[float], list[float]]:
-    """Milliseconds of both programs, run in turn."""
-    times: tuple[list[float], list[float]] = ([], [])
-    for repetition in range(repetitions + 2):
-        for run, record in zip((ours, theirs), times, strict=True):
-            start = time.perf_counter()
-            run()
-            if repetition >= 2:
-                record.append(1e3 * (time.perf_counter() - start))
-    return times
-
-
-def spread(times: list[float]) -> str:
-    """Median and quartiles, as text."""
-    low, middle, high = statistics.quantiles(times, n=4)
-    return f"{middle:.1f} ({low:.1f}-{high:.1f})"
-
-
-@torch.inference_mode()
-def main() -> None:
-    """Measure, and print the table."""
-    parser = argparse.ArgumentParser(description="milliseconds of the saliency models for one photograph")
-    parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the photograph")
-    parser.add_argument("--threads", type=int, default=2, help="threads of torch and of OpenCV")
-    parser.add_argument("--repetitions", type=int, default=40, help="number of repetitions")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    cv2.setNumThreads(arguments.threads)
-    image = photograph(*arguments.size)
-    pixels = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy())
-    filters = gabor_filters()
-    clutter, single, itti = VOCUS2(), VOCUS2(3.0, 13.0), IttiKoch()
-    pairs: dict[str, tuple[Callable[[], Tensor], Callable[[], Array]]] = {
-        "VOCUS2 2/6": (lambda: clutter(image), lambda: vocus2_opencv(pixels, 2, 6)),
-        "VOCUS2 3/13": (lambda: single(image), lambda: vocus2_opencv(pixels, 3, 13)),
-        "Itti-Koch": (lambda: itti(image), lambda: itti_koch_opencv(pixels, filters)),
+def saliency(name: str) -> Comparison:
+    """Computation of a saliency map."""
+    image = photograph()
+    pixels, filters = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), gabor_filters()
+    programs: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[], Array]]] = {
+        "VOCUS2": (VOCUS2(), lambda: vocus2_opencv(pixels, 2, 6)),
+        "Itti-Koch": (IttiKoch(), lambda: itti_koch_opencv(pixels, filters)),
     }
-    print(
-        f"{arguments.size[0]}x{arguments.size[1]}, {arguments.threads} threads, {arguments.repetitions} repetitions; ms"
-    )
-    print("| model | semfov | OpenCV | ratio | largest difference |\n|---|---|---|---|---|")
-    for name, (ours, theirs) in pairs.items():
-        difference = float(np.abs(ours()[0].numpy() - theirs()).max())
-        here, there = measure(ours, theirs, arguments.repetitions)
-        ratios = [a / b for a, b in zip(here, there, strict=True)]
-        low, middle, high = statistics.quantiles(ratios, n=4)
-        ratio = f"{middle:.2f} ({low:.2f}-{high:.2f})"
-        print(f"| {name} | {spread(here)} | {spread(there)} | {ratio} | {difference:.1e} |")
+    model, peer = programs[name]
 
+    def agree() -> None:
+        torch.testing.assert_close(model(image)[0], torch.from_numpy(peer()), rtol=0, atol=1e-5)
 
-if __name__ == "__main__":
-    main()
+    return Comparison(f"saliency, {name}", lambda: model(image), {"OpenCV": peer}, {}, agree)

@@ -1,22 +1,13 @@
-"""Time of the foveal sensor relative to the same sensor written with OpenCV and with Kornia, in one run.
+"""Comparison of the foveal sensor with the same sensor written with OpenCV and with Kornia.
 
-The peers, each including its pyramid:
+The peers build their pyramid for every fixation:
 
-- `cv2, plain`: a straightforward version with `cv2.pyrDown`, `cv2.pyrUp`, and windows and sums in numpy;
-- `cv2, tuned`: every step is a fused OpenCV call that writes into allocated memory; windows are outer products;
-- `kornia`: `kornia.geometry.transform.pyrdown` and `pyrup`.
-
-A repetition times all of them one after another, so that other work on the machine affects all alike. Results are
-ratios of times within one repetition, as median and quartiles over repetitions. Below 1, semfov is faster.
-
-python -m benchmarks.sensor
+- `OpenCV, plain`: a straightforward version with `cv2.pyrDown`, `cv2.pyrUp`, and windows and sums in numpy;
+- `OpenCV, tuned`: every step is a fused OpenCV call that writes into allocated memory; windows are outer products;
+- `Kornia's pyramid`: `kornia.geometry.transform.pyrdown` and `pyrup`.
 """
 
-import argparse
-import statistics
-import time
 from collections.abc import Callable
-from functools import partial
 
 import cv2
 import kornia.geometry.transform as kornia
@@ -24,12 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.images import GAZE, SIGMA, photograph
+from benchmarks.timing import Comparison
 from semfov.sensor import foveate, laplacian_pyramid
 from semfov.sensor.pyramid import Convention
 
 LEVELS = 5
 GROWTH = 2.0
-SIZES = ((480, 640), (416, 416))
 
 
 def line(count: int, centre: float, sigma: float, step: int) -> np.ndarray:
@@ -90,70 +82,26 @@ def planes(view: np.ndarray | Tensor) -> Tensor:
     return view if isinstance(view, Tensor) else torch.from_numpy(view).permute(2, 0, 1)[None]
 
 
-def interleaved(runs: dict[str, Callable[[], object]], repetitions: int) -> dict[str, list[float]]:
-    """Milliseconds of every run in every repetition, after five warm-up repetitions."""
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for repetition in range(-5, repetitions):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            if repetition >= 0:
-                times[name].append(1e3 * (time.perf_counter() - start))
-    return times
-
-
-def measure(height: int, width: int, sigma: float, repetitions: int) -> None:
-    """Measure one size with the current number of threads, and print its table."""
-    torch.manual_seed(0)
-    image, gaze = torch.rand(1, 3, height, width), torch.tensor([0.45 * width, 0.6 * height])
-    array, point = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), (gaze[0].item(), gaze[1].item())
-    peers: dict[str, Callable[[], np.ndarray | Tensor]] = {
-        "cv2, plain": lambda: plain(array, point, sigma),
-        "cv2, tuned": lambda: tuned(array, point, sigma),
-        "kornia": lambda: with_kornia(image, gaze, sigma),
+def foveation(convention: Convention, *, reuse: bool) -> Comparison:
+    """Foveation for one fixation; peers build their pyramid each time, and so does semfov unless `reuse`."""
+    image = photograph()
+    pixels, gaze = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), torch.tensor(GAZE)
+    kinds: dict[Convention, dict[str, Callable[[], np.ndarray | Tensor]]] = {
+        "opencv": {
+            "OpenCV, plain": lambda: plain(pixels, GAZE, SIGMA),
+            "OpenCV, tuned": lambda: tuned(pixels, GAZE, SIGMA),
+        },
+        "kornia": {"Kornia's pyramid": lambda: with_kornia(image, gaze, SIGMA)},
     }
-    runs: dict[str, Callable[[], object]] = dict(peers)
-    same: tuple[tuple[Convention, tuple[str, ...]], ...] = (
-        ("kornia", ("kornia",)),
-        ("opencv", ("cv2, plain", "cv2, tuned")),
-    )
-    for name, equals in same:
-        bands = laplacian_pyramid(image, LEVELS, name)
-        whole = partial(foveate, image, gaze, sigma=sigma, levels=LEVELS, convention=name)
-        runs[f"semfov {name}, whole"] = whole
-        runs[f"semfov {name}, pyramid reused"] = partial(foveate, bands, gaze, sigma=sigma)
-        view = foveate(bands, gaze, sigma=sigma)
-        for peer in equals:
-            torch.testing.assert_close(view, planes(peers[peer]()), rtol=0, atol=1e-5)
-    times = interleaved(runs, repetitions)
-    threads = torch.get_num_threads()
-    print(f"\n{width} x {height}, 3 channels, {threads} thread{'s' * (threads > 1)}, {repetitions} repetitions")
-    print(
-        f"{'ms: least, median':30s}", *(f"{min(times[p]):8.2f} {statistics.median(times[p]):8.2f}    " for p in peers)
-    )
-    print(f"{'time / time of':30s}", *(f"{p:21s}" for p in peers))
-    for run in [run for run in runs if run not in peers]:
-        cells = []
-        for peer in peers:
-            low, middle, high = statistics.quantiles([a / b for a, b in zip(times[run], times[peer], strict=True)], n=4)
-            cells.append(f"{middle:5.2f} ({low:5.2f}-{high:5.2f})  ")
-        print(f"{run:30s}", *cells, f"{min(times[run]):6.2f} {statistics.median(times[run]):6.2f} ms")
+    peers = kinds[convention]
+    source = laplacian_pyramid(image, LEVELS, convention) if reuse else image
 
+    def ours() -> Tensor:
+        return foveate(source, gaze, sigma=SIGMA, levels=LEVELS, convention=convention)
 
-def main() -> None:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sigma", type=float, default=100.0, help="width of the fovea in pixels")
-    parser.add_argument("--repetitions", type=int, default=100, help="number of repetitions")
-    options = parser.parse_args()
-    everything = torch.get_num_threads()
-    with torch.inference_mode():
-        for threads in sorted({1, everything}):
-            torch.set_num_threads(threads)
-            cv2.setNumThreads(threads)
-            for height, width in SIZES:
-                measure(height, width, options.sigma, options.repetitions)
+    def agree() -> None:
+        for peer in peers.values():
+            torch.testing.assert_close(ours(), planes(peer()), rtol=0, atol=1e-5)
 
-
-if __name__ == "__main__":
-    main()
+    how = "pyramid reused" if reuse else "pyramid included"
+    return Comparison(f"foveation, {convention} pyramid, {how}", ours, peers, {}, agree)

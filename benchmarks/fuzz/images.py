@@ -45,7 +45,7 @@ def image_files(data: st.DataObject) -> str:
     frames = data.draw(st.integers(1, 3), label="frames") if kind in ("gif", "webp", "tiff") else 1
     content = encode(image, kind, orientation, frames, rng)
     damage = choose(data, DAMAGES, "damage")
-    content = damaged(content, damage, kind, rng)
+    content = damaged(content, damage, rng)
     oriented = data.draw(st.integers(0, 3), label="as stored") > 0
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"image.{kind}")
@@ -109,7 +109,7 @@ def encode(image: Any, kind: str, orientation: int, frames: int, rng: np.random.
     return file.getvalue()
 
 
-def damaged(content: bytes, damage: str, kind: str, rng: np.random.Generator) -> bytes:
+def damaged(content: bytes, damage: str, rng: np.random.Generator) -> bytes:
     """The contents of the file after the damage."""
     if damage == "cut":
         return content[: int(rng.integers(1, len(content)))]

@@ -30,9 +30,7 @@ def part_files(data: st.DataObject) -> str:
         results = SceneResults(Path(folder), "1-2", lambda index: "digest")
         results.save(0, RECORDS, SECONDS)
         path = results.path(0)
-        damage = choose(
-            data, ("none", "value", "signed value", "missing", "deep", "bytes", "bit", "cut", "text"), "how"
-        )
+        damage = choose(data, PART_DAMAGES, "how")
         part = json.loads(path.read_text())
         if damage in ("value", "signed value", "missing"):
             key = choose(data, list(part), "key")
@@ -71,9 +69,7 @@ def look_files(data: st.DataObject) -> str:
         store.write("a" * 64, whole)
         path = store.path("a" * 64)
         tensors, record = storage.read(path, "cached-tensors")
-        damage = choose(
-            data, ("none", "type", "value", "shape", "missing", "more", "key", "bytes", "bit", "cut"), "how"
-        )
+        damage = choose(data, LOOK_DAMAGES, "how")
         name = choose(data, list(tensors), "tensor")
         if damage == "type":
             kinds = (torch.bfloat16, torch.float16, torch.float64, torch.int32, torch.uint8, torch.bool)
