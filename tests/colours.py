@@ -72,6 +72,14 @@ def write_photographs(folder: Path, count: int = 20) -> Path:
     return path
 
 
+def write_home(folder: Path, count: int = 20) -> Path:
+    """Save the network as `colours.onnx`, and photographs in a folder beside it; returns the folder of both."""
+    write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs", count)
+    return folder
+
+
 SMALL = [
     "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "120", "--map_steps", "20", "--fixations", "6",
     "--sensor.sigma", "60", "--sensor.growth", "1", "--workers", "1",

@@ -226,13 +226,6 @@ def test_same_seed_same_scanpath(agent, image):
     assert not torch.equal(first, other)
 
 
-def test_search_ends_when_every_cell_was_visited(image):
-    agent = ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=(3, 2))
-    scanpath = agent.search(torch.full_like(image, 0.4), "red", shifts=50)
-    assert not scanpath.found
-    assert sorted(scanpath.cells.tolist()) == list(range(6))
-
-
 @pytest.fixture
 def explorer():
     """An agent that calibrates its detections and looks where it expects the largest information gain."""
@@ -297,25 +290,6 @@ def test_class_names_are_suggested(agent, image):
         agent.search(image, 3)
     with pytest.raises(InputError, match="start"):
         agent.search(image, 1, start=48)
-
-
-def test_confirmation_needs_cell_class_and_score():
-    grid = Grid(8, 6, SIZE)
-    boxes = torch.tensor([[[10.0, 10, 19, 19]]])
-    sure = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[True]]))
-    unsure = Detections(boxes, torch.tensor([[[0.1, 0.4, 0.5]]]), torch.tensor([[True]]))
-    padded = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[False]]))
-
-    def confirmed(seen, cell, score):
-        answer = confirms(seen, grid, torch.tensor([cell]), 1, score)
-        assert answer.shape == (1,)
-        return bool(answer)
-
-    assert confirmed(sure, 0, 0.5)
-    assert not confirmed(sure, 1, 0.5)
-    assert not confirmed(sure, 0, 0.9)
-    assert not confirmed(unsure, 0, 0.3)
-    assert not confirmed(padded, 0, 0.5)
 
 
 def test_confirmation_of_a_batch_equals_that_of_each_look():

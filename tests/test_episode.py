@@ -230,36 +230,10 @@ def test_ties_are_broken_by_the_noise_of_each_episode(most, values):
     check_against_loop(Semantic(4), SemanticLoop, acquisition, most, values)
 
 
-def test_an_episode_ends_when_every_cell_was_visited():
-    looks = StoredLooks(stored(), GRID)
-    steps = list(rollout(looks, Semantic(4), Uniform(), START, Greedy(drawn_from(NOISE)), most=50))
-    assert len(steps) == CELLS
-    assert bool(steps[-1].visited.all())
-    assert all(len(step.episodes) == BATCH for step in steps)
-    for episode in range(BATCH):
-        assert sorted(int(step.cell[episode]) for step in steps) == list(range(CELLS))
-
-
 def test_without_episodes_or_looks_there_is_no_step():
     looks, choice = StoredLooks(stored(), GRID), Greedy(drawn_from(NOISE))
     assert not list(rollout(looks, Semantic(4), Uniform(), START[:0], choice, most=3))
     assert not list(rollout(looks, Semantic(4), Uniform(), START, choice, most=0))
-
-
-def test_a_step_marks_visits_and_fuses():
-    """A look sees a box in one corner; the update does not change the belief before it."""
-    boxes = torch.tensor([[[61.0, 31, 89, 59]]]).expand(CELLS, 1, 4)
-    seen = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]).expand(CELLS, 1, 3), torch.ones(CELLS, 1).bool())
-    steps = rollout(
-        StoredLooks(seen, GRID), Semantic(3), TargetPosterior(1), torch.tensor([0]), Greedy(drawn_from(NOISE)), most=3
-    )
-    first, second, third = steps
-    assert [step.visited[0].nonzero()[:, 0].tolist() for step in (first, second)] == [[0], [0, 5]]
-    assert first.next_cell.tolist() == second.cell.tolist() == [5]
-    assert not third.visited[0, third.next_cell]
-    present = [step.belief.probability(1)[0] for step in (first, second)]
-    assert bool(((present[0] > 1 / 3 + 1e-6) == (torch.arange(CELLS) == 5)).all())
-    assert present[1][5] > present[0][5]
 
 
 def test_the_acquisition_is_made_for_the_episodes_that_are_not_over():

@@ -158,7 +158,7 @@ def test_command_runs_as_printed(line, folder, run):
 
 @pytest.mark.slow
 def test_the_three_commands_for_a_custom_detector_run(folder, run):
-    """As printed, except for a smaller fit and a detector of colours instead of cups; and the study of a checkout."""
+    """As printed, except for a tiny fit and a detector of colours instead of cups; and the study of a checkout."""
     page = (ROOT / "docs/detectors.md").read_text(encoding="utf-8")
     assert all(line in page for line in OWN)
     (study,) = (line.split() for line in page.splitlines() if line.startswith("python -m eval.search --models"))
@@ -167,7 +167,8 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
         (folder / name).mkdir()
         write_photographs(folder / name).rename(folder / instances)
     fit, find, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
-    assert written_files(run([*fit, *SMALL]))
+    tiny = [*SMALL, *["--data.limit", "6", "--holdout", "3", "--steps", "3", "--map_steps", "3", "--fixations", "2"]]
+    assert written_files(run([*fit, *tiny]))
     assert "red" in run(find)
     assert "red" in run(search)
     assert written_files(run([*study, "--data.min_instances", "0", "--data.limit", "1"]))

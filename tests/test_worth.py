@@ -89,11 +89,12 @@ def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, i
     agent = agent_of(model, Gain(model))
     scanpath = agent.explore(image, start=7, shifts=19, worth=0.25)
     assert scanpath.ending == "worth"
+    expected = largest_gains(model, scanpath)
     for number, values in enumerate(scanpath.values):
         left = values.clone()
         left[scanpath.cells[: number + 1]] = -math.inf
         assert (float(left.max()) < 0.25) == (number == len(scanpath) - 1)
-        assert float(left.max()) == pytest.approx(largest_gains(model, scanpath)[number], abs=1e-5)
+        assert float(left.max()) == pytest.approx(expected[number], abs=1e-5)
 
 
 def test_until_none_means_the_default_price(model, image):

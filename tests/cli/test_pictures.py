@@ -313,6 +313,9 @@ def test_file_names_are_escaped_in_the_report(run, photo, tmp_path):
     assert episodes_of(tmp_path / "page.html")[0]["name"] == photo.name
 
 
+ONE = ("--draw", "scanpath")
+
+
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -321,8 +324,8 @@ def test_file_names_are_escaped_in_the_report(run, photo, tmp_path):
         ("search", "--target", "Cups"),
         ("find", "--target", "cup"),
         ("explore", "--shifts", 1),
-        ("search", "--target", "cup", "--agent", "published", "--sensor", "published-narrow", "--shifts", 1),
-        ("explore", "--agent", "raw", "--sensor", "gradual", "--shifts", 1),
+        ("search", "--target", "cup", "--agent", "published", "--sensor", "published-narrow", "--shifts", 1, *ONE),
+        ("explore", "--agent", "raw", "--sensor", "gradual", "--shifts", 1, *ONE),
     ],
     ids=lambda options: " ".join(map(str, options[:5])),
 )

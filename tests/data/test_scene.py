@@ -48,13 +48,6 @@ def test_a_target_that_covers_exactly_the_limit_is_legal():
     assert legal_targets(scene, None) == [2, 5]
 
 
-def test_overlap_counts_once_in_the_union():
-    boxes = torch.tensor([[0.0, 0.0, 15.0, 10.0], [0.0, 0.0, 15.0, 10.0]])
-    scene = Annotation(boxes, torch.tensor([1, 1]), torch.zeros(2, dtype=torch.bool), (100, 10))
-    assert legal_targets(scene, 0.2, "sum") == []
-    assert legal_targets(scene, 0.2, "union") == [1]
-
-
 def test_bad_arguments():
     with pytest.raises(InputError, match="coverage"):
         box_coverage(torch.zeros(1, 4), (4, 4), "mean")

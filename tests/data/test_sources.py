@@ -1,6 +1,6 @@
 """Pictures from files, folders, videos and embedded scenes, and the errors for unreadable sources."""
 
-import builtins
+import sys
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
@@ -86,14 +86,7 @@ def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
         open_stream(tmp_path / "none.mp4")
     with pytest.raises(DataError, match="camera 99: cannot be opened; check that it is connected"):
         open_stream(99)
-    real = builtins.__import__
-
-    def without_opencv(name, *rest, **options):
-        if name == "cv2":
-            raise ImportError(name)
-        return real(name, *rest, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without_opencv)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(DataError, match="pip install opencv-python-headless"):
         open_stream(broken)
 

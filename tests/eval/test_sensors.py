@@ -7,17 +7,13 @@ from eval import semba, sensors
 from eval.semba import SembaConfig, search_scene
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
-from tests.colours import write_network, write_photographs
+from tests.colours import write_home
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """A folder with a network of 64 × 64 pixels, and photographs of coloured squares."""
-    folder = tmp_path_factory.mktemp("colours")
-    write_network(folder / "colours.onnx")
-    (folder / "photographs").mkdir()
-    write_photographs(folder / "photographs", 6)
-    return folder
+    return write_home(tmp_path_factory.mktemp("colours"), 6)
 
 
 CROPS = {"settings": {"side": 64, "scales": 3}}

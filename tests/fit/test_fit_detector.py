@@ -40,16 +40,13 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
-from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_network, write_photographs
+from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """The parent folder of a network, photographs and the models fitted to them."""
-    folder = tmp_path_factory.mktemp("fit_detector")
-    write_network(folder / "colours.onnx")
-    (folder / "photographs").mkdir()
-    write_photographs(folder / "photographs")
+    folder = write_home(tmp_path_factory.mktemp("fit_detector"))
     torch.set_num_threads(1)
     assert command(arguments(folder)) == 0
     return folder
@@ -187,8 +184,7 @@ def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["verification", "map"])
-@pytest.mark.parametrize("lost", ["model", "record"])
+@pytest.mark.parametrize(("part", "lost"), [("verification", "model"), ("map", "record")])
 def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, lost):
     """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
     shutil.copytree(home / "models", tmp_path / "models")

@@ -20,18 +20,14 @@ from semfov.runs.looking import looking_of
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
-from tests.colours import COLOURS, write_network, write_photographs
+from tests.colours import COLOURS, write_home
 from tests.small import Tiles
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """The parent folder of a network and of photographs, 16 of which are held out."""
-    folder = tmp_path_factory.mktemp("windows")
-    write_network(folder / "colours.onnx")
-    (folder / "photographs").mkdir()
-    write_photographs(folder / "photographs", 48)
-    return folder
+    return write_home(tmp_path_factory.mktemp("windows"), 48)
 
 
 def folder_of(home, **settings):
@@ -40,7 +36,7 @@ def folder_of(home, **settings):
     config = FitDetectorConfig(
         model=home / "colours.onnx",
         data=DataConfig(root, root / "instances.json", min_instances=0, max_target_area=None),
-        columns=4, rows=4, window_steps=20, workers=1,
+        columns=4, rows=4, window_steps=8, workers=1,
         out=home / "models", cache=home / "cache",
     )  # fmt: skip
     config = replace(config, **settings).named()
@@ -49,6 +45,12 @@ def folder_of(home, **settings):
 
 @pytest.mark.slow
 def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continues(home, tmp_path, monkeypatch):
+    usual = FitDetectorConfig.mosaics
+
+    def fewer(*given):
+        return replace(usual(*given), mosaics=2, crowded=1, judged=2, searched=2)
+
+    monkeypatch.setattr(FitDetectorConfig, "mosaics", fewer)
     folder = folder_of(home)
     fitted = folder.fit("windows")
     config = folder.fits["windows"].settings
@@ -62,10 +64,10 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     # Looks and the finished part are read again; only the fit is repeated when its record is lost.
     before = (home / "models/windows.safetensors").read_bytes()
     (home / "models/progress/windows.json").unlink()
-    monkeypatch.setattr("semfov.zoom.glances.LiveGlances.see", None)
-    assert folder_of(home).fit("windows") == fitted
+    with monkeypatch.context() as stored:
+        stored.setattr("semfov.zoom.glances.LiveGlances.see", None)
+        assert folder_of(home).fit("windows") == fitted
     assert (home / "models/windows.safetensors").read_bytes() == before
-    monkeypatch.undo()
     monkeypatch.setattr("semfov.fit.parts.windows.fit_mosaics", None)
     folder = folder_of(home)
     assert folder.fit("windows") == fitted

@@ -44,10 +44,3 @@ def test_value_equals_the_loop(beta):
                 missed = max(float(p[x, k] * Model.miss_rate[k, n]) for k in (1, 2))
                 total += max(0.0, seen + missed - float(p[x, 1:].max()))
             assert float(got[episode, f]) == pytest.approx(total)
-
-
-def test_value_is_zero_where_every_cell_is_certain():
-    beta = torch.full((1, 12, 3), 1e-6)
-    beta[0, :6, 0] = 1000.0
-    beta[0, 6:, 2] = 1000.0
-    assert values_of(ExpectedAccuracy(Model(), GRID), beta).abs().max() < 1e-5

@@ -105,11 +105,13 @@ def one_row(tensors, row):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_batch_gives_the_values_of_each_episode_alone(name):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_batch_gives_the_values_of_each_episode_alone(name, dtype):
     """Bit for bit, so that results do not depend on how many episodes share a tensor."""
-    together = EVERY[name]()(beliefs(), visits())
+    known = beliefs().map(lambda tensor: tensor.to(dtype))
+    together = EVERY[name]()(known, visits())
     for row in range(3):
-        alone = one_row(EVERY[name](), row)(beliefs()[row : row + 1], visits()[row : row + 1])
+        alone = one_row(EVERY[name](), row)(known[row : row + 1], visits()[row : row + 1])
         assert torch.equal(alone, together[row : row + 1])
 
 
@@ -189,3 +191,29 @@ def test_evidence_of_objects_equals_the_loop():
         for x in range(12):
             first, *others = beta[episode, x].tolist()
             assert float(got[episode, x]) == pytest.approx(sum(others) / (first + sum(others)), rel=1e-6)
+
+
+def test_static_values_need_one_for_each_cell_and_uniform_ones_are_zero():
+    assert EVERY["Uniform"]()(beliefs(), visits()).tolist() == [[0.0] * 12] * 3
+    one = rand(12)
+    assert torch.equal(acquisition.Static(one)(beliefs(), visits()), one.expand(3, 12))
+    with pytest.raises(InputError, match="values"):
+        acquisition.Static(one[:11])(beliefs(), visits())
+
+
+@pytest.mark.parametrize("name", ["TargetPosterior", "PredictedTargetPosterior", "NeighbourhoodPosterior"])
+def test_a_belief_without_a_batch_gives_the_values_of_its_episode(name):
+    made = {"TargetPosterior": (), "PredictedTargetPosterior": (model(),)}.get(name, (model(), GRID))
+    function = getattr(acquisition, name)(2, *made)
+    torch.testing.assert_close(function(beliefs()[1], visits()[1]), function(beliefs(), visits())[1])
+
+
+@pytest.mark.parametrize("target", [-1, 4])
+def test_a_target_out_of_range_is_refused(target):
+    with pytest.raises(InputError, match="target"):
+        acquisition.TargetPosterior(target)(beliefs(), visits())
+
+
+def test_a_neighbourhood_of_zero_width_is_refused():
+    with pytest.raises(InputError, match=r"^sigma:"):
+        acquisition.NeighbourhoodPosterior(3, model(), GRID, sigma=0.0)

@@ -47,20 +47,6 @@ def test_the_first_fixation_is_at_the_centre():
     torch.testing.assert_close(values, values.flip(-1))
 
 
-def test_value_is_zero_after_every_cell_was_in_the_fovea():
-    belief = DirichletBelief(torch.ones(1, 12, 5), torch.full((1, 12), 0.99 * FOVEA))
-    assert not CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool)).any()
-
-
-def test_value_is_almost_zero_where_every_cell_is_certain():
-    beta = torch.full((1, 12, 5), 1e-9)
-    beta[..., 2] = 1.0
-    values = CloserLook(GRID, FOVEA)(
-        DirichletBelief(beta, torch.full((1, 12), 9.0)), torch.zeros(1, 12, dtype=torch.bool)
-    )
-    assert values.abs().max() < 1e-6
-
-
 def test_a_fovea_of_zero_width_is_refused():
     with pytest.raises(InputError, match="fovea"):
         CloserLook(GRID, 0.0)

@@ -149,11 +149,6 @@ def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected
             resolve(f"{policy}-{scores}", task)
 
 
-def test_expected_gain_is_no_search_policy():
-    with pytest.raises(InputError, match="policy"):
-        resolve(PolicyConfig("expected-gain", "learned"), "search")
-
-
 @pytest.mark.parametrize(
     "setting", [{"tempering": 0.5}, {"footprint": "soft"}, {"memory": "closest"}, {"misses": True}], ids=str
 )

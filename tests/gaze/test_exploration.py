@@ -180,16 +180,6 @@ def test_small_divergences_are_accurate_in_single_precision(model):
         torch.testing.assert_close(single.double(), double, rtol=1e-2, atol=0)
 
 
-def test_the_first_fixation_is_at_the_centre_for_foveal_vision():
-    """With the same belief in every cell, the best fixation is the one with most cells nearby."""
-    near, far = 1 + 8 * torch.eye(3), 1 + 0.2 * torch.eye(3)
-    model = FovealObservationModel(torch.stack([near, far], 1), [0.42], ["cup", "cat"]).requires_grad_(False)
-    grid = Grid(5, 5, (50, 50))
-    beta = torch.tensor([1.0, 2.0, 0.5]).expand(1, 25, 3)
-    for acquisition in (KLDivergence, NegativeEntropy, UpperConfidenceBound):
-        assert values_of(acquisition(model, grid), beta).argmax() == 12
-
-
 def test_bad_arguments(model):
     grid = GRIDS["wide"]
     with pytest.raises(InputError, match="classes"):

@@ -172,7 +172,9 @@ globals().update(
 )
 
 
-class TestGain(TestExpectedGain):
+class TestGain(PolicyTester):
+    inputs = TestExpectedGain.inputs
+
     def make(self):
         return policies.Gain(mapping())
 
@@ -219,7 +221,7 @@ class TestVOCUS2(GraphTester):
     autocast = 0.05
 
     def make(self):
-        return saliency.VOCUS2()
+        return saliency.VOCUS2(layers=2)
 
     def inputs(self):
         return (rand(2, 3, 40, 60),)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError
-from semfov.gaze import select_fixation
 from semfov.gaze.acquisition import (
     AcquisitionFunction,
     BayesianSurprise,
@@ -64,26 +63,6 @@ def test_uniform_saliency_changes_nothing(name, level):
     torch.testing.assert_close(guided - guided.mean(-1, keepdim=True), plain.log() - plain.log().mean(-1, keepdim=True))
 
 
-def test_a_large_weight_leaves_the_order_to_saliency():
-    guided = values(SaliencyPrior(TargetPosterior(2), SALIENCY, weight=1e6))
-    assert torch.equal(guided.argsort(-1), SALIENCY.argsort(-1))
-
-
-def test_a_cell_with_zero_saliency_can_be_chosen():
-    """Its prior is about a thousandth of that of the most salient cell."""
-    saliency = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    belief = DirichletBelief(torch.tensor([[[1.0, 1e-6], [1e-6, 1.0]]], dtype=torch.float64))
-    guided = SaliencyPrior(TargetPosterior(1), saliency, weight=1.0)(belief, torch.zeros(1, 2, dtype=torch.bool))
-    assert guided.argmax() == 1
-    ratio = SaliencyPrior(Static(torch.ones(2)), saliency, weight=1.0)(belief, torch.zeros(1, 2, dtype=torch.bool))[0]
-    assert float((ratio[1] - ratio[0]).exp()) == pytest.approx(1e-3 / 1.001, rel=1e-6)
-
-
-def test_the_unit_of_saliency_does_not_matter():
-    one, other = (values(SaliencyPrior(TargetPosterior(2), SALIENCY * unit, weight=0.3)) for unit in (1.0, 255.0))
-    torch.testing.assert_close(one, other)
-
-
 def test_one_saliency_map_applies_to_all_episodes():
     one = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1], weight=0.3))
     each = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1].expand(3, 12), weight=0.3))
@@ -98,14 +77,6 @@ def test_cells_whose_value_is_not_positive_come_last():
     assert bool(got.isfinite().all())
     assert got.argsort(-1, descending=True)[0, :2].tolist() == [0, 3]
     assert got[0, 1] == got[0, 2]
-
-
-def test_the_choice_maximises_the_product_of_value_and_saliency():
-    """The cell with the largest v s^w, as Torralba and others (2006) multiply them."""
-    noise = torch.rand(3, 12, generator=torch.Generator().manual_seed(2))
-    chosen = select_fixation(values(SaliencyPrior(TargetPosterior(2), SALIENCY, weight=0.5)), NOWHERE, noise)
-    raised = SALIENCY + 1e-3 * SALIENCY.amax(-1, keepdim=True)
-    assert torch.equal(chosen, (values(TargetPosterior(2)) * raised**0.5).argmax(-1))
 
 
 def test_bad_arguments():

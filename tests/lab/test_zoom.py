@@ -9,13 +9,13 @@ import torch
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
 from eval.zoom.objects import average_precision, in_all_table, object_figures
+from eval.zoom.orders import in_order, quad_tree, shuffled
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.runs.config import DataConfig
 from semfov.runs.window_looking import right_boxes
-from semfov.runs.zoom_orders import in_order, quad_tree, shuffled
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.lattice import Lattice

@@ -63,16 +63,6 @@ def test_error_of_the_area_is_that_of_delong():
     assert float(got.error) == pytest.approx(expected, rel=0.08)
 
 
-def test_dependent_cases_have_a_larger_error():
-    """Cases that repeat those of their group add nothing: the error is that of the groups."""
-    single = torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    error = single.std() / 40**0.5
-    together = Bootstrap.of(mean_of(single.repeat(5)), [*range(40)] * 5, samples=2000).error
-    apart = Bootstrap.of(mean_of(single.repeat(5)), range(200), samples=2000).error
-    assert float(together) == pytest.approx(float(error), rel=0.06)
-    assert float(apart) == pytest.approx(float(error) / 5**0.5, rel=0.06)
-
-
 def test_differences_are_paired():
     """Two figures that differ by a constant differ without an error."""
     drawn = Bootstrap.of(lambda index: torch.stack([CASES[index].mean(), CASES[index].mean() + 3]), GROUPS)

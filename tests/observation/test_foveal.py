@@ -14,7 +14,6 @@ import scipy.optimize
 import scipy.stats
 import torch
 
-from semfov.belief.fusion import kaplan
 from semfov.errors import InputError
 from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
@@ -97,15 +96,6 @@ def test_calibrated_scores_match_equation_11():
         np.testing.assert_allclose(got[i, j], expected, rtol=1e-9, atol=0)
 
 
-def test_kaplans_rule_does_not_need_the_normalisation_of_equation_11():
-    """Section III-D: "the normalization of the likelihoods is not ultimately relevant"."""
-    model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
-    beta = torch.full((4,), 0.5, dtype=torch.float64)
-    with torch.no_grad():
-        densities = model.log_likelihood(scores, distance).exp()
-        torch.testing.assert_close(kaplan(beta, model.calibrate(scores, distance)), kaplan(beta, densities))
-
-
 def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
     """Beyond the paper, in which the prior is uniform and τ is 1."""
     alpha, scores, distance = table(), *looks()
@@ -155,16 +145,6 @@ def test_expected_scores_match_the_means_of_equation_16():
     given = torch.full((4, 3, 4), 0.25, dtype=torch.float64)
     fixed = FovealObservationModel(table(), EDGES, CLASSES, expected=given)
     assert torch.equal(fixed.expected_scores(), given)
-
-
-def test_likelihoods_and_expected_scores_are_differentiable():
-    model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES, tempering=0.5), looks(shape=(3,))
-
-    def values(log_alpha, scores):
-        with torch.nn.utils.stateless._reparametrize_module(model, {"log_alpha": log_alpha}):
-            return model.log_likelihood(scores, distance), model.expected_scores()
-
-    assert torch.autograd.gradcheck(values, (model.log_alpha.detach().requires_grad_(), scores.requires_grad_()))
 
 
 def test_the_given_table_is_copied():

@@ -65,13 +65,6 @@ def test_the_gradient_is_zero_at_the_optimum_in_40_digit_arithmetic():
             assert abs(total - mpmath.digamma(a) + mpmath.mpf(g)) < 1e-12 * max(1.0, abs(g))
 
 
-def test_fit_of_a_beta_distribution_matches_scipy():
-    samples = np.random.default_rng(0).beta(2.0, 0.7, 200)
-    a, b, _, _ = scipy.stats.beta.fit(samples, floc=0, fscale=1)
-    mean_log = torch.tensor([np.log(samples).mean(), np.log1p(-samples).mean()])
-    np.testing.assert_allclose(mle(mean_log), [a, b], rtol=1e-6)
-
-
 def test_fit_matches_the_pypi_package():
     samples = np.random.default_rng(1).dirichlet([3.0, 0.5, 8.0, 1.0], 100)
     mean_log = torch.from_numpy(np.log(samples)).mean(0)

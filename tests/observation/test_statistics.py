@@ -68,17 +68,6 @@ def test_statistics_do_not_depend_on_the_order_or_split_of_samples(seed, shards,
     assert parts[0] == whole
 
 
-def test_batches_of_any_size_give_the_same_bits():
-    scores, labels, levels = samples(400, components=81)
-    whole = gather(scores, labels, levels)
-    for size in (1, 7, 90):
-        pieces = DirichletStatistics((3, 2), 81)
-        for first in range(0, 400, size):
-            rows = slice(first, first + size)
-            pieces.update(scores[rows], (labels[rows], levels[rows]))
-        assert pieces == whole
-
-
 def test_a_sum_over_cells_equals_pooled_statistics():
     scores, labels, levels = samples(200)
     pooled = gather(scores, labels, levels).sum(1)

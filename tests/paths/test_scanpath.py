@@ -1,10 +1,10 @@
 """Scanpaths as text, tables and files, and the views that they keep."""
 
-import builtins
 import dataclasses
 import json
 import math
 import shutil
+import sys
 from dataclasses import replace
 
 import pandas as pd
@@ -183,14 +183,7 @@ def test_rows_without_detections_and_times(scanpath, target):
 
 
 def test_to_frame_without_pandas_names_the_remedy(scanpath, monkeypatch):
-    importing = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "pandas":
-            raise ImportError(name)
-        return importing(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(InputError, match="pip install pandas"):
         scanpath.to_frame()
 

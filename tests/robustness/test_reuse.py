@@ -12,15 +12,7 @@ from semfov import acquisition, fusion
 from semfov.belief import DirichletBelief
 from semfov.belief.observers import Context, Target
 from semfov.gaze import select_fixation
-from tests.small import GRID, beliefs, context, detections, evidence, look, model, observing, rand
-
-
-@pytest.mark.parametrize("rule", ["kaplan", "product", "sum"])
-def test_vmap_of_fusion_equals_a_loop(rule):
-    update = getattr(fusion, rule)
-    beta, likelihood = 0.5 + rand(6, 4), 0.1 + rand(6, 4)
-    expected = torch.stack([update(*pair) for pair in zip(beta, likelihood, strict=True)])
-    torch.testing.assert_close(torch.func.vmap(update)(beta, likelihood), expected)
+from tests.small import beliefs, context, evidence, model, rand
 
 
 def test_vmap_of_the_choice_equals_a_loop():
@@ -56,15 +48,6 @@ def test_gradients_of_acquisition_values_reach_gaze_and_width_of_the_fovea():
     for leaf in (gaze, width):
         assert bool(torch.isfinite(leaf.grad).all())
         assert float(leaf.grad.abs().sum()) > 0
-
-
-def test_an_update_does_not_change_the_belief_that_it_is_given():
-    scores, boxes, fixation = (each[:1] for each in look())
-    observer = observing()
-    start = observer.start(1, GRID, scores)
-    after = observer(start, detections(scores, boxes), fixation, GRID)
-    assert float(start.beta.max()) == float(start.beta.min()) == 0.5
-    assert float(after.beta.max()) > 0.5
 
 
 def test_a_nested_observer_is_one_module_that_contains_all_its_parts():

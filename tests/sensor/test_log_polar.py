@@ -89,18 +89,6 @@ def test_back_projection_equals_a_loop_over_pixels():
             assert float(view[y, x]) == pytest.approx(expected, abs=1e-9)
 
 
-def test_rotating_the_image_shifts_the_wedges():
-    image, middle = draw(1, 3, 41, 41), torch.tensor([20.0, 20.0])
-    seen = log_polar(image, middle, fovea=6.0)
-    quarter = seen.shape[-1] // 4
-    turned = log_polar(image.rot90(-1, (-2, -1)), middle, fovea=6.0)  # clockwise, in the order of the wedges
-    close(turned, seen.roll(quarter, -1), 1e-9)
-    views = LogPolar(6.0)(torch.cat([image, image.rot90(-1, (-2, -1))]), middle)
-    # The fixated pixel has no direction; the code uses that of the x-axis.
-    views[..., 20, 20] = 0
-    close(views[1], views[0].rot90(-1, (-2, -1)), 1e-9)
-
-
 @given(
     size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
     gaze=st.tuples(st.floats(-50, 80), st.floats(-50, 80)),
@@ -113,13 +101,6 @@ def test_constant_image_stays_constant(size, gaze, fovea, spacing):
     seen = sensor.cortical(image, torch.tensor(gaze))
     close(seen, torch.full_like(seen, 0.3), 1e-9)
     close(sensor(image, torch.tensor(gaze)), image, 1e-9)
-
-
-@given(a=st.floats(-3, 3), b=st.floats(-3, 3), height=st.integers(1, 20), width=st.integers(1, 20))
-def test_the_sensor_is_linear_in_the_image(a, b, height, width):
-    first, second = draw(1, 2, height, width), draw(1, 2, height, width, seed=1)
-    gaze, sensor = torch.tensor([width / 3, height / 2]), LogPolar(4.0)
-    close(sensor(a * first + b * second, gaze), a * sensor(first, gaze) + b * sensor(second, gaze), 1e-10)
 
 
 def contrast(wavelength, fovea, size=801):

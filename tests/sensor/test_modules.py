@@ -15,7 +15,7 @@ class TestFoveation(GraphTester):
     differentiable = (0, 1)
 
     def make(self):
-        return Foveation(9.0, learnable=True)
+        return Foveation(9.0, levels=2, learnable=True)
 
     def inputs(self):
         return rand(2, 3, 48, 64), GAZES
@@ -23,7 +23,7 @@ class TestFoveation(GraphTester):
 
 class TestFoveationAsOpenCV(TestFoveation):
     def make(self):
-        return Foveation(9.0, convention="opencv")
+        return Foveation(9.0, levels=2, convention="opencv")
 
     def inputs(self):
         return rand(2, 3, 33, 47), GAZES

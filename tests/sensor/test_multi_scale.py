@@ -61,11 +61,6 @@ def test_the_crops_equal_those_of_opencv(size):
     close(seen.permute(0, 2, 3, 1), np.stack(expected), 1e-4)
 
 
-def test_gradients():
-    image, gaze = draw(1, 1, 7, 6).requires_grad_(), (4 * draw(1, 2, 2) + 0.123).requires_grad_()
-    assert torch.autograd.gradcheck(MultiScaleFovea(4, 3), (image, gaze))
-
-
 @pytest.mark.parametrize("far", [500.0, 1e9, 1e30])
 def test_far_outside_the_picture_everything_is_black(far):
     image, gaze = torch.ones(1, 3, 60, 80, requires_grad=True), torch.tensor([far, -far], requires_grad=True)

@@ -16,7 +16,7 @@ from semfov.runs.command import run_command
 from semfov.runs.config import SensorConfig
 from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
 from semfov.sensor.named import SensorName
-from tests.colours import write_network, write_photographs
+from tests.colours import write_home
 from train.fit_fom import main as fit_fom
 
 
@@ -88,11 +88,7 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """A folder with a network and photographs of coloured squares."""
-    folder = tmp_path_factory.mktemp("log_polar")
-    write_network(folder / "colours.onnx")
-    (folder / "photographs").mkdir()
-    write_photographs(folder / "photographs", 8)
-    return folder
+    return write_home(tmp_path_factory.mktemp("log_polar"), 8)
 
 
 def given(home, out, *more):

@@ -45,11 +45,6 @@ def test_the_most_salient_unvisited_cell_holds_the_most_salient_pixel_left() -> 
         left[row * 6 : row * 6 + 6, column * 10 : column * 10 + 10] = 0
 
 
-def test_mean_over_cells_is_the_mean_over_pixels(device: torch.device) -> None:
-    saliency = torch.rand(3, 31, 50, dtype=torch.float64, device=device)
-    torch.testing.assert_close(cell_saliency(saliency, 8, 7).mean(-1), saliency.mean((-2, -1)))
-
-
 def test_gradients_and_compilation() -> None:
     saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
     for reduction in ("mean", "max"):

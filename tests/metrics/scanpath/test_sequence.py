@@ -43,12 +43,6 @@ def test_the_edit_distance_is_the_levenshtein_distance(a, b):
     assert edit_distance(a, b) == levenshtein(a, b)
 
 
-def test_scanpaths_may_be_arrays_of_labels():
-    a, b = np.array([3, 7, 7]), np.array([3, 7])
-    assert sequence_score(a, b) == pytest.approx(2 / 3)
-    assert edit_distance(a, b) == 1
-
-
 def test_cell_labels_match_the_grid():
     from semfov.belief.grid import Grid
 

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition, dirichlet, fusion
-from semfov.belief import fuse
-from semfov.gaze import select_fixation
+from semfov import dirichlet, fusion
 
 mp = mpmath.mp.clone()
 mp.dps = 60
@@ -74,6 +72,18 @@ def test_log_normaliser_is_accurate_for_tiny_and_huge_parameters():
     assert_close_to_exact(dirichlet.log_normaliser(rows()), [exact_normaliser(row) for row in table], size)
 
 
+def test_log_density_is_accurate_for_tiny_and_huge_parameters():
+    alpha = rows()
+    log_scores = torch.tensor([-1e-9, -300.0, -21.0], dtype=torch.float64).expand_as(alpha)
+    exact, size = [], []
+    for row, logs in zip(alpha.tolist(), log_scores.tolist(), strict=True):
+        row = [mp.mpf(a) for a in row]
+        terms = [(a - 1) * mp.mpf(log) for a, log in zip(row, logs, strict=True)]
+        exact.append(mp.fsum(terms) - exact_normaliser(row))
+        size.append(max(map(abs, terms)) + mp.fsum(abs(mp.loggamma(a)) for a in (*row, mp.fsum(row))))
+    assert_close_to_exact(dirichlet.log_prob(alpha, log_scores), exact, size)
+
+
 def test_entropy_is_accurate_for_tiny_and_huge_parameters():
     exact, size = [], []
     for row in [[mp.mpf(a) for a in row] for row in rows().tolist()]:
@@ -116,32 +126,3 @@ def test_trigamma_is_accurate_for_tiny_and_huge_arguments():
     x = torch.logspace(-6, 8, 57, dtype=torch.float64)
     exact = [float(mp.polygamma(1, mp.mpf(v))) for v in x.tolist()]
     np.testing.assert_allclose(torch.polygamma(1, x).numpy(), exact, rtol=1e-9)
-
-
-def test_beliefs_and_choices_do_not_depend_on_the_batch():
-    """Fused beliefs and choices of every acquisition function are the same in a batch and alone."""
-    generator = torch.Generator().manual_seed(3)
-    beta = 0.5 + torch.rand(16, 30, 9, generator=generator)
-    likelihood = torch.rand(16, 12, 9, generator=generator).softmax(-1)
-    footprint = torch.rand(16, 12, 30, generator=generator) < 0.3
-    whole = fuse(beta, likelihood, footprint)
-    assert torch.equal(
-        whole, torch.cat([fuse(*(t[i : i + 1] for t in (beta, likelihood, footprint))) for i in range(16)])
-    )
-    alpha = 0.5 + 3 * torch.rand(9, 3, 9, generator=generator) + 2 * torch.eye(9)[:, None]
-    model = FovealObservationModel(alpha, [0.2, 0.4], [f"class {n}" for n in range(8)]).eval().requires_grad_(False)
-    grid, noise = Grid(6, 5, (60, 50)), torch.rand(16, 30, generator=generator)
-    visited = torch.zeros(16, 30, dtype=torch.bool)
-    for value in (
-        acquisition.TargetPosterior(4),
-        acquisition.PredictedTargetPosterior(4, model),
-        acquisition.KLDivergence(model, grid),
-        acquisition.NegativeEntropy(model, grid),
-        acquisition.TwoPeaks(model, grid),
-    ):
-        together = select_fixation(value(DirichletBelief(whole), visited), visited, noise)
-        alone = [
-            select_fixation(value(DirichletBelief(whole[i : i + 1]), visited[:1]), visited[:1], noise[i : i + 1])
-            for i in range(16)
-        ]
-        assert torch.equal(together, torch.cat(alone))
