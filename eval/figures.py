@@ -32,7 +32,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
 from semfov.runs.remembered import look_everywhere
-from semfov.runs.saliency_store import seen_by
+from semfov.runs.saliency_store import open_at_reference
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.sensor.named import SensorName, named_sensor
@@ -284,7 +284,7 @@ def grid_example(example: Example) -> Figure:
 def saliency_example(example: Example) -> Figure:
     """The foveal image after a few looks, and its saliency by VOCUS2, which is 0 in the cells that were visited."""
     grid, model, reduction = example.grid, VOCUS2(), SaliencyConfig().reduction
-    state, points = seen_by(example.eye.sensor, example.eye.reference, example.image, grid.centres)
+    state, points = open_at_reference(example.eye.sensor, example.eye.reference, example.image, grid.centres)
     visited, cells = torch.zeros(1, len(grid), dtype=torch.bool), [int(example.scanpath.cells[0])]
     for _ in range(LOOKS):
         view = example.eye.sensor.picture(state, points[cells[-1]][None])

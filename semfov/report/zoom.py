@@ -18,7 +18,7 @@ from semfov.paths.stimulus import LONGEST
 from semfov.report.episode import Data, jpeg_uri, rounded, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.viz.head import head_views
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
 _Frame = tuple[int, int, int, int]
@@ -264,9 +264,9 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     parts = (view.boxes.tolist(), seen.boxes[0].tolist(), seen.labels[0].tolist(), seen.confidence[0].tolist())
     for box, place, vector, label, score in zip(*parts[:2], seen.scores[0], *parts[2:], strict=True):
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label and float(vector[path.target]) >= FOUND:
+        if path.target is not None and label and float(vector[path.target]) >= DETECTION_SCORE:
             label, score = path.target, float(vector[path.target])
-        if score >= FOUND:
+        if score >= DETECTION_SCORE:
             first = label == path.target
             corners = {"box": [round(n, 1) for n in box], "place": [round(n, 1) for n in place]}
             rows.append((first, score, {**corners, "label": path.classes[label], "score": rounded(score)}))
