@@ -10,7 +10,7 @@ from eval.search.run import SearchRun
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow]
+pytestmark = [pytest.mark.weights, pytest.mark.slow, pytest.mark.lab]
 
 SEARCHES = [
     "recommended",

@@ -182,6 +182,7 @@ def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
     assert path.decision.outcome == ("absent" if any(sure) else "undecided")
 
 
+@pytest.mark.slow
 def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
     world = Panorama(panorama)
     everything = agent.find_all(world, passes=30)

@@ -86,6 +86,7 @@ def test_every_look_at_a_camera_takes_a_new_frame(agent, panorama):
     assert camera.asked == [tuple(path.pose(number)[:2].tolist()) for number in range(6)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_objects_are_where_they_are_though_the_camera_is_a_little_off(exact, panorama, noise):
     """A camera that reports its direction knows where an object is, whatever the error of its motors."""

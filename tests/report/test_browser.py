@@ -158,8 +158,7 @@ def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
     assert max(float(width) for width in widths) <= 3.5 * 80 / 640
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1200, 900), (360, 740)], ids=["desktop", "phone"])
+@pytest.mark.parametrize(("size", "scheme"), [((1200, 900), "light"), ((360, 740), "dark")], ids=["desktop", "phone"])
 @pytest.mark.parametrize("kind", ["episodes", "run", "notebook", "large"])
 def test_axe_finds_no_accessibility_violation(
     chromium, path, run_page, zoom_page, scanpath, kind, size, scheme, tmp_path

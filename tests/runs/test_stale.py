@@ -43,6 +43,7 @@ def config(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, monkeypatch, caplog):
     first = SearchRun(config)
     finish(first, "searching")
@@ -147,6 +148,7 @@ def test_a_policy_given_twice_is_refused(config):
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
     """The same command and folder, after the choice of the next cell has been inverted."""
     tree = tmp_path / "tree"

@@ -96,6 +96,7 @@ def test_windows_are_looked_at_again_after_the_half_life_of_evidence(agent, pict
     assert len(last) < 30 - len(overviews) + 1
 
 
+@pytest.mark.slow
 def test_objects_that_move_or_leave_are_forgotten(agent):
     """A square jumps to another place: soon it is shown there, and nowhere else."""
 
