@@ -173,7 +173,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(height * scale)), max(1, round(width * scale))
-    pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, kept=1))
+    pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
     return resized(pixels, size)[0].contiguous()
 
 
