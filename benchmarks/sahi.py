@@ -35,7 +35,7 @@ from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom.episode import Order, look_by_look
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -154,7 +154,7 @@ class Outcome:
 def sliced(run: ZoomRun, pixels: NDArray[np.uint8], **merging: str) -> tuple[Objects, int]:
     """Objects that SAHI reports for a picture `(H, W, 3)`, and its passes; `merging` changes its default rules."""
     config = run.config
-    model = Slicing(run.eye.detector, run.target, FOUND)
+    model = Slicing(run.eye.detector, run.target, DETECTION_SCORE)
     result = get_sliced_prediction(
         pixels,
         model,
@@ -176,14 +176,14 @@ def ordered(run: ZoomRun, pixels: NDArray[np.uint8], order: Callable[[Lattice], 
     """Objects that an order of windows shows in a picture, and its passes."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
     seen = [turn.glance for turn in islice(look_by_look(glances, order(glances.lattice), None), run.config.passes)]
-    return merge(seen, run.target, score=FOUND), len(seen)
+    return merge(seen, run.target, score=DETECTION_SCORE), len(seen)
 
 
 def chosen(run: ZoomRun, pixels: NDArray[np.uint8], passes: int) -> tuple[Objects, int]:
     """Objects in the windows that semfov chooses, and its passes."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
     seen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
-    return merge(seen, run.target, score=FOUND), len(seen)
+    return merge(seen, run.target, score=DETECTION_SCORE), len(seen)
 
 
 def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects, int]]]:

@@ -32,7 +32,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
 from semfov.runs.remembered import look_everywhere
-from semfov.runs.saliency_store import seen_by
+from semfov.runs.saliency_store import open_at_reference
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.sensor.named import SensorName, named_sensor
@@ -40,13 +40,13 @@ from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
 from semfov.viz.drawing import (
     Tag,
     choose_fixations,
+    confident_detections,
     draw_boxes,
     draw_cells,
     draw_cross,
     draw_image,
-    draw_seen,
+    draw_look,
     draw_tags,
-    seen_well,
 )
 from semfov.viz.path import GazePath, path_of
 from semfov.viz.style import FOUND, GAZE, OTHER, lay_out, make_figure, save_figure, styled
@@ -182,7 +182,13 @@ def detection_example(example: Example) -> Figure:
     draw_cross(axes[1], example.fixation)
     lay_out(figure)
     for panel, seen in zip(axes, looks, strict=True):
-        draw_seen(panel, seen_well(seen, MOST), example.scanpath.classes, example.frame, target=example.scanpath.target)
+        draw_look(
+            panel,
+            confident_detections(seen, MOST),
+            example.scanpath.classes,
+            example.frame,
+            target=example.scanpath.target,
+        )
     return figure
 
 
@@ -191,7 +197,7 @@ def foveal_scene(example: Example) -> Figure:
     """The foveal image, and the distance from the fovea to the centre of each box, as a share of the longer side."""
     figure, (axes,) = example.pictures(1, 1, 5.4)
     draw_image(axes, example.foveated("published", example.fixation), example.grid)
-    seen = seen_well(example.scanpath.detections[0], MOST)
+    seen = confident_detections(example.scanpath.detections[0], MOST)
     boxes = seen.boxes[0]
     middles = (boxes[:, :2] + boxes[:, 2:]) / 2
     x, y = (example.fixation + 0.5).tolist()
@@ -213,9 +219,11 @@ def foveal_scene(example: Example) -> Figure:
 
 def ambiguities(example: Example) -> Figure | None:
     """An object whose class changes when it is seen from afar; None if there is none."""
-    sharp = seen_well(example.eye.detector(example.image[None]), MOST)
+    sharp = confident_detections(example.eye.detector(example.image[None]), MOST)
     everywhere = look_everywhere(example.eye, lambda: example.image[None], example.grid, None, str)
-    found = ambiguous(sharp, [seen_well(everywhere[cell : cell + 1], MOST) for cell in range(len(example.grid))])
+    found = ambiguous(
+        sharp, [confident_detections(everywhere[cell : cell + 1], MOST) for cell in range(len(example.grid))]
+    )
     if found is None:
         return None
     before, cell, after = found
@@ -255,7 +263,7 @@ def ambiguity(example: Example, before: Detections, after: Detections, fixation:
     axes[1].set_title("foveated")
     lay_out(figure)
     for panel, seen in zip(axes, (before, after), strict=True):
-        draw_seen(panel, seen, example.scanpath.classes, example.frame)
+        draw_look(panel, seen, example.scanpath.classes, example.frame)
     return figure
 
 
@@ -271,7 +279,7 @@ def grid_example(example: Example) -> Figure:
     from matplotlib.colors import ListedColormap
 
     figure, (axes,) = example.pictures(1, 1, 5.4)
-    grid, seen = example.grid, seen_well(example.scanpath.detections[0], MOST)
+    grid, seen = example.grid, confident_detections(example.scanpath.detections[0], MOST)
     draw_image(axes, example.foveated("published", example.fixation), grid)
     updated = grid.footprint(seen.boxes[0]).any(0)
     draw_cells(axes, grid, updated.float().masked_fill(~updated, torch.nan), cmap=ListedColormap([GAZE]), alpha=0.45)
@@ -284,7 +292,7 @@ def grid_example(example: Example) -> Figure:
 def saliency_example(example: Example) -> Figure:
     """The foveal image after a few looks, and its saliency by VOCUS2, which is 0 in the cells that were visited."""
     grid, model, reduction = example.grid, VOCUS2(), SaliencyConfig().reduction
-    state, points = seen_by(example.eye.sensor, example.eye.reference, example.image, grid.centres)
+    state, points = open_at_reference(example.eye.sensor, example.eye.reference, example.image, grid.centres)
     visited, cells = torch.zeros(1, len(grid), dtype=torch.bool), [int(example.scanpath.cells[0])]
     for _ in range(LOOKS):
         view = example.eye.sensor.picture(state, points[cells[-1]][None])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from semfov.agents.fovea import MOST_SHIFTS, FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook, given_of, only_for
+from semfov.agents.limits import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.windows import ZoomAgent, pays
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -204,9 +204,9 @@ class ActivePerception(nn.Module):
         return cls._of(raw_arguments(name, sensor, **options))
 
     @classmethod
-    def _of(cls, parts: dict[str, Any]) -> Self:
+    def _of(cls, fields: dict[str, Any]) -> Self:
         """The agent with these parts, ready for use."""
-        return cls(**parts).eval().requires_grad_(False)
+        return cls(**fields).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
@@ -371,12 +371,12 @@ class ActivePerception(nn.Module):
             )
         index = _one_class(target, self.classes)
         if kind == "head":
-            given = given_of(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
+            arguments = without_none(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
             only_for(kind, "fovea", "confirm", closer=closer)
-            return self.head.search(open_scene(picture, color), index, seed=seed, **given)
+            return self.head.search(open_scene(picture, color), index, seed=seed, **arguments)
         only_for(kind, "fovea", "none", start=start)
-        given = given_of(confirm=confirm, give_up=give_up, closer=closer, **limits)
-        return self.zoom.search(_large(picture, color), index, **given)
+        arguments = without_none(confirm=confirm, give_up=give_up, closer=closer, **limits)
+        return self.zoom.search(_large(picture, color), index, **arguments)
 
     def find_all(
         self,
@@ -435,11 +435,11 @@ class ActivePerception(nn.Module):
             record = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
             return _counting(record, least)
         if kind == "head":
-            given = given_of(worth=worth, duration=duration, **limits)
-            return _counting(self.head.find_all(open_scene(picture, color), targets, **given), least)
-        wanted = targets[0] if len(targets) == 1 else list(targets) or None
+            arguments = without_none(worth=worth, duration=duration, **limits)
+            return _counting(self.head.find_all(open_scene(picture, color), targets, **arguments), least)
+        aim = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(
-            _large(picture, color), wanted, batch=batch, **given_of(worth=worth, least=least, **limits)
+            _large(picture, color), aim, batch=batch, **without_none(worth=worth, least=least, **limits)
         )
 
     def explore(
@@ -499,10 +499,10 @@ class ActivePerception(nn.Module):
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
             return _counting(record, least)
         if kind == "head":
-            given = given_of(start=start, duration=duration, worth=worth, **limits)
-            return _counting(self.head.explore(open_scene(picture, color), seed=seed, **given), least)
+            arguments = without_none(start=start, duration=duration, worth=worth, **limits)
+            return _counting(self.head.explore(open_scene(picture, color), seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
-        return self.zoom.explore(_large(picture, color), **given_of(worth=worth, least=least, **limits))
+        return self.zoom.explore(_large(picture, color), **without_none(worth=worth, least=least, **limits))
 
     def live(
         self,
@@ -588,9 +588,9 @@ def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
 
 def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
     """Number of the only class of a target."""
-    wanted = [target] if isinstance(target, str | int) else list(target)
-    check(len(wanted) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
-    return class_index(wanted[0], classes[1:], "target")
+    targets = [target] if isinstance(target, str | int) else list(target)
+    check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
+    return class_index(targets[0], classes[1:], "target")
 
 
 def _large(picture: PictureLike, color: Color) -> LargePicture:

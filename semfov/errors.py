@@ -88,8 +88,8 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     if tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True)):
         return
     # The message is built only now, because a graph with dynamic sizes cannot write the sizes out.
-    wanted = ", ".join("any" if s is None else str(s) for s in shape)
-    check(False, argument, f"a tensor of shape (..., {wanted})", tuple(tensor.shape))
+    expected = ", ".join("any" if s is None else str(s) for s in shape)
+    check(False, argument, f"a tensor of shape (..., {expected})", tuple(tensor.shape))
 
 
 def check_tensor(value: object, argument: str) -> None:

@@ -143,13 +143,14 @@ class Eye(nn.Module):
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
         if self.sensor.crops == 1:
             return self.detector.detect(canvases, view.placement, back=back)
-        seen = self.detector.detect(canvases)
+        detections = self.detector.detect(canvases)
         height, width = canvases.shape[-2:]
-        frame = seen.boxes.new_tensor([0, 0, width, height]).expand(len(canvases), 1, 4)
+        frame = detections.boxes.new_tensor([0, 0, width, height]).expand(len(canvases), 1, 4)
         size = view.canvas.shape[-1], view.canvas.shape[-2]
-        seen = replace(seen, boxes=back(seen.boxes))
-        found = merge_crops(seen, back(frame)[:, 0], self.sensor.crops, width, size, self.detector.selection.limit)
-        return replace(found, boxes=view.placement.boxes_to_image(found.boxes))
+        detections = replace(detections, boxes=back(detections.boxes))
+        limit = self.detector.selection.limit
+        merged = merge_crops(detections, back(frame)[:, 0], self.sensor.crops, width, size, limit)
+        return replace(merged, boxes=view.placement.boxes_to_image(merged.boxes))
 
     def look(self, view: View, fixations: PointLike) -> Detections:
         """Look from fixations: apply the sensor, then detect.
@@ -189,9 +190,9 @@ class Eye(nn.Module):
         sides = window[2:] - window[:2]
         scale = (sides.new_tensor(self.detector.input_size) / sides).amin()
         width, height = (max(1, round(side)) for side in (sides * scale).tolist())
-        seen = self.detector(glimpse(image, window[None], (width, height)).clamp(0, 1))
+        detections = self.detector(glimpse(image, window[None], (width, height)).clamp(0, 1))
         unit = (sides / sides.new_tensor([width, height])).repeat(2)
-        return replace(seen, boxes=seen.boxes * unit + window[:2].repeat(2))
+        return replace(detections, boxes=detections.boxes * unit + window[:2].repeat(2))
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
         """Open an image and look from fixations.

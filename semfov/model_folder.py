@@ -87,13 +87,13 @@ class ModelFolder:
 
     def file(self, part: str) -> Path | None:
         """File of a part, whether the agent uses it or not; None if there is none."""
-        known = self.manifest.parts.get(lookup(part, PARTS, "part"))
-        return None if known is None or known.file is None else inside(self.path, known.file)
+        entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
+        return None if entry is None or entry.file is None else inside(self.path, entry.file)
 
     def used(self, part: str) -> bool:
         """Whether the agent uses a part."""
-        known = self.manifest.parts.get(lookup(part, PARTS, "part"))
-        return known is not None and known.used
+        entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
+        return entry is not None and entry.used
 
     def detector_source(
         self, detector: str | PathLike[str] | None = None, weights: str | PathLike[str] | None = None
@@ -110,17 +110,17 @@ class ModelFolder:
         Raises:
             DataError: a file is neither at its path relative to the folder nor at its absolute path.
         """
-        known = self.manifest.detector
-        options = dict(known["options"])
-        place = known.get("weights_file")
+        record = self.manifest.detector
+        options = dict(record["options"])
+        place = record.get("weights_file")
         if weights is not None:
             options["weights"] = os.fspath(weights)
         elif place is not None:
             options["weights"] = str(self._find(place))
         if detector is not None:
             return os.fspath(detector), options
-        place = known.get("model_file")
-        return (known["model"] if place is None else str(self._find(place))), options
+        place = record.get("model_file")
+        return (record["model"] if place is None else str(self._find(place))), options
 
     def load_detector(
         self,
@@ -143,10 +143,10 @@ class ModelFolder:
         """
         source, own = self.detector_source(detector, weights)
         loaded = load_detector(source, **{**own, **options})
-        told = self.manifest.detector["sha256"]
-        if NETWORKS.get(loaded.digest, loaded.digest) != NETWORKS.get(told, told):
+        digest = self.manifest.detector["sha256"]
+        if NETWORKS.get(loaded.digest, loaded.digest) != NETWORKS.get(digest, digest):
             raise DataError(
-                f"detector: expected the network that {self.path} was fitted to (sha256 {told[:12]}…), got {source} "
+                f"detector: expected the network that {self.path} was fitted to (sha256 {digest[:12]}…), got {source} "
                 f"(sha256 {loaded.digest[:12]}…); give the right file as detector=, or fit to this one: "
                 f"{fit_command(source)}"
             )

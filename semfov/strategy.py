@@ -41,8 +41,10 @@ class Strategy(nn.Module):
         if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
-        given: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
-        wanted, policy = weights_by_class(given, classes[1:]), self.policy
+        by_target: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
+        weights, policy = weights_by_class(by_target, classes[1:]), self.policy
         suits = isinstance(policy, NonPredictive | Random) or policy.by_place
-        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(given))
-        return Strategy(AnyOf(self.observer, wanted), policy), max(wanted, key=wanted.__getitem__), wanted
+        check(
+            suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(by_target)
+        )
+        return Strategy(AnyOf(self.observer, weights), policy), max(weights, key=weights.__getitem__), weights

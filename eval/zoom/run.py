@@ -36,7 +36,7 @@ from semfov.runs.window_looking import (
     right_boxes,
 )
 from semfov.zoom.episode import WindowStep, look_by_look
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -214,7 +214,7 @@ class ZoomRun(WindowLooking, SceneRun):
     def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
         counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
-        objects = merge(seen, self.target, score=FOUND)
+        objects = merge(seen, self.target, score=DETECTION_SCORE)
         return {
             "measure": "recall",
             "way": name,

@@ -86,7 +86,7 @@ class FoveaAgent:
         closer: int = 0,
     ) -> Scanpath:
         """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`)."""
-        strategy, index, wanted = self.searching.sought(target, self.classes)
+        strategy, index, weights = self.searching.sought(target, self.classes)
         grid = self.grid(image)
         goal = None if boxes is None else goal_cells(boxes, grid, image)
         chosen = strategy.observer.thresholds
@@ -96,7 +96,7 @@ class FoveaAgent:
             at = model.thresholds.changed(confirm, give_up)
             places, close_up = CandidateCells(grid, index), partial(self.eye.close_up, image)
             verifier = Verifier(model, places, close_up, at, closer)
-        outcome = outcome_of(wanted, grid, goal, thresholds, 0.5 if confirm is None else confirm)
+        outcome = outcome_of(weights, grid, goal, thresholds, 0.5 if confirm is None else confirm)
         episode = _Episode(self, image, grid, strategy, index, limits, verifier, outcome)
         scanpath, ended, last = episode.run(start, shifts, seed)
         index = class_meant(last.belief, index)

@@ -67,19 +67,19 @@ class EpisodeLimits:
         return float("inf") if self.passes is None else self.passes - passes
 
 
-def only_for(kind: str, suits: str, instead: str, **given: object) -> None:
+def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
     """Raise `InputError` for arguments that suit another kind of look.
 
     Args:
         kind: the kind of look.
         suits: the kind of look that the arguments suit.
         instead: what to give in their place.
-        given: the arguments; None is no argument.
+        arguments: the arguments; None is no argument.
 
     Raises:
         InputError: an argument was given, and the kind of look is another one.
     """
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value is not None and kind != suits:
             raise InputError(
                 f"{name}: expected None for a picture that is looked at by {kind!r}, got {value}; use {instead}, or "
@@ -87,6 +87,6 @@ def only_for(kind: str, suits: str, instead: str, **given: object) -> None:
             )
 
 
-def given_of(**values: Any) -> dict[str, Any]:
+def without_none(**values: Any) -> dict[str, Any]:
     """The arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}

@@ -219,7 +219,7 @@ class ZoomAgent(nn.Module):
         with torch.inference_mode():
             for turn in turns:
                 path.add(turn)
-                ending = limits.reached(len(path.seen), path.record)
+                ending = limits.reached(len(path.looks), path.record)
                 if ending is not None:
                     break
         return path.record(ending or ("windows" if evidence is None else "worth"))
@@ -320,22 +320,22 @@ def search_windows(
         The looks, the objects of the class, and the decision.
     """
     path = _Windows(glances, classes, target, (), evidence)
-    seen, values = path.seen, path.values
+    looks, values = path.looks, path.values
 
     def close_up(box: Tensor) -> Detections:
-        seen.append(look_closely(glances, box))
-        return seen[-1].detections
+        looks.append(look_closely(glances, box))
+        return looks[-1].detections
 
     deciding = WindowDecisions(evidence, target, close_up, confirm=confirm, give_up=give_up, closer=closer)
     ending: Ending | None = None
     for turn in look_for(glances, evidence, target, confirm=float("inf")):
         path.add(turn, counting=False)
-        ending = limits.reached(len(seen), path.record)
-        deciding.see(turn, len(seen), last=turn.ahead == 0 or limits.room(len(seen)) <= 1)
+        ending = limits.reached(len(looks), path.record)
+        deciding.see(turn, len(looks), last=turn.ahead == 0 or limits.room(len(looks)) <= 1)
         while ending is None and deciding.candidate is not None:
             values.append(deciding.candidate.probability)
             deciding.look()
-            ending = limits.reached(len(seen), path.record)
+            ending = limits.reached(len(looks), path.record)
         if deciding.outcome or ending is not None:
             break
     decision = deciding.decision(over=deciding.outcome > 0)
@@ -364,8 +364,8 @@ def search_slices(
     ending: Ending | None = None
     for turn in look_by_look(glances, ranked(usual_slices(glances.lattice), [target]), None):
         path.add(turn)
-        ending = limits.reached(len(path.seen), path.record)
-        decision = decide_by_score(path.seen, target, confirm)
+        ending = limits.reached(len(path.looks), path.record)
+        decision = decide_by_score(path.looks, target, confirm)
         if decision.outcome == "found":
             ending = "detection"
         if ending is not None:
@@ -407,15 +407,14 @@ def window_objects(
     # A belief about objects of any class says nothing about those of several.
     several = target is not None and not isinstance(target, int)
     remaining = 0.0 if belief is None or several else belief.remaining()
-    given = {"remaining": remaining, "promised": promised}
-    return probable_objects(glances, lattice, target, certainty, **given, latest=latest)
+    return probable_objects(glances, lattice, target, certainty, remaining=remaining, promised=promised, latest=latest)
 
 
 class _Windows:
     """The looks of an episode so far, of which records are made.
 
     Attributes:
-        seen: the looks.
+        looks: the looks.
         values: their values when they were chosen.
     """
 
@@ -433,7 +432,7 @@ class _Windows:
         self.least = least_of(self.certainty) if least is None else least
         self.belief: ZoomBelief | None = None
         self.promised = 0.0
-        self.seen: list[Glance] = []
+        self.looks: list[Glance] = []
         self.values: list[float] = []
         self.picture = glances.view.picture if isinstance(glances, LiveGlances) else None
         self.source = None if self.picture is None or self.picture.path is None else str(self.picture.path)
@@ -446,22 +445,22 @@ class _Windows:
     def add(self, turn: WindowStep[Any], *, counting: bool = True) -> None:
         """Keep a look; in a search its value is no number of objects, and none are counted that no look has shown."""
         if counting:
-            self.promised += turn.worth if self.seen else 0.0
+            self.promised += turn.worth if self.looks else 0.0
             self.belief = turn.belief
-        self.seen.append(turn.glance)
+        self.looks.append(turn.glance)
         self.values.append(turn.worth)
 
     def record(self, ending: Ending | None = None) -> ZoomPath:
         """The record so far."""
         objects, unseen = window_objects(
-            self.seen, self.glances.lattice, self.targets or self.target, self.certainty, self.belief, self.promised
+            self.looks, self.glances.lattice, self.targets or self.target, self.certainty, self.belief, self.promised
         )
         return ZoomPath(
             lattice=self.glances.lattice,
             classes=self.classes,
             target=self.target,
             targets=self.targets,
-            glances=tuple(self.seen),
+            glances=tuple(self.looks),
             values=tuple(self.values),
             candidates=objects,
             unseen=unseen,

@@ -255,12 +255,12 @@ class ContextPrior(Pretrained):
             raise DataError(f"{path}: expected a table with sha256 {sha256}, got {digest}; download it again")
         cooccurrence, missing = cooccurrence_from(read_named_table(path), classes, len(edges) + 1)
         place = torch.zeros(len(classes) + 1, 1, 1)
-        told: dict[str, Any] = {"source": source, "sha256": digest, "missing": missing}
+        origin: dict[str, Any] = {"source": source, "sha256": digest, "missing": missing}
         if places is not None:
             place = places_from(read_named_table(places), classes)
-            told["places_sha256"] = _digest(places)
+            origin["places_sha256"] = _digest(places)
         weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
-        return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": told})
+        return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": origin})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str] = "coco") -> Self:
@@ -289,11 +289,11 @@ def _digest(path: str | PathLike[str]) -> str:
 def presence_of(detections: Detections, grid: Grid) -> Tensor:
     """Highest score of each class among the detections that overlap a cell, `(B, X·Y, K+1)`; 0 without detections."""
     batch, count, components = detections.scores.shape
-    seen = detections.scores.new_zeros(batch, len(grid), components)
+    presence = detections.scores.new_zeros(batch, len(grid), components)
     covered = grid.footprint(detections.boxes) & detections.mask[..., None]
     for index in range(count):
-        seen = torch.maximum(seen, covered[:, index, :, None] * detections.scores[:, index, None])
-    return seen
+        presence = torch.maximum(presence, covered[:, index, :, None] * detections.scores[:, index, None])
+    return presence
 
 
 def reaches(presence: Tensor, grid: Grid, edges: Sequence[float]) -> Iterator[Tensor]:

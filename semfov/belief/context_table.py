@@ -100,14 +100,14 @@ def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> 
     Raises:
         InputError: the table has none of the classes.
     """
-    known = _picked(_picked(table.values, table.rows, classes).mT, table.columns, classes).mT
-    known.fill_diagonal_(torch.nan)
-    missing = [name for name, row, column in zip(classes, known, known.mT, strict=True)
+    values = _picked(_picked(table.values, table.rows, classes).mT, table.columns, classes).mT
+    values.fill_diagonal_(torch.nan)
+    missing = [name for name, row, column in zip(classes, values, values.mT, strict=True)
                if row.isnan().all() and column.isnan().all()]  # fmt: skip
     if len(missing) == len(classes):
         some = ", ".join(table.rows[:5])
         raise InputError(f"classes: expected some that are in the table ({some}, …), got {', '.join(classes[:5])}, …")
-    relative = known - known.nanmean(1, keepdim=True) - known.nanmean(0, keepdim=True) + known.nanmean()
+    relative = values - values.nanmean(1, keepdim=True) - values.nanmean(0, keepdim=True) + values.nanmean()
     profile = torch.linspace(1, -1, bands)
     cooccurrence = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
     cooccurrence[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
@@ -116,8 +116,8 @@ def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> 
 
 def places_from(table: NamedTable, classes: Sequence[str]) -> Tensor:
     """Log odds of places `(K+1, R, R)`, minus the mean of each class, from a table of classes by heights."""
-    known = _picked(table.values, table.rows, classes)
-    relative = (known - known.nanmean(1, keepdim=True)).nan_to_num(0)
+    values = _picked(table.values, table.rows, classes)
+    relative = (values - values.nanmean(1, keepdim=True)).nan_to_num(0)
     rows = relative.shape[1]
     place = torch.zeros(len(classes) + 1, rows, rows)
     place[1:] = relative[..., None].expand(-1, -1, rows)

@@ -300,9 +300,9 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
     evidence = scaled.reshape(-1, components)
     weights = footprint[image, detection, cell][order, None].to(evidence).split(steps) if soft else None
     for i, (row, source) in enumerate(zip(rows.split(steps), sources.split(steps), strict=True)):
-        said = evidence.index_select(0, source)
-        said = said if weights is None else said.pow(weights[i])
-        flat.index_copy_(0, row, update(flat.index_select(0, row), said))
+        likelihood = evidence.index_select(0, source)
+        likelihood = likelihood if weights is None else likelihood.pow(weights[i])
+        flat.index_copy_(0, row, update(flat.index_select(0, row), likelihood))
     return flat.view(batch, cells, components)
 
 
@@ -331,8 +331,8 @@ def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
 def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: _Rule) -> Tensor:
     """`fuse` as one graph, given scaled likelihoods."""
     for number in range(evidence.shape[1]):
-        said, covers = evidence[:, number, None], footprint[:, number, :, None]
+        likelihood, covers = evidence[:, number, None], footprint[:, number, :, None]
         if covers.is_floating_point():
-            said = said.pow(covers.to(evidence))
-        beta = torch.where(covers > 0, update(beta, said), beta)
+            likelihood = likelihood.pow(covers.to(evidence))
+        beta = torch.where(covers > 0, update(beta, likelihood), beta)
     return beta.clone()

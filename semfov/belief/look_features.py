@@ -62,8 +62,8 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
     """
     components = detections.scores.shape[-1]
     check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
-    wanted = torch.tensor([target], device=fixation.device)
-    return class_features(detections, fixation, grid, wanted)[:, 0]
+    targets = torch.tensor([target], device=fixation.device)
+    return class_features(detections, fixation, grid, targets)[:, 0]
 
 
 @one_thread_if_small
@@ -86,12 +86,12 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
     def of_best(values: Tensor) -> Tensor:
         """Select the value of the best detection of each class in each cell, from `(B, 1 or T, L, 1 or X·Y)`."""
         wide = values.expand(batch, len(targets), *weight.shape[2:])
-        return wide.gather(2, best[:, :, None])[:, :, 0] * seen
+        return wide.gather(2, best[:, :, None])[:, :, 0] * covered
 
-    seen = touches.any(2)
+    covered = touches.any(2)
     edges = detections.boxes[..., 2:] - detections.boxes[..., :2]
     size = (edges.clamp(min=0).prod(-1) / grid.extent.prod().to(edges)).sqrt()[:, None, :, None]
-    told = [
+    features = [
         4 * distance,
         _log(strongest),
         _log((score * touches).amax(2)),
@@ -101,9 +101,9 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
         2 * of_best(score / objectness),
         2 * (objectness * weight).amax(2),
         2 * ((objectness - score).clamp(min=0) * weight).amax(2),
-        (~seen).to(weight.dtype),
+        (~covered).to(weight.dtype),
     ]
-    return torch.stack([each.expand(batch, len(targets), len(grid)) for each in told], -1)
+    return torch.stack([each.expand(batch, len(targets), len(grid)) for each in features], -1)
 
 
 def nothing_seen(distance: Tensor) -> Tensor:
@@ -120,8 +120,8 @@ def nothing_seen(distance: Tensor) -> Tensor:
     """
     none = torch.zeros_like(distance)
     least = _log(none)
-    told = [4 * distance, least, least, none, none, none, none, none, none, none + 1]
-    return torch.stack(told, -1)
+    features = [4 * distance, least, least, none, none, none, none, none, none, none + 1]
+    return torch.stack(features, -1)
 
 
 def _log(score: Tensor) -> Tensor:

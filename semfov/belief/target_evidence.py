@@ -43,8 +43,8 @@ class Thresholds:
         self, confirm: float | None = None, give_up: float | None = None, place: float | None = None
     ) -> "Thresholds":
         """Copy with other values; None keeps a value."""
-        given = {"confirm": confirm, "give_up": give_up, "place": place}
-        return replace(self, **{name: value for name, value in given.items() if value is not None})
+        values = {"confirm": confirm, "give_up": give_up, "place": place}
+        return replace(self, **{name: value for name, value in values.items() if value is not None})
 
 
 THRESHOLDS = Maybe(

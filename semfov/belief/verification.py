@@ -121,20 +121,20 @@ def closer_features(
     >>> closer_features(0.9, 0.8, 0.5, nothing, box, 1)[0].round(decimals=1)
     tensor([ 2.2000,  1.4000,  0.0000, -6.9000, -6.9000, -6.9000, -6.9000])
     """
-    shown = closer.mask[0]
-    boxes, scores = closer.boxes[0][shown], closer.scores[0][shown]
+    real = closer.mask[0]
+    boxes, scores = closer.boxes[0][real], closer.scores[0][real]
     before = [presence, cell, evidence]
-    seen = [0.0] * 4
+    after = [0.0] * 4
     if len(boxes):
         score = scores[:, target]
         best, overlap = best_detection(boxes, score, box)
         other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
-        seen = [
+        after = [
             float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
         ]
         if float(overlap[best]) >= MATCHED:
             box = boxes[best]
-    return box.new_tensor([*before, *seen]).logit(_FLOOR), box
+    return box.new_tensor([*before, *after]).logit(_FLOOR), box
 
 
 def best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:

@@ -15,7 +15,7 @@ from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import SENSORS
 
 
-def known_classes(options: AgentOptions) -> tuple[str, ...] | None:
+def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     """Names of the detector's classes, or None where they are known only after it is loaded."""
     return check_detector(options.detector) if options.models is None else Manifest.read(options.models).classes
 

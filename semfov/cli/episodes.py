@@ -57,17 +57,17 @@ class PictureJob(ABC):
 
     def __init__(self, options: Any) -> None:
         self.options: Any = options
-        found = picture_sources(options.pictures)
-        self.several = len(found) > 1
-        self._found = found
+        sources = picture_sources(options.pictures)
+        self.several = len(sources) > 1
+        self._sources = sources
 
     @property
     def sources(self) -> list[PictureSource]:
         """The pictures; an embedded scene if none is named."""
-        if not self._found:
+        if not self._sources:
             scene = embedded_picture(self.agent.classes[1:], self.target, self.options.seed)
-            self._found = [PictureSource("embedded scene", scene=scene)]
-        return self._found
+            self._sources = [PictureSource("embedded scene", scene=scene)]
+        return self._sources
 
     @abstractmethod
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
@@ -89,12 +89,12 @@ class PictureJob(ABC):
         """Arguments that all subcommands share, and a bar for the passes in a single picture."""
         options: PictureOptions = self.options
         how: How = "auto" if isinstance(picture, World) else options.how
-        given: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
-        given |= {"shifts": options.shifts, "duration": options.duration}
+        arguments: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
+        arguments |= {"shifts": options.shifts, "duration": options.duration}
         if not self.several and sys.stderr.isatty():
             bar = tqdm(desc=Path(source.name).name, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
-            given["on_look"] = lambda record: bar.update(record.passes - bar.n)
-        return given
+            arguments["on_look"] = lambda record: bar.update(record.passes - bar.n)
+        return arguments
 
 
 _process: dict[str, PictureJob] = {}
@@ -144,8 +144,8 @@ class PictureFiles:
         self.results = ResultsFile(file, kind or ".json", searched=self.job.title.startswith("search"))
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several:
-            told = {name: value for name, value in plain(asdict(self.job.options)).items() if name not in WHERE}
-            key = hashlib.sha256(f"{digest_of(told)} {package_digest()}".encode()).hexdigest()[:32]
+            settings = {name: value for name, value in plain(asdict(self.job.options)).items() if name not in WHERE}
+            key = hashlib.sha256(f"{digest_of(settings)} {package_digest()}".encode()).hexdigest()[:32]
             versions = [source.version() for source in self.job.sources]
             folder = file.with_name(f"{file.name}.unfinished")
             self.finished = SceneResults(folder, key, lambda number: json.dumps(versions[number]))
@@ -170,7 +170,7 @@ class PictureFiles:
         if outcome.episode is not None:
             self.episodes[number] = outcome.episode
         if self.finished is not None and not before:
-            self.finished.save(number, [outcome.kept()], {})
+            self.finished.save(number, [outcome.values()], {})
 
     def finish(self, *, complete: bool) -> None:
         """Write the results and the page of all pictures so far, and list what was written."""
@@ -206,7 +206,7 @@ def look_at_pictures(job: PictureJob) -> int:
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")
     outputs = PictureFiles(job)
-    skipped, complete, tally = 0, False, Counter[str]()
+    skipped, complete, endings = 0, False, Counter[str]()
     before = outputs.before()
     if before:
         print(f"continuing: {len(before)} of {len(sources)} pictures were looked at before")
@@ -215,7 +215,7 @@ def look_at_pictures(job: PictureJob) -> int:
             name = sources[number].name
             if isinstance(outcome, SemfovError):
                 # A wrong argument is not the fault of a picture.
-                if not several or (isinstance(outcome, InputError) and not tally):
+                if not several or (isinstance(outcome, InputError) and not endings):
                     raise outcome
                 skipped += 1
                 tqdm.write(f"skipped {name}: {outcome}", file=sys.stderr)
@@ -223,15 +223,15 @@ def look_at_pictures(job: PictureJob) -> int:
                     outputs.results.skip(number, name, str(outcome))
                 continue
             outputs.add(number, outcome, before=number in before)
-            tally[outcome.ended] += 1
+            endings[outcome.ended] += 1
             if number not in before:
                 tqdm.write(outcome.text, file=sys.stdout)
         complete = True
     finally:
-        if tally or skipped:
+        if endings or skipped:
             outputs.finish(complete=complete)
     if several:
-        counts = ", ".join(f"{count} {name}" for name, count in tally.items())
+        counts = ", ".join(f"{count} {name}" for name, count in endings.items())
         print(f"{len(sources)} pictures: {counts}{f'; {skipped} skipped' if skipped else ''}")
     return 1 if skipped else 0
 

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from semfov.agents.fovea import cell_at
-from semfov.cli.agent import known_classes, make_agent, one_class, several_classes
+from semfov.cli.agent import detector_classes, make_agent, one_class, several_classes
 from semfov.cli.options import LiveOptions, start_of
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
@@ -37,12 +37,12 @@ def look_live(options: LiveOptions) -> int:
         raise InputError("source: expected a video, an address or --camera 0, got none")
     check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
     start = start_of(options.start)
-    _sought(options, known_classes(options))
+    _sought(options, detector_classes(options))
     stream = open_live(options)
     agent = make_agent(options)
-    given = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
+    settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
-    running = agent.live(_sought(options, agent.classes[1:]), start=first, **given)
+    running = agent.live(_sought(options, agent.classes[1:]), start=first, **settings)
     written = watch(running, stream, options.out)
     if written is not None:
         print(f"written:\n  {written}")
@@ -94,8 +94,8 @@ def moment_line(moment: Moment) -> str:
     assert isinstance(moment, FoveaMoment)
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)
-    seen = detections_in_words(moment.detections, moment.classes, 2, CONFIDENT)
-    look = f"{moment.number:4d}  at ({column}, {row}): {seen}"
+    detections = detections_in_words(moment.detections, moment.classes, 2, CONFIDENT)
+    look = f"{moment.number:4d}  at ({column}, {row}): {detections}"
     if moment.closer is not None:
         look = f"{moment.number:4d}  closely at ({column}, {row}): p {moment.closer.place:.2f} there"
     row, column = divmod(best, moment.grid.columns)

@@ -96,10 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0, or 1 after an error (printed in one line) and if a picture was left out. Usage errors exit
         with 2.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given[:1] == ["help"]:
-        given = [*given[1:2], "--help"]
-    name, *rest = given or ["--help"]
+    command_line = list(sys.argv[1:] if arguments is None else arguments)
+    if command_line[:1] == ["help"]:
+        command_line = [*command_line[1:2], "--help"]
+    name, *rest = command_line or ["--help"]
     if name in ("--version", "-V"):
         print(f"semfov {__version__}")
         return 0

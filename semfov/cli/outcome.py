@@ -43,8 +43,8 @@ class PictureOutcome:
     names: tuple[str, ...] = ()
     figures: Mapping[str, bytes] = field(default_factory=dict)
 
-    def kept(self) -> dict[str, Any]:
-        """The JSON values, from which `PictureOutcome(**kept)` makes the outcome again without its figures."""
+    def values(self) -> dict[str, Any]:
+        """The JSON values, from which `PictureOutcome(**values)` makes the outcome again without its figures."""
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
@@ -97,10 +97,10 @@ def picture_outcome(
 
 
 def draw_episode(
-    record: GazeRecord, boxes: Tensor | None, views: list[Tensor], wanted: Sequence[Drawing]
+    record: GazeRecord, boxes: Tensor | None, views: list[Tensor], drawings: Sequence[Drawing]
 ) -> dict[str, bytes]:
-    """Draw those wanted figures and the animation that a record of this kind has; returns the files by name."""
-    if not wanted:
+    """Draw those figures and the animation that a record of this kind has; returns the files by name."""
+    if not drawings:
         return {}
     figures: dict[str, Callable[[], Any]] = {"scanpath": record.plot}
     if isinstance(record, Scanpath):
@@ -111,10 +111,10 @@ def draw_episode(
             figures["belief_bars"] = lambda: plot_belief_bars(record)
         else:
             figures["map"] = lambda: plot_semantic_map(record)
-    names = ["map" if name == "belief" and "map" in figures else name for name in wanted]
+    names = ["map" if name == "belief" and "map" in figures else name for name in drawings]
     with tempfile.TemporaryDirectory() as folder:
         drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
-        if "animation" in wanted:
+        if "animation" in drawings:
             path = Path(folder) / "animation.gif"
             if isinstance(record, Scanpath):
                 drawn += film_of(record, views=views, boxes=boxes).save(path)

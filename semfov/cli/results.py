@@ -41,8 +41,8 @@ def kind_of(path: Path) -> str | None:
     """
     name = path.name.lower()
     kind = next((kind for kind in RESULT_KINDS if name.endswith(kind)), None)
-    known = kind is not None or not path.suffix or path.is_dir()
-    check(known, "out", f"a folder, or a file that ends in {', '.join(RESULT_KINDS)}", path)
+    fits = kind is not None or not path.suffix or path.is_dir()
+    check(fits, "out", f"a folder, or a file that ends in {', '.join(RESULT_KINDS)}", path)
     return kind
 
 
@@ -120,15 +120,15 @@ class ResultsFile:
             return self._csv(pictures)
         if self.kind == ".geojson":
             unit = "; ".join(sorted({row["coordinates"] for row in rows}))
-            parts = [each for row in rows for each in row["parts"]]
-            whole = {"type": "FeatureCollection", "coordinates": unit, "features": parts}
+            features = [each for row in rows for each in row["parts"]]
+            whole = {"type": "FeatureCollection", "coordinates": unit, "features": features}
         elif self.kind == ".coco.json":
             images = [
                 {"id": number, "file_name": each["picture"], "width": each["width"], "height": each["height"]}
                 for number, each in enumerate(pictures, 1)
             ]
-            parts = [{**each, "image_id": number} for number, row in enumerate(rows, 1) for each in row["parts"]]
-            annotations = [{"id": number, **each} for number, each in enumerate(parts, 1)]
+            objects = [{**each, "image_id": number} for number, row in enumerate(rows, 1) for each in row["parts"]]
+            annotations = [{"id": number, **each} for number, each in enumerate(objects, 1)]
             categories = rows[0]["categories"] if rows else []
             whole = {"images": images, "annotations": annotations, "categories": categories}
         return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
@@ -149,14 +149,14 @@ class ResultsFile:
 def _summary(name: str, record: GazeRecord, seconds: float) -> dict[str, Any]:
     """What a file says about a picture as a whole."""
     width, height = record.size
-    found: dict[str, Any] = {"picture": name, "width": width, "height": height, "target": record.target_name}
+    row: dict[str, Any] = {"picture": name, "width": width, "height": height, "target": record.target_name}
     if record.decision is not None:
         point, box = found_place(record, record.decision) if record.decision.outcome == "found" else (None, None)
-        found |= {"outcome": record.decision.outcome, "probability": record.decision.probability}
-        found |= dict(zip("xy", point or (None, None), strict=True))
-        found |= dict(zip(("x1", "y1", "x2", "y2"), box or [None] * 4, strict=True))
-    said = {"least": record.least, "expected": record.expected, "passes": record.passes}
-    return {**found, **said, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+        row |= {"outcome": record.decision.outcome, "probability": record.decision.probability}
+        row |= dict(zip("xy", point or (None, None), strict=True))
+        row |= dict(zip(("x1", "y1", "x2", "y2"), box or [None] * 4, strict=True))
+    figures = {"least": record.least, "expected": record.expected, "passes": record.passes}
+    return {**row, **figures, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
 
 
 def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from semfov.agent import PictureLike
-from semfov.cli.agent import check_target, known_classes, make_agent, several_classes
+from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
 from semfov.cli.results import kind_of
@@ -29,24 +29,24 @@ class SearchJob(PictureJob):
         check_target(options.target, options)
         super().__init__(options)
         self.start = _check(options)
-        known = known_classes(options)
-        wanted = None if known is None else meant(options, known)
+        classes = detector_classes(options)
+        weights = None if classes is None else meant(options, classes)
         self.agent = make_agent(options)
-        self.wanted = meant(options, self.agent.classes[1:]) if wanted is None else wanted
-        self.target = next(iter(self.wanted))
+        self.weights = meant(options, self.agent.classes[1:]) if weights is None else weights
+        self.target = next(iter(self.weights))
         self.title = f"search for “{self.target}”"
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Search a picture."""
-        agent, options, wanted = self.agent, self.options, self.wanted
-        given = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
+        agent, options, weights = self.agent, self.options, self.weights
+        settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
         kind = agent.kind_of_look(picture, shared["how"])
         if kind != "fovea":
-            only_likeliest(wanted)
-        aim = wanted if kind == "fovea" and len(wanted) > 1 else next(iter(wanted))
+            only_likeliest(weights)
+        aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
         start = start_beside(agent, source, options.seed) if beside else self.start
-        return agent.search(picture, aim, start=start, **given, **shared)
+        return agent.search(picture, aim, start=start, **settings, **shared)
 
 
 class FindJob(PictureJob):
@@ -66,7 +66,7 @@ class FindJob(PictureJob):
             )
         super().__init__(options)
         _check(options)
-        several_classes(options.target, known_classes(options))
+        several_classes(options.target, detector_classes(options))
         self.agent = make_agent(options)
         self.targets = several_classes(options.target, self.agent.classes[1:])
         self.target = None if self.targets is None else self.targets[0]
@@ -74,8 +74,8 @@ class FindJob(PictureJob):
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Find all objects in a picture."""
-        given = {name: getattr(self.options, name) for name in ("worth", "least", "batch")}
-        return self.agent.find_all(picture, self.targets, **given, **shared)
+        settings = {name: getattr(self.options, name) for name in ("worth", "least", "batch")}
+        return self.agent.find_all(picture, self.targets, **settings, **shared)
 
 
 class ExploreJob(PictureJob):
@@ -90,13 +90,13 @@ class ExploreJob(PictureJob):
     def __init__(self, options: ExploreOptions) -> None:
         super().__init__(options)
         self.start = _check(options)
-        known_classes(options)
+        detector_classes(options)
         self.agent = make_agent(options)
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Explore a picture."""
-        given = {name: getattr(self.options, name) for name in ("seed", "worth", "least")}
-        return self.agent.explore(picture, start=self.start, **given, **shared)
+        settings = {name: getattr(self.options, name) for name in ("seed", "worth", "least")}
+        return self.agent.explore(picture, start=self.start, **settings, **shared)
 
 
 _JOBS: dict[type[PictureOptions], Callable[[Any], PictureJob]] = {
@@ -139,11 +139,11 @@ def meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
         if options.embeddings is None:
             raise InputError(f"{error}{_other_ways(target, classes, str(error))}") from None
     vectors = WordVectors.read(options.embeddings, [target, *classes])
-    found = spread(target, classes, vectors)
-    print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in found.items())}")
+    weights = spread(target, classes, vectors)
+    print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in weights.items())}")
     if vectors.missing:
         print(f"  words without a vector in {options.embeddings}: {', '.join(vectors.missing)}")
-    return found
+    return weights
 
 
 def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
@@ -155,7 +155,7 @@ def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
     return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"
 
 
-def only_likeliest(wanted: dict[str, float]) -> None:
+def only_likeliest(weights: dict[str, float]) -> None:
     """Say so if only the most likely class of a description is searched for."""
-    if len(wanted) > 1:
-        print(f"large pictures and scenes are searched only for the most likely class: {next(iter(wanted))}")
+    if len(weights) > 1:
+        print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")

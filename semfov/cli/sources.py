@@ -48,8 +48,8 @@ class PictureSource:
         """What changes with the file: its name, size and time of change."""
         if self.file is None:
             return [self.name]
-        told = self.file.stat()
-        return [str(self.file.resolve()), told.st_size, told.st_mtime_ns]
+        status = self.file.stat()
+        return [str(self.file.resolve()), status.st_size, status.st_mtime_ns]
 
 
 def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
@@ -65,13 +65,13 @@ def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
         InputError: one is a video or an address.
         DataError: one does not exist, or a folder has no pictures.
     """
-    found: list[PictureSource] = []
+    sources: list[PictureSource] = []
     for name in pictures:
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
-        found += [PictureSource(str(each), each) for each in picture_files(path)]
-    return found
+        sources += [PictureSource(str(each), each) for each in picture_files(path)]
+    return sources
 
 
 def start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:

@@ -95,11 +95,11 @@ def box_text(box: Sequence[float]) -> str:
 
 def regions_lines(scanpath: Scanpath) -> list[str]:
     """A line for each class that the final map of an exploration names, with its most probable cell."""
-    parts: dict[str, list[int]] = {}
+    by_class: dict[str, list[int]] = {}
     for label, cells, _ in named_regions(scanpath):
-        parts.setdefault(label, []).extend(cells)
+        by_class.setdefault(label, []).extend(cells)
     lines = []
-    for label, cells in sorted(parts.items(), key=lambda item: -len(item[1])):
+    for label, cells in sorted(by_class.items(), key=lambda item: -len(item[1])):
         chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
         x, y = scanpath.grid.centres[cells[int(chance.argmax())]].tolist()
         many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"

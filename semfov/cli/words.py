@@ -35,8 +35,8 @@ def in_command_words(message: str, options: Iterable[str]) -> str:
         message = message.replace(python, command)
     names = "|".join(map(re.escape, options))
 
-    def option(found: re.Match[str]) -> str:
-        value = (found[2] or "").strip("'\"")
-        return f"--{found[1].replace('_', '-')}{' ' if value else ''}{value}"
+    def option(match: re.Match[str]) -> str:
+        value = (match[2] or "").strip("'\"")
+        return f"--{match[1].replace('_', '-')}{' ' if value else ''}{value}"
 
     return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

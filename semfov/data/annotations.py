@@ -117,27 +117,27 @@ def _entries(data: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, An
 
 def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | str]:
     """Ids of the entries, checked to be unique; further fields are checked to have their type and not to be empty."""
-    seen: set[int | str] = set()
+    ids: set[int | str] = set()
     for where, entry in _entries(data, key):
         identity = entry.get("id")
         if not isinstance(identity, int | str) or isinstance(identity, bool):
             raise _Fault(f"{where}: expected id to be an integer or a string, got {_show(entry, 'id')}")
         if isinstance(identity, str) and not is_plain(identity):
             raise _Fault(f"{where}: expected id to have no control characters, got {_show(entry, 'id')}")
-        if identity in seen:
+        if identity in ids:
             raise _Fault(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once")
-        seen.add(identity)
+        ids.add(identity)
         for field, kind in fields.items():
             if not isinstance(entry.get(field), kind) or not entry[field]:
                 raise _Fault(f"{where}: expected {field} to be a string, got {_show(entry, field)}")
             if not is_plain(entry[field]):
                 raise _Fault(f"{where}: expected {field} to have no control characters, got {_show(entry, field)}")
-    return seen
+    return ids
 
 
-def _check_reference(where: str, entry: dict[str, Any], key: str, known: set[int | str], what: str) -> None:
+def _check_reference(where: str, entry: dict[str, Any], key: str, ids: set[int | str], what: str) -> None:
     value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | str) or value not in known:
+    if isinstance(value, bool) or not isinstance(value, int | str) or value not in ids:
         raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {_show(entry, key)}")
 
 

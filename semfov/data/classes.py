@@ -87,19 +87,19 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return _index(name, len(classes), argument)
     if name in classes:
         return list(classes).index(name) + 1
-    wanted, keys = plain_key(name), [plain_key(known) for known in classes]
+    name_key, keys = plain_key(name), [plain_key(other) for other in classes]
     forms = [set().union(*map(other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
     for fits in (
-        [index for index, key in enumerate(keys, 1) if key == wanted],
-        [index for index, form in enumerate(forms, 1) if wanted in form],
+        [index for index, key in enumerate(keys, 1) if key == name_key],
+        [index for index, form in enumerate(forms, 1) if name_key in form],
     ):
         if len(fits) == 1:
             return fits[0]
         if fits:
             raise InputError(_unknown(argument, name, [classes[index - 1] for index in fits], classes))
-    singular = [word for word in SYNONYMS if wanted in other_numbers(word)]
-    meant = [key for word in (wanted, *singular) for key in map(plain_key, SYNONYMS.get(word, ())) if key in keys]
-    near = get_close_matches(wanted, keys, n=3, cutoff=0.8 if meant else 0.6)
+    singular = [word for word in SYNONYMS if name_key in other_numbers(word)]
+    meant = [key for word in (name_key, *singular) for key in map(plain_key, SYNONYMS.get(word, ())) if key in keys]
+    near = get_close_matches(name_key, keys, n=3, cutoff=0.8 if meant else 0.6)
     raise InputError(_unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes))
 
 

@@ -95,11 +95,11 @@ class CocoScenes:
         self._packed = packed
         self._rows: list[int] = []
         self._targets: list[list[int]] = []
-        wanted = None if ids is None else _known_ids(ids, packed.ids, annotations)
+        chosen = None if ids is None else _checked_ids(ids, packed.ids, annotations)
         for row, instances in enumerate(packed.instances):
             if instances < min_instances or len(self._rows) == limit:
                 continue
-            if wanted is not None and str(packed.ids[row]) not in wanted:
+            if chosen is not None and str(packed.ids[row]) not in chosen:
                 continue
             targets = legal_targets(packed.annotation(row), max_target_area, coverage)
             if targets or max_target_area is None:
@@ -175,17 +175,17 @@ def _summary(repairs: Counter[str], most: int = 8) -> str:
     return first + (f", and {sum(rest)} boxes cut or dropped for {len(rest)} more reasons" if rest else "")
 
 
-def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
+def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
     """Ids as text, checked to be in the annotations."""
-    wanted = {str(i) for i in ids}
-    missing = sorted(wanted - {str(i) for i in known})
+    chosen = {str(i) for i in ids}
+    missing = sorted(chosen - {str(i) for i in image_ids})
     if missing:
         some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
         raise DataError(
-            f"annotations {annotations}: expected an image for each of {len(wanted)} ids, got none for "
+            f"annotations {annotations}: expected an image for each of {len(chosen)} ids, got none for "
             f"{len(missing)} of them: {some}; correct ids or the annotations"
         )
-    return wanted
+    return chosen
 
 
 class _Packed:
@@ -201,29 +201,29 @@ class _Packed:
         rows = torch.tensor([row for row, _ in entries], dtype=torch.int64)
         label = torch.tensor([labels[entry["category_id"]] for _, entry in entries], dtype=torch.int64)
         crowd = torch.tensor([bool(entry.get("iscrowd", 0)) for _, entry in entries], dtype=torch.bool)
-        given = torch.tensor([[float(v) for v in entry["bbox"]] for _, entry in entries], dtype=torch.float64)
+        bboxes = torch.tensor([[float(v) for v in entry["bbox"]] for _, entry in entries], dtype=torch.float64)
         limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
 
-        corner, extent = given.reshape(-1, 4).split(2, -1)
+        corner, extent = bboxes.reshape(-1, 4).split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)
         cut = edges.clamp(min=0).minimum(limits)
         boxes = cut.float()
         solid = (boxes[:, 2:] > boxes[:, :2]).all(-1)
         dropped = solid & crowd & drop_crowds
-        kept = solid & ~dropped
-        known = kept & (label > 0)
+        valid = solid & ~dropped
+        labelled = valid & (label > 0)
         # official files have two decimals, so a difference of up to 0.01 is rounding
-        outside = kept & ((edges - cut).abs() > 0.01).any(-1)
+        outside = valid & ((edges - cut).abs() > 0.01).any(-1)
         for what, which in (("without area in the image, dropped", ~solid), ("of crowds, dropped", dropped)):
             self._count(f"boxes {what}", which)
         self._count("boxes cut to the image", outside)
-        for at in (kept & ~known).nonzero()[:, 0].tolist():
+        for at in (valid & ~labelled).nonzero()[:, 0].tolist():
             name = coco.cats[entries[at][1]["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
-        self.instances: list[int] = rows[kept].bincount(minlength=len(self.ids)).tolist()
-        self._boxes, self._labels, self._crowd = boxes[known], label[known], crowd[known]
-        self._ends: list[int] = rows[known].bincount(minlength=len(self.ids)).cumsum(0).tolist()
+        self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
+        self._boxes, self._labels, self._crowd = boxes[labelled], label[labelled], crowd[labelled]
+        self._ends: list[int] = rows[labelled].bincount(minlength=len(self.ids)).cumsum(0).tolist()
 
     def _count(self, what: str, which: torch.Tensor) -> None:
         if which.any():
@@ -274,8 +274,8 @@ def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
     return sizes
 
 
-def _sha256(*parts: object) -> str:
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+def _sha256(*values: object) -> str:
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 if __name__ == "__main__":

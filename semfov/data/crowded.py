@@ -30,27 +30,27 @@ class Crowded:
         check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
         counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
         order = sorted(range(len(scenes)), key=lambda index: -counts[index])
-        self._scenes, self._kept = scenes, sorted(order[: math.ceil(share * len(scenes))])
+        self._scenes, self._chosen = scenes, sorted(order[: math.ceil(share * len(scenes))])
         self.classes = scenes.classes
         every = scenes.ids
-        self.ids: list[int] | list[str] = [every[index] for index in self._kept]  # type: ignore[assignment]
+        self.ids: list[int] | list[str] = [every[index] for index in self._chosen]  # type: ignore[assignment]
         self.fingerprint = hashlib.sha256(json.dumps([scenes.fingerprint, self.ids]).encode()).hexdigest()
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._chosen)
 
     def __getitem__(self, index: int) -> Scene:
         """Decode a scene."""
-        return self._scenes[self._kept[index]]
+        return self._scenes[self._chosen[index]]
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a scene, without decoding its image."""
-        return self._scenes.annotation(self._kept[index])
+        return self._scenes.annotation(self._chosen[index])
 
     def targets(self, index: int) -> list[int]:
         """List the classes of a scene that may be searched for."""
-        return self._scenes.targets(self._kept[index])
+        return self._scenes.targets(self._chosen[index])
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a scene depend on."""
-        return self._scenes.digest(self._kept[index])
+        return self._scenes.digest(self._chosen[index])

@@ -187,10 +187,10 @@ def unpack_members(file: Path, root: Path, members: str) -> None:
 
     try:
         with zipfile.ZipFile(file) as archive:
-            wanted = [m for m in archive.infolist() if m.filename.startswith(members) and not m.is_dir()]
-            if not wanted:
+            entries = [m for m in archive.infolist() if m.filename.startswith(members) and not m.is_dir()]
+            if not entries:
                 raise DataError(f"{file}: expected members {members}*, got none; delete the file and run again")
-            for member in tqdm(wanted, desc=f"unpacking {file.name}", unit="file", disable=None):
+            for member in tqdm(entries, desc=f"unpacking {file.name}", unit="file", disable=None):
                 target = _inside(root, member, file)
                 if _is_unpacked(target, member):
                     continue

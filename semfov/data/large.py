@@ -17,7 +17,16 @@ from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
-from semfov.data.reduction import FIRST, KEPT, LARGE, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
+from semfov.data.reduction import (
+    FIRST,
+    LARGE,
+    OVERSAMPLING,
+    PixelBox,
+    ReducedCopies,
+    bytes_of,
+    first_for,
+    reduction_for,
+)
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
@@ -56,19 +65,19 @@ class LargePicture(ABC):
             RGB bytes `(h, w, 3)`.
         """
 
-    def reduction(self, ratio: float, kept: float = KEPT) -> int:
+    def reduction(self, ratio: float, oversampling: float = OVERSAMPLING) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it.
 
         Args:
             ratio: pixels of a window for each wanted pixel.
-            kept: pixels that a reduced window keeps for each wanted pixel.
+            oversampling: pixels that a reduced window keeps for each wanted pixel.
 
         Returns:
             A power of two; 1 for windows that are read as they are: those of pictures of up to 16 million pixels, and
             those that keep more than a sixth of the pixels along a side (of very large pictures, a twelfth or less).
         """
         many = self.size[0] * self.size[1] > LARGE
-        reduction = reduction_for(ratio, kept) if many else 1
+        reduction = reduction_for(ratio, oversampling) if many else 1
         return reduction if reduction >= self._first else 1
 
     def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
@@ -371,8 +380,8 @@ class RasterPicture(LargePicture):
             bands = self._file.read(
                 self._bands, window=Window(x1, y1, x2 - x1, y2 - y1), out_shape=shape, resampling=Resampling.average
             )
-        found = np.moveaxis(_from_16(bands), 0, -1)
-        return np.repeat(found, 3, -1) if len(self._bands) == 1 else found
+        pixels = np.moveaxis(_from_16(bands), 0, -1)
+        return np.repeat(pixels, 3, -1) if len(self._bands) == 1 else pixels
 
 
 def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> LargePicture:

@@ -87,21 +87,21 @@ class Mosaics:
     def tiles(self, index: int) -> list[Tile]:
         """List the photographs of a mosaic, row by row."""
         generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
-        slots, known = self.columns * self.rows, np.arange(len(self.scenes))
+        slots, photographs = self.columns * self.rows, np.arange(len(self.scenes))
         if self._alike and self._sharing:
-            known = self._sharing[int(generator.integers(len(self._sharing)))]
-        rounds = -(-slots // len(known))
-        order = np.concatenate([generator.permutation(known) for _ in range(rounds)])[:slots]
+            photographs = self._sharing[int(generator.integers(len(self._sharing)))]
+        rounds = -(-slots // len(photographs))
+        order = np.concatenate([generator.permutation(photographs) for _ in range(rounds)])[:slots]
         return [self._tile(int(scene), slot) for slot, scene in enumerate(order)]
 
     @cached_property
     def _sharing(self) -> list[NDArray[np.intp]]:
         """The photographs of each class that enough of them show."""
-        shown = np.zeros((len(self.scenes), len(self.classes) + 1), np.bool_)
+        presence = np.zeros((len(self.scenes), len(self.classes) + 1), np.bool_)
         for index in range(len(self.scenes)):
-            shown[index, self.scenes.annotation(index).labels.numpy()] = True
+            presence[index, self.scenes.annotation(index).labels.numpy()] = True
         least = -(-self.columns * self.rows // 4)
-        return [column.nonzero()[0] for column in shown.T if column.sum() >= least]
+        return [column.nonzero()[0] for column in presence.T if column.sum() >= least]
 
     def _tile(self, scene: int, slot: int) -> Tile:
         (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
@@ -126,10 +126,10 @@ class Mosaics:
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        parts = [(tile, self.scenes.annotation(tile.index)) for tile in self.tiles(index)]
-        boxes = torch.cat([_moved(part, tile) for tile, part in parts])
-        labels = torch.cat([part.labels for _, part in parts])
-        return Annotation(boxes, labels, torch.cat([part.crowd for _, part in parts]), self.size)
+        pairs = [(tile, self.scenes.annotation(tile.index)) for tile in self.tiles(index)]
+        boxes = torch.cat([_moved(annotation, tile) for tile, annotation in pairs])
+        labels = torch.cat([annotation.labels for _, annotation in pairs])
+        return Annotation(boxes, labels, torch.cat([annotation.crowd for _, annotation in pairs]), self.size)
 
     def targets(self, index: int) -> list[int]:
         """List the classes of a mosaic that may be searched for, ascending: those that cover at most a fifth of it."""
@@ -137,8 +137,8 @@ class Mosaics:
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""
-        parts = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
-        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, parts]).encode()).hexdigest()
+        tiles = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
+        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, tiles]).encode()).hexdigest()
 
 
 def _moved(part: Annotation, tile: Tile) -> Tensor:

@@ -19,12 +19,12 @@ def alike(name: str, names: Sequence[str]) -> list[int]:
     >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
     ([1], [0, 1], [0])
     """
-    wanted, keys = plain_key(name), [plain_key(known) for known in names]
-    forms = {wanted, *other_numbers(wanted)}
-    same = [place for place, key in enumerate(keys) if key in forms or wanted in other_numbers(key)]
+    name_key, keys = plain_key(name), [plain_key(other) for other in names]
+    forms = {name_key, *other_numbers(name_key)}
+    same = [place for place, key in enumerate(keys) if key in forms or name_key in other_numbers(key)]
     if same:
         return same
-    return [place for place, key in enumerate(keys) if _calls(key, wanted) or _calls(wanted, key)]
+    return [place for place, key in enumerate(keys) if _calls(key, name_key) or _calls(name_key, key)]
 
 
 def _calls(other: str, key: str) -> bool:

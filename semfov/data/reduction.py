@@ -23,16 +23,16 @@ FIRST = 4
 LARGEST = 1 << 25
 """Most pixels of a copy, so that all copies together take at most 134 MB."""
 
-KEPT = 1.5
+OVERSAMPLING = 1.5
 """Pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works."""
 
 
-def reduction_for(ratio: float, kept: float = KEPT) -> int:
+def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
     """Largest factor by which a window may be reduced that is resampled afterwards.
 
     Args:
         ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
-        kept: pixels that the reduced window keeps for each wanted pixel.
+        oversampling: pixels that the reduced window keeps for each wanted pixel.
 
     Returns:
         A power of two.
@@ -41,7 +41,7 @@ def reduction_for(ratio: float, kept: float = KEPT) -> int:
     [1, 1, 2, 4, 8]
     """
     reduction = 1
-    while ratio >= 2 * kept * reduction:
+    while ratio >= 2 * oversampling * reduction:
         reduction *= 2
     return reduction
 

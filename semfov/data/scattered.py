@@ -96,21 +96,21 @@ class Scattered:
     @cached_property
     def alone(self) -> dict[int, list[tuple[int, _Box]]]:
         """By class, the objects that stand alone: index of the photograph and the part of it to cut out."""
-        found: dict[int, list[tuple[int, _Box]]] = defaultdict(list)
+        by_class: dict[int, list[tuple[int, _Box]]] = defaultdict(list)
         for index in range(len(self.scenes)):
-            told = self.scenes.annotation(index)
-            sides = told.boxes[:, 2:] - told.boxes[:, :2]
-            wide = torch.cat([told.boxes[:, :2] - _MARGIN * sides, told.boxes[:, 2:] + _MARGIN * sides], -1)
-            low = torch.maximum(wide[:, None, :2], told.boxes[:, :2])
-            high = torch.minimum(wide[:, None, 2:], told.boxes[:, 2:])
+            annotation = self.scenes.annotation(index)
+            sides = annotation.boxes[:, 2:] - annotation.boxes[:, :2]
+            wide = torch.cat([annotation.boxes[:, :2] - _MARGIN * sides, annotation.boxes[:, 2:] + _MARGIN * sides], -1)
+            low = torch.maximum(wide[:, None, :2], annotation.boxes[:, :2])
+            high = torch.minimum(wide[:, None, 2:], annotation.boxes[:, 2:])
             shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)
-            alone = (shared.sum(1) <= _SHARED * (wide[:, 2:] - wide[:, :2]).prod(-1)) & ~told.crowd
+            alone = (shared.sum(1) <= _SHARED * (wide[:, 2:] - wide[:, :2]).prod(-1)) & ~annotation.crowd
             alone &= sides.amax(-1) >= _SMALLEST
             for n in alone.nonzero()[:, 0].tolist():
-                limits = told.size * 2
+                limits = annotation.size * 2
                 part = [min(max(round(edge), 0), limit) for edge, limit in zip(wide[n].tolist(), limits, strict=True)]
-                found[int(told.labels[n])].append((index, (part[0], part[1], part[2], part[3])))
-        return dict(found)
+                by_class[int(annotation.labels[n])].append((index, (part[0], part[1], part[2], part[3])))
+        return dict(by_class)
 
     def cutouts(self, index: int) -> list[Cutout]:
         """List the parts of photographs in a picture."""
@@ -120,17 +120,17 @@ class Scattered:
         count = round(np.exp(draw.uniform(0, np.log(self.most))))
         if self.whole or not self.alone:
             order = draw.permutation(len(self.scenes))[:count].tolist()
-            parts = [(n, (0, 0, *self.scenes.annotation(n).size)) for n in order]
+            sources = [(n, (0, 0, *self.scenes.annotation(n).size)) for n in order]
         else:
             kinds = sorted(self.alone)
             weights = np.sqrt([len(self.alone[kind]) for kind in kinds])
             chosen = draw.choice(kinds, size=draw.integers(1, 4), p=weights / weights.sum())
             rows = [self.alone[int(draw.choice(chosen))] for _ in range(count)]
-            parts = [row[int(draw.integers(len(row)))] for row in rows]
+            sources = [row[int(draw.integers(len(row)))] for row in rows]
         groups = draw.uniform(0, 1, (draw.integers(1, 5), 2)) * self.size
         spread = draw.uniform(0.03, 0.2) * self.size[0]
         placed: list[Cutout] = []
-        for number, part in parts:
+        for number, part in sources:
             scale = min(1.0, side * draw.uniform(0.7, 1.3) / max(part[2] - part[0], part[3] - part[1]))
             wide, tall = (max(2, round(scale * (part[n + 2] - part[n]))) for n in (0, 1))
             for _ in range(_TRIES):
@@ -152,25 +152,29 @@ class Scattered:
             image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)[0]
             fade = 1.0 if self.whole else _fading(y2 - y1)[:, None] * _fading(x2 - x1)
             canvas[:, y1:y2, x1:x2] += (image - canvas[:, y1:y2, x1:x2]) * fade
-        told = self.annotation(index)
+        annotation = self.annotation(index)
         return Scene(
-            self.ids[index], f"scattered {self.ids[index]}, seed {self._seed}", canvas, told.boxes, told.labels
+            self.ids[index],
+            f"scattered {self.ids[index]}, seed {self._seed}",
+            canvas,
+            annotation.boxes,
+            annotation.labels,
         )
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a picture, without composing its image."""
         boxes, labels, crowd = [torch.zeros(0, 4)], [torch.zeros(0, dtype=torch.long)], [torch.zeros(0).bool()]
         for cutout in self.cutouts(index):
-            told = self.scenes.annotation(cutout.index)
-            low, high = (told.boxes.new_tensor(cutout.part[n : n + 2]) for n in (0, 2))
-            centre = (told.boxes[:, :2] + told.boxes[:, 2:]) / 2
-            kept = ((centre >= low) & (centre <= high)).all(-1)
+            annotation = self.scenes.annotation(cutout.index)
+            low, high = (annotation.boxes.new_tensor(cutout.part[n : n + 2]) for n in (0, 2))
+            centre = (annotation.boxes[:, :2] + annotation.boxes[:, 2:]) / 2
+            inside = ((centre >= low) & (centre <= high)).all(-1)
             x1, y1, x2, y2 = cutout.place
-            scale = told.boxes.new_tensor([x2 - x1, y2 - y1]) / (high - low)
-            edges = torch.minimum(torch.maximum(told.boxes[kept].view(-1, 2, 2), low), high)
-            boxes.append(((edges - low) * scale + told.boxes.new_tensor([x1, y1])).flatten(1))
-            labels.append(told.labels[kept])
-            crowd.append(told.crowd[kept])
+            scale = annotation.boxes.new_tensor([x2 - x1, y2 - y1]) / (high - low)
+            edges = torch.minimum(torch.maximum(annotation.boxes[inside].view(-1, 2, 2), low), high)
+            boxes.append(((edges - low) * scale + annotation.boxes.new_tensor([x1, y1])).flatten(1))
+            labels.append(annotation.labels[inside])
+            crowd.append(annotation.crowd[inside])
         return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
 
     def targets(self, index: int) -> list[int]:
@@ -201,10 +205,10 @@ class Scattered:
         patch = torch.full((3, 16, 16), float(draw.random()))
         for _ in range(_TRIES):
             index = int(draw.integers(len(self.scenes)))
-            told = self.scenes.annotation(index)
-            side = min(*told.size, int(draw.integers(48, 256)))
-            x, y = (int(draw.integers(length - side + 1)) for length in told.size)
-            if not any(_meet((x, y, x + side, y + side), box) for box in told.boxes.tolist()):
+            annotation = self.scenes.annotation(index)
+            side = min(*annotation.size, int(draw.integers(48, 256)))
+            x, y = (int(draw.integers(length - side + 1)) for length in annotation.size)
+            if not any(_meet((x, y, x + side, y + side), box) for box in annotation.boxes.tolist()):
                 patch = self.scenes[index].image[:, y : y + side, x : x + side]
                 break
         across, down = (_mirrored(length, side) for length, side in zip(self.size, patch.shape[:0:-1], strict=True))

@@ -130,9 +130,9 @@ class EmbeddedScenes:
         self.ids = list(range(count))
         self._seed = seed
         self._labels = class_indices(self.classes)
-        known = {photograph.label for photograph in PHOTOGRAPHED_OBJECTS}
-        some = f"at least one of {', '.join(sorted(known))}"
-        check(not known.isdisjoint(self._labels), "classes", some, self.classes)
+        labels = {photograph.label for photograph in PHOTOGRAPHED_OBJECTS}
+        some = f"at least one of {', '.join(sorted(labels))}"
+        check(not labels.isdisjoint(self._labels), "classes", some, self.classes)
         files = sorted(
             {(p.package, p.file) for p in PHOTOGRAPHED_OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES}
         )

@@ -71,13 +71,13 @@ hair drier: hair dryer, blow dryer, hairdryer, dryer
 
 def _read(table: str) -> dict[str, tuple[str, ...]]:
     """Classes by each of their synonyms, which are written without spaces."""
-    found: dict[str, tuple[str, ...]] = {}
+    classes: dict[str, tuple[str, ...]] = {}
     for line in table.strip().splitlines():
         name, _, others = line.partition(": ")
         for other in others.split(", "):
             key = other.replace(" ", "")
-            found[key] = (*found.get(key, ()), name)
-    return found
+            classes[key] = (*classes.get(key, ()), name)
+    return classes
 
 
 SYNONYMS = _read(_TABLE)
@@ -101,4 +101,4 @@ def names_of(name: str) -> tuple[str, ...]:
     (('cutlery',), ())
     """
     lines = (line.partition(": ") for line in _TABLE.strip().splitlines())
-    return next((tuple(others.split(", ")) for known, _, others in lines if known == name), ())
+    return next((tuple(others.split(", ")) for word, _, others in lines if word == name), ())

@@ -63,17 +63,17 @@ class WordVectors:
             DataError: the file is missing, or the line of a wanted word does not hold a vector of the common length.
             InputError: the file has none of the words.
         """
-        wanted = sorted({word for name in names for word in words_of(name)})
+        words = sorted({word for name in names for word in words_of(name)})
         check_regular(path)
-        found: dict[str, Tensor] = {}
+        vectors: dict[str, Tensor] = {}
         try:
             with Path(path).open(encoding="utf-8", errors="replace", newline="\n") as file:
-                _read(iter(lambda: file.readline(_LONGEST), ""), set(wanted), found, str(path))
+                _read(iter(lambda: file.readline(_LONGEST), ""), set(words), vectors, str(path))
         except OSError as error:
             raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
-        some = f"a file with vectors of some of the words {', '.join(wanted)}"
-        check(bool(found), "embeddings", some, f"{path}, which has none of them")
-        return cls(found, [word for word in wanted if word not in found], sha256(Path(path)))
+        some = f"a file with vectors of some of the words {', '.join(words)}"
+        check(bool(vectors), "embeddings", some, f"{path}, which has none of them")
+        return cls(vectors, [word for word in words if word not in vectors], sha256(Path(path)))
 
     def vector(self, name: str) -> Tensor:
         """Compute the mean vector of a name's words.
@@ -87,9 +87,9 @@ class WordVectors:
         Raises:
             InputError: none of the words has a vector.
         """
-        known = [self.vectors[word] for word in words_of(name) if word in self.vectors]
-        check(bool(known), "name", "a name with at least one word in the file of word vectors", repr(name))
-        return torch.stack(known).mean(0)
+        vectors = [self.vectors[word] for word in words_of(name) if word in self.vectors]
+        check(bool(vectors), "name", "a name with at least one word in the file of word vectors", repr(name))
+        return torch.stack(vectors).mean(0)
 
     def knows(self, name: str) -> bool:
         """Tell whether at least one word of a name has a vector.
@@ -179,15 +179,15 @@ def spread(
             f"got {description!r}"
         )
     near = vectors.similarity([description], classes)[0]
-    known = ~near.isnan()
-    check(bool(known.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))
-    weights = ((near - near[known].max()) / temperature).exp().nan_to_num(0)
+    has_words = ~near.isnan()
+    check(bool(has_words.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))
+    weights = ((near - near[has_words].max()) / temperature).exp().nan_to_num(0)
     order = weights.argsort(descending=True, stable=True).tolist()
     return {classes[k]: float(weights[k]) for k in order if weights[k] >= least}
 
 
-def _read(lines: Iterable[str], wanted: set[str], found: dict[str, Tensor], path: str) -> None:
-    """Add the vectors of the wanted words to `found`."""
+def _read(lines: Iterable[str], words: set[str], vectors: dict[str, Tensor], path: str) -> None:
+    """Add the vectors of some words, read from the lines of a file, to `vectors`."""
     size: int | None = None
     for number, line in enumerate(lines, 1):
         word, _, rest = line.strip().partition(" ")
@@ -196,7 +196,7 @@ def _read(lines: Iterable[str], wanted: set[str], found: dict[str, Tensor], path
             continue
         key = word.lower()
         # A word in lower case takes precedence; in upper case it may be a proper name.
-        if key not in wanted or (key in found and word != key):
+        if key not in words or (key in vectors and word != key):
             continue
         try:
             values = [float(value) for value in rest.split()]
@@ -205,4 +205,4 @@ def _read(lines: Iterable[str], wanted: set[str], found: dict[str, Tensor], path
         size = len(values) if size is None else size
         if not values or len(values) != size or not all(map(math.isfinite, values)):
             raise DataError(f"{path}, line {number}: expected a word and {size or 'some'} numbers, got {line[:60]!r}")
-        found[key] = torch.tensor(values)
+        vectors[key] = torch.tensor(values)

@@ -214,8 +214,8 @@ class CandidateCells(CandidatePlaces[Step]):
         if not (last or bool(place_known(cells, self._step.visited[0], least))):
             return None
         looks, target = self._left(), self.target
-        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
-        value = cells * shown.amax(0)
+        strengths = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
+        value = cells * strengths.amax(0)
         cell = int(value.argmax())
         evidence, box = strongest(looks, self.grid, cell, target)
         if box is None or float(value[cell]) <= 0 or float(cells[cell]) < least:

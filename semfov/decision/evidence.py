@@ -10,10 +10,11 @@ from semfov.detection.detections import Detections
 from semfov.errors import check, check_finite, check_shape
 
 
-def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
+def strength(detections: Detections, grid: Grid, target: int) -> Tensor:
     """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
-    shown = grid.footprint(seen.boxes, "soft")[0] * (seen.mask[0] * seen.scores[0, :, target])[:, None]
-    return shown.amax(0) if len(shown) else shown.sum(0)
+    scores = detections.mask[0] * detections.scores[0, :, target]
+    by_detection = grid.footprint(detections.boxes, "soft")[0] * scores[:, None]
+    return by_detection.amax(0) if len(by_detection) else by_detection.sum(0)
 
 
 def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
@@ -29,11 +30,11 @@ def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -
         The evidence, and the box `(4,)` as `(x1, y1, x2, y2)`; 0 and None if no detection overlaps the cell.
     """
     evidence, box = 0.0, None
-    for seen in looks:
-        weight = grid.footprint(seen.boxes, "soft")[0, :, cell] * seen.mask[0]
-        scores = weight * seen.scores[0, :, target]
+    for look in looks:
+        weight = grid.footprint(look.boxes, "soft")[0, :, cell] * look.mask[0]
+        scores = weight * look.scores[0, :, target]
         if scores.numel() and float(scores.max()) > evidence:
-            evidence, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
+            evidence, box = float(scores.max()), look.boxes[0, int(scores.argmax())]
     return evidence, box
 
 

@@ -137,8 +137,8 @@ def conclude(
         return Decision(OUTCOMES[outcome], probability)
     if cell is None:
         cells = belief.probability(target)[0]
-        shown = torch.stack([cells.new_zeros(len(grid)), *(strength(seen, grid, target) for seen in looks)]).amax(0)
-        cell = int((cells * shown if bool(shown.any()) else cells).argmax())
+        strengths = torch.stack([cells.new_zeros(len(grid)), *(strength(look, grid, target) for look in looks)]).amax(0)
+        cell = int((cells * strengths if bool(strengths.any()) else cells).argmax())
     return Decision("found", probability, cell, strongest(looks, grid, cell, target)[1])
 
 
@@ -176,7 +176,7 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
 
 
 def outcome_of(
-    wanted: Mapping[int, float],
+    weights: Mapping[int, float],
     grid: Grid,
     goal: Tensor | None,
     thresholds: Thresholds | None,
@@ -185,7 +185,7 @@ def outcome_of(
     """Make the function that decides which searches end with a step.
 
     Args:
-        wanted: for each class 1..K of the target, the probability that it is meant; the belief is about all of them.
+        weights: for each class 1..K of the target, the probability that it is meant; the belief is about all of them.
         grid: the cells.
         goal: `(X·Y,)` boolean, cells on which a search ends; None ends it by a decision.
         thresholds: thresholds of the belief; None lets a detection in the fixated cell confirm the target.
@@ -194,19 +194,19 @@ def outcome_of(
     Returns:
         A function from a step to `(A,)`, 0 for a search that continues, otherwise its outcome in `OUTCOMES`.
     """
-    first = next(iter(wanted))
+    first = next(iter(weights))
 
     def outcome(step: Step) -> Tensor:
         if goal is not None:
             return goal[step.cell].long()
         if thresholds is not None:
             return decide(step, first, thresholds)
-        seen = [
+        hits = [
             confirms(step.detections, grid, step.cell, index, confirm / weight)
-            for index, weight in wanted.items()
+            for index, weight in weights.items()
             if weight > 0
         ]
-        return torch.stack(seen).any(0).long()
+        return torch.stack(hits).any(0).long()
 
     return outcome
 

@@ -283,25 +283,26 @@ class Verifier(Generic[LookType]):
         return float((weight * odds + (1 - weight) * present).sigmoid())
 
 
-def follow_target(box: Tensor, seen: Detections, target: int) -> Tensor:
+def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
     """Move the box of a target to the middle of the detection that best shows it (`best_detection`).
 
     The box keeps its size, because a closer look measures it better than a look of the fovea.
 
     Args:
         box: `(4,)`, the box.
-        seen: detections of a look, a batch of one.
+        detections: detections of a look, a batch of one.
         target: class 1..K.
 
     Returns:
         The box `(4,)`, unmoved if no detection overlaps it by `MATCHED`.
 
-    >>> seen = Detections(torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
-    >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), seen, 1)
+    >>> box, scores = torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]])
+    >>> detections = Detections(box, scores, torch.ones(1, 1).bool())
+    >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
     tensor([ 3.,  0., 11.,  8.])
     """
-    shown = seen.mask[0]
-    boxes, scores = seen.boxes[0][shown], seen.scores[0][shown, target]
+    real = detections.mask[0]
+    boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]
     if not len(boxes):
         return box
     best, overlap = best_detection(boxes, scores, box)

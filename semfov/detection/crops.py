@@ -11,7 +11,7 @@ _BORDER = 2.0
 
 
 def merge_crops(
-    seen: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
+    detections: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
 ) -> Detections:
     """Merge the detections in the crops of each fixation.
 
@@ -21,7 +21,7 @@ def merge_crops(
     box is kept rather than a cut one, and otherwise the one in the finer crop.
 
     Args:
-        seen: detections in the crops, a batch of F·L, boxes in pixels of the picture.
+        detections: detections in the crops, a batch of F·L, boxes in pixels of the picture.
         windows: `(F·L, 4)`, the squares that the crops show, in pixels of the picture; finest first.
         crops: number of crops of a fixation, L.
         side: side of a crop in the detector's pixels.
@@ -32,16 +32,16 @@ def merge_crops(
         A batch of F, boxes cut to the picture.
 
     >>> boxes = torch.tensor([[[6.0, 6, 14, 14]], [[6.0, 6, 14, 15]]])
-    >>> seen = Detections(boxes, torch.tensor([[[0.2, 0.8]], [[0.1, 0.9]]]), torch.ones(2, 1, dtype=torch.bool))
+    >>> detections = Detections(boxes, torch.tensor([[[0.2, 0.8]], [[0.1, 0.9]]]), torch.ones(2, 1, dtype=torch.bool))
     >>> windows = torch.tensor([[2.0, 2, 18, 18], [-6, -6, 26, 26]])
-    >>> merge_crops(seen, windows, 2, 16, (40, 40), 100).boxes
+    >>> merge_crops(detections, windows, 2, 16, (40, 40), 100).boxes
     tensor([[[ 6.,  6., 14., 14.]]])
     """
-    found = []
-    for first in range(0, len(seen.mask), crops):
+    merged = []
+    for first in range(0, len(detections.mask), crops):
         rows = slice(first, first + crops)
-        number, row = seen.mask[rows].nonzero(as_tuple=True)
-        boxes, scores, window = seen.boxes[rows][number, row], seen.scores[rows][number, row], windows[rows]
+        number, row = detections.mask[rows].nonzero(as_tuple=True)
+        boxes, scores, window = detections.boxes[rows][number, row], detections.scores[rows][number, row], windows[rows]
         limits = boxes.new_tensor([*size, *size], dtype=boxes.dtype)
         boxes = torch.minimum(boxes.clamp(min=0), limits)
         own = boxes.detach()
@@ -51,10 +51,12 @@ def merge_crops(
         index = left.nonzero()[:, 0]
         value, label = scores[index, 1:].detach().max(-1)
         cut = ~whole[index, number[index]]
-        parts = (own[index], value, label, number[index], cut, -number[index])
-        kept = index[unlike(*(part.cpu() for part in parts))[:limit].to(index)]
-        found.append(Detections(boxes[kept][None], scores[kept][None], torch.ones_like(kept, dtype=torch.bool)[None]))
-    return found[0] if len(found) == 1 else Detections.stack(found)
+        columns = (own[index], value, label, number[index], cut, -number[index])
+        chosen = index[unlike(*(column.cpu() for column in columns))[:limit].to(index)]
+        merged.append(
+            Detections(boxes[chosen][None], scores[chosen][None], torch.ones_like(chosen, dtype=torch.bool)[None])
+        )
+    return merged[0] if len(merged) == 1 else Detections.stack(merged)
 
 
 def _whole(boxes: Tensor, windows: Tensor, size: Tensor, side: int) -> Tensor:

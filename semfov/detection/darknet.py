@@ -69,8 +69,8 @@ class Darknet(nn.Module):
         stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
         outputs = {-1: image}
         if stem:
-            parts = [self.run({-1: part}, 0, stem) for part in image.split(1)]
-            outputs = {index: torch.cat([part[index] for part in parts]) for index in parts[0]}
+            runs = [self.run({-1: single}, 0, stem) for single in image.split(1)]
+            outputs = {index: torch.cat([run[index] for run in runs]) for index in runs[0]}
         outputs = self.run(outputs, stem, len(self.layers))
         return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
@@ -78,8 +78,8 @@ class Darknet(nn.Module):
         """Compute the input of the last convolution before the first head, `(B, C, H', W')`."""
         self.check_image(image)
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
-        wanted = self.sources[self.sources[head][0]][0]
-        return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, wanted + 1)[wanted]
+        last = self.sources[self.sources[head][0]][0]
+        return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, last + 1)[last]
 
     def cfg_digest(self) -> str:
         """sha256 of the sections."""

@@ -64,8 +64,8 @@ class Builder:
         if len(self.shapes) >= _MOST_LAYERS:
             raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers, got more; check the cfg")
         if section.kind not in self._makers:
-            known = ", ".join(self._makers)
-            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {known}")
+            kinds = ", ".join(self._makers)
+            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {kinds}")
         for key, value in _NEUTRAL.get(section.kind, {}).items():
             if section.text(key, value) != value:
                 raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")

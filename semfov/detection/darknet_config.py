@@ -40,14 +40,14 @@ class Section:
     def integers(self, key: str, default: str | None = None) -> tuple[int, ...]:
         """The value of `key` as a list of whole numbers."""
         try:
-            return tuple(int(part) for part in self._parts(key, default))
+            return tuple(int(part) for part in self._entries(key, default))
         except ValueError as error:
             raise self._refuse(key, "whole numbers") from error
 
     def numbers(self, key: str, default: str | None = None) -> tuple[float, ...]:
         """The value of `key` as a list of numbers."""
         try:
-            numbers = tuple(float(part) for part in self._parts(key, default))
+            numbers = tuple(float(part) for part in self._entries(key, default))
         except ValueError as error:
             raise self._refuse(key, "numbers") from error
         if not all(map(math.isfinite, numbers)):
@@ -61,7 +61,7 @@ class Section:
             raise self._refuse(key, f"one whole number of at least {minimum}")
         return values[0]
 
-    def _parts(self, key: str, default: str | None) -> list[str]:
+    def _entries(self, key: str, default: str | None) -> list[str]:
         return [part for part in self.text(key, default).split(",") if part.strip()]
 
     def _refuse(self, key: str, expected: str) -> DataError:

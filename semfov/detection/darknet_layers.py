@@ -95,8 +95,8 @@ class Route(nn.Module):
 
     def forward(self, *images: Tensor) -> Tensor:
         """Concatenate `(B, C_i, H, W)` to `(B, Σ C_i / groups, H, W)`."""
-        parts = [image.chunk(self.groups, 1)[self.group] for image in images]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+        chunks = [image.chunk(self.groups, 1)[self.group] for image in images]
+        return chunks[0] if len(chunks) == 1 else torch.cat(chunks, 1)
 
 
 class Shortcut(nn.Module):

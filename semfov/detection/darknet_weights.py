@@ -52,8 +52,8 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     needed = start + 4 * sum(_count(layer) for layer in layers)
     if length != needed or len(data) != needed:
         fault = "truncated" if length < needed else "too long"
-        found = f"expected {needed} bytes for this network, got {length}"
-        raise DataError(f"weights {str(path)!r}: {found}; the file is {fault}, or belongs to another network")
+        sizes = f"expected {needed} bytes for this network, got {length}"
+        raise DataError(f"weights {str(path)!r}: {sizes}; the file is {fault}, or belongs to another network")
     numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
     if not bool(torch.isfinite(numbers).all()):
         raise DataError(

@@ -38,8 +38,8 @@ class Exchange:
                 f"detections: expected the detections of one image, such as detections[0], got a batch of shape "
                 f"{tuple(mask.shape[:-1])}"
             )
-        kept = mask.reshape(-1)
-        boxes, vectors = self.boxes.reshape(-1, 4)[kept], self.scores.reshape(-1, self.scores.shape[-1])[kept]
+        real = mask.reshape(-1)
+        boxes, vectors = self.boxes.reshape(-1, 4)[real], self.scores.reshape(-1, self.scores.shape[-1])[real]
         best = vectors[:, 1:].max(-1) if vectors.shape[-1] > 1 else vectors.max(-1)
         return boxes, vectors, best.indices + 1, best.values
 
@@ -88,14 +88,16 @@ class Exchange:
         full = detections.data.get(SCORES)
         if full is not None:
             vectors = torch.as_tensor(full)
-            wanted = (len(boxes), classes + 1)
-            check(tuple(vectors.shape) == wanted, "data['scores']", f"shape {wanted}", tuple(vectors.shape))
+            shape = (len(boxes), classes + 1)
+            check(tuple(vectors.shape) == shape, "data['scores']", f"shape {shape}", tuple(vectors.shape))
             return cls._one_image(boxes, vectors)
         if detections.class_id is None and len(boxes):
             raise InputError("detections: expected a class_id for every box, got none")
         labels = torch.as_tensor([] if detections.class_id is None else detections.class_id).long() + 1
-        given = detections.confidence
-        return cls._one_image(boxes, vectors_of(labels, None if given is None else torch.as_tensor(given), classes))
+        confidence = detections.confidence
+        return cls._one_image(
+            boxes, vectors_of(labels, None if confidence is None else torch.as_tensor(confidence), classes)
+        )
 
     def to_torchvision(self) -> dict[str, Tensor]:
         """Convert the detections of one image to the form of torchvision's detectors, which `torchmetrics` also takes.
@@ -229,16 +231,16 @@ def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     tensor([[0.2500, 0.0000, 0.7500, 0.0000]])
     """
     check_whole(classes, "classes", 1, 10**6)
-    known = torch.ones(len(labels), device=labels.device) if scores is None else scores
-    known = known if known.is_floating_point() else known.float()
-    check_shape(known, "scores", len(labels))
+    scores = torch.ones(len(labels), device=labels.device) if scores is None else scores
+    scores = scores if scores.is_floating_point() else scores.float()
+    check_shape(scores, "scores", len(labels))
     inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
     check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
     # The comparison also refuses NaN.
-    check(bool(((known >= 0) & (known <= 1)).all()), "scores", "numbers from 0 to 1", known.tolist()[:3])
-    vectors = known.new_zeros(len(labels), classes + 1)
-    vectors[:, 0] = 1 - known
-    return vectors.scatter(1, labels[:, None], known[:, None])
+    check(bool(((scores >= 0) & (scores <= 1)).all()), "scores", "numbers from 0 to 1", scores.tolist()[:3])
+    vectors = scores.new_zeros(len(labels), classes + 1)
+    vectors[:, 0] = 1 - scores
+    return vectors.scatter(1, labels[:, None], scores[:, None])
 
 
 def category_ids(
@@ -266,10 +268,10 @@ def category_ids(
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
     named = [category for category in categories if isinstance(category, Mapping)]
     by_name = {canonical_name(str(category["name"])): int(category["id"]) for category in named}
-    wanted = class_indices(classes)
-    missing = [name for name in wanted if name not in by_name]
+    names = class_indices(classes)
+    missing = [name for name in names if name not in by_name]
     check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")
-    return [by_name[name] for name in wanted]
+    return [by_name[name] for name in names]
 
 
 def _check_names(classes: Sequence[str], count: int) -> None:

@@ -89,8 +89,8 @@ class _NetworkGraph(Graph):
             return self.add("Resize", sources[0], "", scales, mode="nearest", nearest_mode="floor",
                             coordinate_transformation_mode="asymmetric")  # fmt: skip
         if isinstance(layer, Route):
-            parts = [self._part(source, layer) for source in sources]
-            return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=1)
+            chunks = [self._part(source, layer) for source in sources]
+            return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
         if isinstance(layer, Shortcut):
             return self.activation(layer.activation, self.add("Add", *sources))
         return sources[0]
@@ -115,8 +115,8 @@ class _NetworkGraph(Graph):
         anchors, channels = len(head.anchors), 5 + head.classes
         shape = self.constant([0, anchors, channels, -1])
         cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
-        parts = self.add("Split", cells, self.constant([2, 2, 1, head.classes]), outputs=4, axis=3)
-        shift, size, objectness, classes = parts
+        lengths = self.constant([2, 2, 1, head.classes])
+        shift, size, objectness, classes = self.add("Split", cells, lengths, outputs=4, axis=3)
         centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
         corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
         centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
@@ -181,12 +181,12 @@ def _build(network: Darknet) -> _NetworkGraph:
     """The whole graph, from `images` to `OUTPUTS`."""
     graph = _NetworkGraph()
     names = {-1: "images"}
-    found = []
+    heads = []
     for index, layer in enumerate(network.layers):
         names[index] = graph.layer(layer, *(names[source] for source in network.sources[index]))
         if isinstance(layer, Head):
-            found.append(graph.decode(layer, names[index], float(network.steps[index])))
-    for name, parts in zip(OUTPUTS, zip(*found, strict=True), strict=True):
-        graph.add("Concat", *parts, axis=1)
+            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
+    for name, outputs in zip(OUTPUTS, zip(*heads, strict=True), strict=True):
+        graph.add("Concat", *outputs, axis=1)
         graph.name_last(name)
     return graph

@@ -73,7 +73,7 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
         return model
     if not isinstance(model, str | PathLike):
         return load_module(model, **options)
-    name = known_name(model)
+    name = detector_name(model)
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
         from semfov.detection.onnx import load_onnx
 
@@ -138,7 +138,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
     >>> check_detector("YOLOX-Nano")[:2]
     ('person', 'bicycle')
     """
-    name = known_name(name_or_path)
+    name = detector_name(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         if not Path(name).exists():
             raise DataError(f"detector: no such file: {name}; check the path")
@@ -146,7 +146,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
     return COCO_CLASSES if name in WEIGHTS else None
 
 
-def known_name(name_or_path: str | PathLike[str]) -> str:
+def detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is.
 
     Args:
@@ -158,22 +158,22 @@ def known_name(name_or_path: str | PathLike[str]) -> str:
     Raises:
         InputError: no detector has this name, or its file is not one that can be read.
 
-    >>> known_name("YOLOv3-tiny"), known_name("Mine.onnx")
+    >>> detector_name("YOLOv3-tiny"), detector_name("Mine.onnx")
     ('yolov3-tiny', 'Mine.onnx')
     """
-    given = fspath(name_or_path)
-    if given.endswith((".onnx", ".cfg")):
-        return given
-    if given.endswith(".weights"):
-        raise InputError(_WEIGHTS_ALONE.format(given))
-    if given.endswith((".pt", ".pth")):
-        raise InputError(_PICKLE.format(given, Path(given).stem))
-    lower = given.lower()
+    name = fspath(name_or_path)
+    if name.endswith((".onnx", ".cfg")):
+        return name
+    if name.endswith(".weights"):
+        raise InputError(_WEIGHTS_ALONE.format(name))
+    if name.endswith((".pt", ".pth")):
+        raise InputError(_PICKLE.format(name, Path(name).stem))
+    lower = name.lower()
     if lower.startswith("torchvision:"):
         return lower
     if lower.startswith("hf:"):
-        return f"hf:{given[3:]}"
-    return lower if lower in WEIGHTS else lookup(given, WEIGHTS, "detector")
+        return f"hf:{name[3:]}"
+    return lower if lower in WEIGHTS else lookup(name, WEIGHTS, "detector")
 
 
 def load_yolo(

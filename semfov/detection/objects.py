@@ -183,9 +183,9 @@ def merge_looks(
         Objects, most confident first.
     """
     enough = (scores >= score).nonzero()[:, 0]
-    parts = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
-    kept = enough[unlike(*parts, iou=iou, inside=inside, around=around)]
-    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept])
+    columns = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
+    index = enough[unlike(*columns, iou=iou, inside=inside, around=around)]
+    return Objects(boxes[index], scores[index], labels[index], looks[index])
 
 
 def unlike(
@@ -220,8 +220,8 @@ def unlike(
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    kept = order[_unlike(boxes[order], labels[order], cut[order], looks[order], iou, inside, around)]
-    return kept[scores[kept].argsort(descending=True, stable=True)]
+    index = order[_unlike(boxes[order], labels[order], cut[order], looks[order], iou, inside, around)]
+    return index[scores[index].argsort(descending=True, stable=True)]
 
 
 def _unlike(
@@ -255,12 +255,12 @@ def _unlike(
     return torch.from_numpy(survivors(count, first[same], second[same]))
 
 
-def _numbers(given: ArrayLike | Tensor, name: str) -> Tensor:
+def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
     """Numbers as a tensor of floats on the CPU."""
     try:
-        tensor = torch.as_tensor(given, device="cpu").detach()
+        tensor = torch.as_tensor(values, device="cpu").detach()
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{name}: expected numbers, got {given!r:.80}") from None
+        raise InputError(f"{name}: expected numbers, got {values!r:.80}") from None
     tensor = tensor if tensor.is_floating_point() else tensor.float()
     check(bool(tensor.isfinite().all()), name, "finite numbers", "infinite ones or NaN")
     return tensor

@@ -90,14 +90,14 @@ class OnnxDetector(Detector):
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input, with the placement of the network's training."""
         check_images(images)
-        wanted = self.preprocessing
+        preprocessing = self.preprocessing
         return letterbox(
             images,
             self.input_size,
-            fill=wanted.fill,
+            fill=preprocessing.fill,
             stride=self.stride,
-            stretch=wanted.stretch,
-            corner=wanted.corner,
+            stretch=preprocessing.stretch,
+            corner=preprocessing.corner,
         )
 
     def propose(self, canvas: Tensor) -> Candidates:
@@ -219,9 +219,9 @@ def load_onnx(
     name = fspath(name_or_path)
     file = _locate(name, weights)
     digest = sha256(file) if file.is_file() else ""
-    known_as = name if name in ONNX_MODELS else NETWORKS.get(digest)
+    published_name = name if name in ONNX_MODELS else NETWORKS.get(digest)
     path = file
-    if known_as in ONNX_MODELS and input_size is not None:
+    if published_name in ONNX_MODELS and input_size is not None:
         path = with_input_size(file, _sides(input_size), STRIDES)
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(file, session.metadata)
@@ -232,7 +232,7 @@ def load_onnx(
         "stride": stride,
         "logits": logits,
         "background": background,
-        "name": known_as,
+        "name": published_name,
     }
     chosen = stored | {key: value for key, value in options.items() if value is not None}
     size = canvas_size(session, chosen.get("input_size"))
@@ -240,15 +240,15 @@ def load_onnx(
     names = chosen.get("classes")
     if "head" not in chosen:
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
-        coco = len(COCO_CLASSES) if known_as else None
+        coco = len(COCO_CLASSES) if published_name else None
         count = coco if names is None else len(names)
         chosen["head"] = recognise(Signature(session.image, shapes, size, session.producer, count))
-    known = HEADS[lookup(chosen["head"], HEADS, "head")]
+    head_kind = HEADS[lookup(chosen["head"], HEADS, "head")]
     if not isinstance(preprocessing, Preprocessing):
-        wanted = known.preprocessing.merged(stored["preprocessing"])
-        preprocessing = wanted.merged({} if preprocessing is None else preprocessing)
+        default = head_kind.preprocessing.merged(stored["preprocessing"])
+        preprocessing = default.merged({} if preprocessing is None else preprocessing)
     try:
-        scores = known.decode(outputs, size).classes.shape[-1]
+        scores = head_kind.decode(outputs, size).classes.shape[-1]
     except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
         listed = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
         raise InputError(
@@ -272,26 +272,26 @@ def load_onnx(
     )
 
 
-def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tuple[int, int]:
+def canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> tuple[int, int]:
     """`(width, height)` of a model's canvas: its fixed size, or the wanted size of a model that takes any."""
     height, width = session.shape[2:]
-    if wanted is None:
+    if input_size is None:
         if height is None or width is None:
             raise InputError(
                 f"input_size: expected (width, height) because {session.path.name} takes any size, got None"
             )
         check_canvas(session.path.name, (width, height))
         return width, height
-    sizes = _sides(wanted)
+    sizes = _sides(input_size)
     check_canvas("input_size", sizes)
     fits = width in (None, sizes[0]) and height in (None, sizes[1])
     check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)
     return sizes
 
 
-def _sides(wanted: int | Sequence[int]) -> tuple[int, int]:
+def _sides(input_size: int | Sequence[int]) -> tuple[int, int]:
     """`(width, height)` of one side or two."""
-    sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
+    sizes = (input_size, input_size) if isinstance(input_size, int) else tuple(input_size)
     whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
     check(whole, "input_size", "(width, height) in pixels", excerpt(sizes))
     return sizes[0], sizes[1]

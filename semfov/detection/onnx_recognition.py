@@ -80,15 +80,15 @@ def recognise(signature: Signature) -> str:
     >>> recognise(Signature("images", (("output0", (1, 84, 8400)),), (640, 640)))
     'yolov8'
     """
-    found = list(_fitting(signature))
-    if len(found) == 1:
-        return found[0]
+    names = list(_fitting(signature))
+    if len(names) == 1:
+        return names[0]
     shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
     width, height = signature.canvas
-    known = "" if signature.classes is None else f" with {signature.classes} classes"
-    fits = f"{' and '.join(found)} fit" if found else "no head fits with certainty"
+    count = "" if signature.classes is None else f" with {signature.classes} classes"
+    fits = f"{' and '.join(names)} fit" if names else "no head fits with certainty"
     raise InputError(
-        f"outputs {shapes} on a {width} x {height} canvas{known}: {fits}; "
+        f"outputs {shapes} on a {width} x {height} canvas{count}: {fits}; "
         f"name the head with head=, one of {', '.join(sorted(HEADS))}"
     )
 

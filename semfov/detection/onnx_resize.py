@@ -39,10 +39,10 @@ def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int])
     check_file(path)
     model = onnx.load(path)
     sides = model.graph.input[0].type.tensor_type.shape.dim[2:4]
-    known = sides[1].dim_value, sides[0].dim_value
-    if known == canvas:
+    size = sides[1].dim_value, sides[0].dim_value
+    if size == canvas:
         return path
-    _resize(model.graph, known, canvas, strides)
+    _resize(model.graph, size, canvas, strides)
     content = model.SerializeToString()
     digest = hashlib.sha256(content).hexdigest()
     new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
@@ -52,15 +52,15 @@ def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int])
     return new
 
 
-def _resize(graph: Any, known: tuple[int, int], canvas: tuple[int, int], strides: Sequence[int]) -> None:
+def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int], strides: Sequence[int]) -> None:
     """Replace the sizes that a graph has in constants."""
     from onnx import numpy_helper
 
-    maps = {cells(known, stride): cells(canvas, stride) for stride in strides}
-    asked = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
+    maps = {cells(size, stride): cells(canvas, stride) for stride in strides}
+    shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
     constants = {tensor.name: tensor for tensor in graph.initializer}
     constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
-    for name in asked & constants.keys():
+    for name in shape_names & constants.keys():
         shape = numpy_helper.to_array(constants[name]).copy()
         if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
             shape[-2:] = maps[int(shape[-1]), int(shape[-2])][::-1]

@@ -76,7 +76,7 @@ class OnnxSession:
         if checked:
             check_file(self.path)
         try:
-            chosen = _providers(self.device) if self.providers is None else _known_providers(self.providers)
+            chosen = _providers(self.device) if self.providers is None else _available_providers(self.providers)
             # onnxruntime's fallback would print messages and try the same again.
             self._session = ort.InferenceSession(fspath(path), options, providers=chosen, disable_fallback=1)
         except InputError:
@@ -106,13 +106,13 @@ class OnnxSession:
         """Name, shape and dtype of the image input, and the names of the other inputs."""
         inputs = self._session.get_inputs()
         images = [i for i in inputs if len(i.shape) == 4 and i.type in _FLOATS]
-        found = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
+        description = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
         if len(images) != 1 or _sizes(images[0].shape)[1] not in (3, None):
-            raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {found}")
+            raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {description}")
         extra = [i.name for i in inputs if i is not images[0]]
         if not set(extra) <= set(EXTRA_INPUTS):
             raise InputError(
-                f"{self.path.name}: expected no inputs but an image and {', '.join(EXTRA_INPUTS)}, got {found}"
+                f"{self.path.name}: expected no inputs but an image and {', '.join(EXTRA_INPUTS)}, got {description}"
             )
         return images[0].name, _sizes(images[0].shape), _FLOATS[images[0].type], extra
 
@@ -161,15 +161,15 @@ def _reopen(
     return OnnxSession(path, threads=threads, device=device, providers=providers, spinning=spinning, checked=False)
 
 
-def _known_providers(wanted: Sequence[Provider]) -> list[Any]:
+def _available_providers(providers: Sequence[Provider]) -> list[Any]:
     """The execution providers, all of which onnxruntime has."""
     import onnxruntime as ort
 
     have = ort.get_available_providers()
-    names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
+    names = [provider if isinstance(provider, str) else provider[0] for provider in providers]
     missing = [name for name in names if name not in have]
     check(bool(names) and not missing, "providers", f"some of {', '.join(have)}", ", ".join(missing) or "none")
-    return list(wanted)
+    return list(providers)
 
 
 def _providers(device: torch.device) -> list[Any]:

@@ -89,16 +89,16 @@ def _parse(text: str, where: str) -> dict[str, Any]:
 
 def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
     """Class names `{0: 'person', ...}` and input size `[height, width]` from Ultralytics' metadata."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     try:
         if "names" in metadata:
             names = ast.literal_eval(metadata["names"])
-            found["classes"] = [names[i] for i in range(len(names))]
-            if not all(isinstance(name, str) and is_plain(name) for name in found["classes"]):
+            settings["classes"] = [names[i] for i in range(len(names))]
+            if not all(isinstance(name, str) and is_plain(name) for name in settings["classes"]):
                 return {}
         if "imgsz" in metadata:
             height, width = ast.literal_eval(metadata["imgsz"])
-            found["input_size"] = [int(width), int(height)]
+            settings["input_size"] = [int(width), int(height)]
     except (ValueError, SyntaxError, TypeError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
         return {}  # keys of the same name from another exporter
-    return found
+    return settings

@@ -38,7 +38,7 @@ class OnnxTwin:
 
     def __init__(self, digest: str) -> None:
         self.digest = digest
-        self._seen: tuple[object, ...] | None = None
+        self._versions: tuple[object, ...] | None = None
         self._same = False
         self._opened: tuple[tuple[int, int], OnnxSession] | None = None
 
@@ -55,9 +55,9 @@ class OnnxTwin:
             return f"a network of {dtype}"
         if network.channels != 3:
             return f"a network that takes {network.channels} channels"
-        seen = tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
-        if seen != self._seen:
-            self._seen, self._same = seen, network_digest(network) == self.digest
+        versions = tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
+        if versions != self._versions:
+            self._versions, self._same = versions, network_digest(network) == self.digest
         return None if self._same else "weights that were changed after loading"
 
     def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
@@ -77,13 +77,13 @@ class OnnxTwin:
     def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
         network.check_image(canvas)
-        found = self._session(network)(canvas.float())
-        return Candidates(found["boxes"], found["classes"], found["objectness"])
+        outputs = self._session(network)(canvas.float())
+        return Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
 
     def _session(self, network: Darknet) -> OnnxSession:
-        wanted = (os.getpid(), torch.get_num_threads())
-        if self._opened is None or self._opened[0] != wanted:
-            self._opened = wanted, self._open(network)
+        key = (os.getpid(), torch.get_num_threads())
+        if self._opened is None or self._opened[0] != key:
+            self._opened = key, self._open(network)
         return self._opened[1]
 
     def _open(self, network: Darknet) -> OnnxSession:

@@ -112,10 +112,11 @@ def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Te
     elif policy == "residual":
         background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)
     elif policy == "normalised":
-        seen = classes.amax(-1) if candidates.objectness is None else candidates.objectness
-        sure = 1 if candidates.objectness is None else seen
+        objectness = classes.amax(-1) if candidates.objectness is None else candidates.objectness
+        sure = 1 if candidates.objectness is None else objectness
         # (1 - o) / (1 - o + o Σ c); below, the classes share the rest as with every policy.
-        background = (1 - seen) / (1 - seen + sure * classes.sum(-1)).clamp(min=torch.finfo(classes.dtype).tiny)
+        total = 1 - objectness + sure * classes.sum(-1)
+        background = (1 - objectness) / total.clamp(min=torch.finfo(classes.dtype).tiny)
     elif policy == "uniform":
         background = torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
     else:

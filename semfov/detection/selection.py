@@ -54,8 +54,8 @@ def select(
         The selected boxes.
     """
     count = candidates.boxes.shape[0]
-    found = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
-    return found[0] if count == 1 else Detections.stack(found)
+    detections = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
+    return detections[0] if count == 1 else Detections.stack(detections)
 
 
 def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:
@@ -69,11 +69,11 @@ def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:
             check_finite(numbers, f"detector: {name} in image {image}")
 
 
-def check_scores(image: int, kept: Candidates) -> None:
+def check_scores(image: int, candidates: Candidates) -> None:
     """Raise `InputError` where a selected box has a score outside [0, 1]."""
-    if not values_known(kept.classes):
+    if not values_known(candidates.classes):
         return
-    for name, scores in (("class scores", kept.classes), ("objectness", kept.objectness)):
+    for name, scores in (("class scores", candidates.classes), ("objectness", candidates.objectness)):
         if scores is not None and scores.numel():
             low, high = scores.detach().aminmax()
             inside = float(low) >= 0 and float(high) <= 1
@@ -93,13 +93,13 @@ def _select_one(
     check_candidates(image, confidence, boxes)
     boxes = boxes if placement is None else placement.boxes_to_image(boxes)
     labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
-    kept = suppress(boxes, confidence.index_select(0, index), labels, selection)
-    rows = candidates.take(image, index[kept])
+    chosen = suppress(boxes, confidence.index_select(0, index), labels, selection)
+    rows = candidates.take(image, index[chosen])
     check_scores(image, rows)
     scores = score_vectors(rows, policy)
     # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
     order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
-    boxes, scores = boxes.index_select(0, kept[order]), scores.index_select(0, order)
+    boxes, scores = boxes.index_select(0, chosen[order]), scores.index_select(0, order)
     return Detections(boxes[None], scores[None], torch.ones_like(order, dtype=torch.bool)[None])
 
 

@@ -139,13 +139,13 @@ class TorchvisionDetector(Detector):
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
         """The classes of one image without placeholders, with one box for each row."""
-        kept = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
+        candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
         if boxes.ndim == 2:
-            return kept
+            return candidates
         places = torch.tensor(self._places, device=boxes.device) + self.first
-        best = places[kept.classes.argmax(-1)]
+        best = places[candidates.classes.argmax(-1)]
         own = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
-        return Candidates(own, kept.classes)
+        return Candidates(own, candidates.classes)
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""

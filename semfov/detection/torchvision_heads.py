@@ -119,9 +119,9 @@ def output_count(model: nn.Module) -> int | None:
         "head.classification_head.num_classes",
         "head.classification_head.num_columns",
     ):
-        found: Any = model
+        value: Any = model
         for part in path.split("."):
-            found = getattr(found, part, None)
-        if isinstance(found, int):
-            return found
+            value = getattr(value, part, None)
+        if isinstance(value, int):
+            return value
     return None

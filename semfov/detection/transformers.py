@@ -70,9 +70,9 @@ class TransformersDetector(Detector):
             classes = [config.id2label[index] for index in sorted(config.id2label)]
         names, places = named_outputs(classes)
         normal = config.model_type in _IMAGENET
-        given: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
-        given |= processor or {}
-        size = given.get("size") or (_EDGES if normal else _SQUARE)
+        settings: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
+        settings |= processor or {}
+        size = settings.get("size") or (_EDGES if normal else _SQUARE)
         self.edges = (size["shortest_edge"], size["longest_edge"]) if "shortest_edge" in size else None
         self.softmax = config.model_type in SOFTMAX
         super().__init__(
@@ -86,8 +86,8 @@ class TransformersDetector(Detector):
         )
         self.model = model.eval()
         self.preprocessing = Preprocessing(stretch=self.edges is None)
-        if given["do_normalize"]:
-            means = {"mean": given["image_mean"], "std": given["image_std"]}
+        if settings["do_normalize"]:
+            means = {"mean": settings["image_mean"], "std": settings["image_std"]}
             self.preprocessing = self.preprocessing.merged(means)
         self._places, self._count = places, len(classes)
 

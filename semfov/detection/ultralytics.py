@@ -47,8 +47,8 @@ class UltralyticsDetector(Detector):
     ) -> None:
         network: Any = _network(model)
         if classes is None:
-            found = network.names
-            classes = [found[index] for index in sorted(found)] if isinstance(found, dict) else list(found)
+            labels = network.names
+            classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
         names, places = named_outputs(classes)
         super().__init__(
             name,

@@ -111,13 +111,13 @@ class YoloV3(Detector):
         maps = self.network(canvas.to(next(self.network.parameters()).dtype))
         maps = [raw.float() if raw.dtype in HALVES else raw for raw in maps]
         size = (canvas.shape[-1], canvas.shape[-2])
-        parts = [
+        candidates = [
             decode_yolo(raw, head.anchors, size, head.scale) for raw, head in zip(maps, self.network.heads, strict=True)
         ]
         return Candidates(
-            torch.cat([part.boxes for part in parts], 1),
-            torch.cat([part.classes for part in parts], 1),
-            torch.cat([part.objectness for part in parts if part.objectness is not None], 1),
+            torch.cat([some.boxes for some in candidates], 1),
+            torch.cat([some.classes for some in candidates], 1),
+            torch.cat([some.objectness for some in candidates if some.objectness is not None], 1),
         )
 
     def features(self, canvas: Tensor) -> Tensor:

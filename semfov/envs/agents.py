@@ -200,7 +200,7 @@ def run_agent(envs: Any, agent: Agent, episodes: Sequence[Any]) -> list[Ran]:
 def _run(envs: Any, agent: Agent, episodes: list[Any]) -> list[Ran]:
     observations, infos = envs.reset(options={"episodes": episodes})
     cells, results = [[episode.start] for episode in episodes], [[float(r)] for r in infos["result"]]
-    found, going = [-1] * len(episodes), np.ones(len(episodes), dtype=bool)
+    found_at, going = [-1] * len(episodes), np.ones(len(episodes), dtype=bool)
     while going.any():
         actions = np.asarray(agent(observations, infos))
         observations, _, terminated, truncated, infos = envs.step(actions)
@@ -208,6 +208,6 @@ def _run(envs: Any, agent: Agent, episodes: list[Any]) -> list[Ran]:
             cells[row].append(int(actions[row]))
             results[row].append(float(infos["result"][row]))
             if terminated[row] and isinstance(episodes[row], Episode):
-                found[row] = len(cells[row]) - 1
+                found_at[row] = len(cells[row]) - 1
         going &= ~(terminated | truncated)
-    return [Ran(tuple(path), at, tuple(each)) for path, at, each in zip(cells, found, results, strict=True)]
+    return [Ran(tuple(path), at, tuple(each)) for path, at, each in zip(cells, found_at, results, strict=True)]

@@ -81,14 +81,14 @@ class CellGazes(Gazes):
             return scenery.draw(random)
         scene = options["scene"]
         check_whole(scene, "scene", 0, scenery.count - 1)
-        found = scenery.episodes(int(scene))
-        check(len(found) > 0, "scene", "a scene with objects to look for", scene)
-        return found[random.integers(len(found))]
+        episodes = scenery.episodes(int(scene))
+        check(len(episodes) > 0, "scene", "a scene with objects to look for", scene)
+        return episodes[random.integers(len(episodes))]
 
-    def action(self, given: Any) -> Tensor:
+    def action(self, action: Any) -> Tensor:
         """Check the cell of a single episode; returns a batch of one."""
-        check_whole(given, "action", 0, int(self.action_space.n) - 1)
-        return torch.tensor([int(given)])
+        check_whole(action, "action", 0, int(self.action_space.n) - 1)
+        return torch.tensor([int(action)])
 
     @torch.inference_mode()
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
@@ -96,8 +96,8 @@ class CellGazes(Gazes):
         visited = self.memory.visited[rows]
         here = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
         more = torch.stack([visited, here], 1).reshape(len(rows), 2, *self.scenery.shape)
-        found: NDArray[np.float32] = torch.cat([self._map(rows).float().clamp(0, 1), more.float()], 1).numpy()
-        return found
+        planes: NDArray[np.float32] = torch.cat([self._map(rows).float().clamp(0, 1), more.float()], 1).numpy()
+        return planes
 
     def places(self, rows: Tensor) -> Tensor:
         """Fixated points `(n, 2)` as fractions of width and height."""
@@ -173,8 +173,8 @@ class CellGazes(Gazes):
         """Keep the last look of the first episode."""
         if not self.pictures:
             return
-        found, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
-        sight = Sight(None, lambda: found, {})  # type: ignore[arg-type]
+        detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
+        sight = Sight(None, lambda: detections, {})  # type: ignore[arg-type]
         visited = self.memory.visited
         values = torch.zeros(visited.shape)
         step = Step(len(self._steps), _FIRST, cell, point, sight, self.belief, visited, values, cell, point, {})
@@ -234,8 +234,8 @@ class SearchGazes(CellGazes):
         self._goal[rows] = goal
 
     def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        found = self.result(rows)
-        return found, found > 0
+        result = self.result(rows)
+        return result, result > 0
 
 
 class Explorations(CellGazes):

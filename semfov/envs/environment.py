@@ -127,8 +127,8 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any]):
             each class, background first), the cells that were fixated, and the cell of the gaze. Where they are
             windows: the probability that closer looks find an object, and how closely each place was looked at.
         """
-        found: NDArray[np.float32] = self.gazes.planes(_ROW)[0]
-        return found
+        planes: NDArray[np.float32] = self.gazes.planes(_ROW)[0]
+        return planes
 
     def glimpse(self, side: int) -> NDArray[np.uint8]:
         """The foveated image, or the image of the window, that the eye sees.
@@ -139,8 +139,8 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any]):
         Returns:
             `(side, side, 3)`, RGB, uint8.
         """
-        found: NDArray[np.uint8] = self.gazes.glimpses(_ROW, side)[0]
-        return found
+        image: NDArray[np.uint8] = self.gazes.glimpses(_ROW, side)[0]
+        return image
 
     def _observed(self) -> tuple[Arrays, Arrays]:
         return _first(self.gazes.observe(_ROW)), _first(self.gazes.infos(_ROW))

@@ -106,7 +106,7 @@ class Gazes(ABC):
         """The episode that the options of a reset ask for, or one at random."""
 
     @abstractmethod
-    def action(self, given: Any) -> Tensor:
+    def action(self, action: Any) -> Tensor:
         """Check the action of a single episode; returns a batch of one."""
 
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
@@ -206,22 +206,24 @@ def glimpse_space(side: int) -> spaces.Box:
     return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
 
-def detection_arrays(found: Detections, detector: Detector) -> Arrays:
+def detection_arrays(detections: Detections, detector: Detector) -> Arrays:
     """Detections as arrays of one shape, padded to the largest number L that the detector gives.
 
     Gymnasium's own vectorised environments require infos of constant shape.
 
     Args:
-        found: detections of n looks.
+        detections: detections of n looks.
         detector: the detector, which limits their number.
 
     Returns:
         `boxes` `(n, L, 4)`, `scores` `(n, L, K+1)` and `mask` `(n, L)`, which is true for entries that are detections.
     """
-    number, count = found.mask.shape
-    limit, components = max(detector.selection.limit, count), found.scores.shape[-1]
+    number, count = detections.mask.shape
+    limit, components = max(detector.selection.limit, count), detections.scores.shape[-1]
     boxes = np.zeros((number, limit, 4), np.float32)
     scores = np.zeros((number, limit, components), np.float32)
     mask = np.zeros((number, limit), bool)
-    boxes[:, :count], scores[:, :count], mask[:, :count] = found.boxes.numpy(), found.scores.numpy(), found.mask.numpy()
+    boxes[:, :count] = detections.boxes.numpy()
+    scores[:, :count] = detections.scores.numpy()
+    mask[:, :count] = detections.mask.numpy()
     return {"boxes": boxes, "scores": scores, "mask": mask}

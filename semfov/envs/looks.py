@@ -26,7 +26,7 @@ class SceneLooks(Looks):
         self._scenes: dict[int, StoredLooks] = {}
         self._starts: dict[int, tuple[int, int]] = {}
         self._table: Look | None = None
-        self._seen: Detections | None = None
+        self._every_look: Detections | None = None
         # For each episode, the rows of the look from cell 0: in the table, and in the detections.
         self._row, self._place = torch.zeros(2, episodes, dtype=torch.int64)
 
@@ -55,20 +55,20 @@ class SceneLooks(Looks):
         places = len(self._scenes) * len(self.grid)
         rows = sum(each.rows(self._observer) for each in self._scenes.values())
         self._scenes[scene], self._starts[scene] = stored, (rows, places)
-        self._table = self._seen = None
+        self._table = self._every_look = None
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Read the looks at the cells from the table; the fixations are the centres of the cells."""
         watch = Stopwatch()
         if self._table is None:
-            parts = [stored.weighed(self._observer) for stored in self._scenes.values()]
-            self._table = parts[0] if len(parts) == 1 else type(parts[0]).join(parts)
+            tables = [stored.weighed(self._observer) for stored in self._scenes.values()]
+            self._table = tables[0] if len(tables) == 1 else type(tables[0]).join(tables)
         look = self._table[self._row[episodes] + cell]
         watch.lap("weigh")
         place = self._place[episodes] + cell
         return Sight(look, lambda: self._detections()[place], watch.seconds)
 
     def _detections(self) -> Detections:
-        if self._seen is None:
-            self._seen = Detections.stack([stored.detections for stored in self._scenes.values()])
-        return self._seen
+        if self._every_look is None:
+            self._every_look = Detections.stack([stored.detections for stored in self._scenes.values()])
+        return self._every_look

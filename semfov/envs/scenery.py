@@ -82,8 +82,8 @@ class Scenery:
         self.eye, self.shape = looking.eye, (belief.rows, belief.columns)
         self.observer: Observer = looking.strategies[self.policy].observer
         names = self.classes[1:]
-        self._wanted = None if targets is None else {class_index(target, names, "targets") for target in targets}
-        self.scenes = [scene for scene in range(self.count) if self._asked(scene)]
+        self._targets = None if targets is None else {class_index(target, names, "targets") for target in targets}
+        self.scenes = [scene for scene in range(self.count) if self._targets_of(scene)]
         # Results are kept for as long as an environment uses this scenery.
         self._listed = cache(self._list)
         self.grid = cache(looking.grid)
@@ -96,13 +96,13 @@ class Scenery:
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
             )
 
-    def _asked(self, scene: int) -> list[int]:
+    def _targets_of(self, scene: int) -> list[int]:
         """Classes to search for in a scene, or those of its objects in an exploration."""
         if self._looking.task == "search":
             allowed = self._data.targets(scene)
-            return [target for target in allowed if self._wanted is None or target in self._wanted]
-        found: list[int] = self.annotation(scene).labels.tolist()
-        return found
+            return [target for target in allowed if self._targets is None or target in self._targets]
+        labels: list[int] = self.annotation(scene).labels.tolist()
+        return labels
 
     def episodes(self, scene: int) -> list[Any]:
         """All episodes of a scene: its searches or explorations, with the starts that the protocol draws.
@@ -118,7 +118,7 @@ class Scenery:
     def _list(self, scene: int) -> list[Any]:
         rows, columns = self.shape
         if self._looking.task == "search":
-            return list(episodes_of(self._data, scene, columns, rows, self.protocol, self._asked(scene)))
+            return list(episodes_of(self._data, scene, columns, rows, self.protocol, self._targets_of(scene)))
         if not self.answers(scene).any():
             return []
         return list(explorations_of(self._data, scene, columns * rows, self.protocol))
@@ -161,8 +161,8 @@ class Scenery:
 
     def _open(self, scene: int) -> StoredLooks:
         """Stored looks from every cell of a scene."""
-        asked = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
-        targets = torch.tensor(asked) if asked else None
+        cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
+        targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
 
     def _answers(self, scene: int) -> Tensor:
@@ -217,8 +217,8 @@ class Scenery:
         return self._data[scene].image
 
 
-class _Given(PolicyLooking):
-    """Looks at given scenes."""
+class _SceneLooking(PolicyLooking):
+    """Looks at the scenes of an environment."""
 
     def __init__(self, config: RunConfig, task: Task, choose: Callable[[Callable[[], Scenes]], Scenes]) -> None:
         self.task, self._choose = task, choose
@@ -311,7 +311,7 @@ def open_scenery(
             chosen = Mosaics(chosen, *tiles, count=mosaics, seed=size)
         return chosen
 
-    looking = _Given(config, task, choose)
-    found, names = looking.scenes.classes, looking.eye.detector.classes
-    check(found == names, "scenes", "the classes of the detector", f"{len(found)} others")
+    looking = _SceneLooking(config, task, choose)
+    classes, names = looking.scenes.classes, looking.eye.detector.classes
+    check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
     return Scenery(looking, targets)

@@ -49,8 +49,8 @@ class StableVecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Start all episodes, with the seeds that were given to `seed`."""
-        asked = None if all(seed is None for seed in self._seeds) else self._seeds
-        observations, _ = self.envs.reset(seed=asked)
+        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
+        observations, _ = self.envs.reset(seed=seeds)
         self._reset_seeds()
         self._reset_options()
         self._returns[:], self._lengths[:] = 0, 0

@@ -109,21 +109,21 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
             InputError: there are too few or too many seeds or episodes, or an option is unknown.
         """
         if seed is not None:
-            given = (
+            seeds = (
                 [int(seed) + row for row in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
             )
-            check(len(given) == self.num_envs, "seed", f"{self.num_envs} seeds, one for each environment", len(given))
-            for row, one in enumerate(given):
+            check(len(seeds) == self.num_envs, "seed", f"{self.num_envs} seeds, one for each environment", len(seeds))
+            for row, one in enumerate(seeds):
                 if one is not None:
                     self._randoms[row] = seeding.np_random(one)[0]
-        asked = dict(options or {})
-        mask = asked.pop("reset_mask", None)
+        remaining = dict(options or {})
+        mask = remaining.pop("reset_mask", None)
         rows = self._rows if mask is None else torch.from_numpy(np.flatnonzero(mask))
-        episodes = asked.pop("episodes", None)
+        episodes = remaining.pop("episodes", None)
         if episodes is None:
-            episodes = [self.gazes.choose(self._randoms[row], asked) for row in rows.tolist()]
-        wanted = f"{len(rows)} episodes, one for each environment that is reset"
-        check(len(episodes) == len(rows), "episodes", wanted, len(episodes))
+            episodes = [self.gazes.choose(self._randoms[row], remaining) for row in rows.tolist()]
+        expected = f"{len(rows)} episodes, one for each environment that is reset"
+        check(len(episodes) == len(rows), "episodes", expected, len(episodes))
         self.gazes.begin(rows, episodes)
         self._ended[:, rows] = False
         return self._observed()

@@ -91,12 +91,12 @@ class WindowGaze(Gazes):
         check(int(target) in allowed, "target", f"one of {allowed}", int(target))
         return WindowEpisode(int(scene), int(target))
 
-    def action(self, given: Any) -> Tensor:
+    def action(self, action: Any) -> Tensor:
         """Check an action; returns a batch of one."""
-        action = np.asarray(given, dtype=np.float64)
-        fits = action.shape == (3,) and bool(((action >= 0) & (action <= 1)).all())
-        check(fits, "action", "(x, y, magnification), each from 0 to 1", given)
-        return torch.from_numpy(action)[None]
+        values = np.asarray(action, dtype=np.float64)
+        fits = values.shape == (3,) and bool(((values >= 0) & (values <= 1)).all())
+        check(fits, "action", "(x, y, magnification), each from 0 to 1", action)
+        return torch.from_numpy(values)[None]
 
     def move(self, rows: Tensor, actions: Tensor) -> Score:
         """Look at another window; the looks are stored at the end of an episode."""
@@ -122,8 +122,8 @@ class WindowGaze(Gazes):
             x1, y1, x2, y2 = window.cells
             closeness[0, y1:y2, x1:x2] = closeness[0, y1:y2, x1:x2].clamp(min=(window.level + 1) / lattice.levels)
         near = adaptive_max_pool2d(closeness, self.shape)
-        found: NDArray[np.float32] = torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()
-        return found[None]
+        planes: NDArray[np.float32] = torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()
+        return planes[None]
 
     def places(self, rows: Tensor) -> Tensor:
         """The middle of the window and its magnification, each from 0 to 1."""
@@ -187,8 +187,8 @@ class WindowGaze(Gazes):
 
     def _rate(self) -> Tensor:
         scene, target = self.episodes[0]
-        found = self.scenery.found(self.looks, scene, target) if target else self.scenery.share(self.looks, scene)
-        return torch.tensor([found], dtype=torch.float64)
+        result = self.scenery.found(self.looks, scene, target) if target else self.scenery.share(self.looks, scene)
+        return torch.tensor([result], dtype=torch.float64)
 
     def _view(self, row: int) -> Tensor:
         eye = self.scenery.eye

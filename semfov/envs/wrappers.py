@@ -49,8 +49,8 @@ class BeliefObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
         Returns:
             `(C + 2, Y, X)` or `(2, Y, X)`, float32 in [0, 1].
         """
-        found: NDArray[np.float32] = self._inner.planes()
-        return found
+        planes: NDArray[np.float32] = self._inner.planes()
+        return planes
 
 
 class GlimpseObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
@@ -82,8 +82,8 @@ class GlimpseObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
         Returns:
             `(side, side, 3)`, RGB, uint8.
         """
-        found: NDArray[np.uint8] = self._inner.glimpse(self._side)
-        return found
+        image: NDArray[np.uint8] = self._inner.glimpse(self._side)
+        return image
 
 
 class VectorBeliefObservation(VectorObservationWrapper):
@@ -117,8 +117,8 @@ class VectorBeliefObservation(VectorObservationWrapper):
         Returns:
             `(num_envs, C + 2, Y, X)`, float32 in [0, 1].
         """
-        found: NDArray[np.float32] = self._inner.gazes.planes(torch.arange(self.num_envs))
-        return found
+        planes: NDArray[np.float32] = self._inner.gazes.planes(torch.arange(self.num_envs))
+        return planes
 
 
 def _own(env: Any, *kinds: type[Any]) -> Any:

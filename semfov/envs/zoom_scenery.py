@@ -50,7 +50,7 @@ class ZoomScenery:
         self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
         self.annotated = not isinstance(self.pictures, Pictures)
         names = self.eye.detector.classes
-        self._wanted = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
+        self._targets = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
         # Looks are kept for as long as an environment uses this scenery.
         self.glances = cache(looking.glances)
         self._listed = cache(self._list)
@@ -89,10 +89,10 @@ class ZoomScenery:
             InputError: the pictures have no annotations, and no targets were given.
         """
         if not self.annotated:
-            if self._wanted is None:
+            if self._targets is None:
                 raise InputError("targets: expected classes to search for in pictures without annotations, got none")
-            return self._wanted
-        return [each for each in self.pictures.targets(scene) if self._wanted is None or each in self._wanted]
+            return self._targets
+        return [each for each in self.pictures.targets(scene) if self._targets is None or each in self._targets]
 
     def episodes(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the look at the whole picture does not show already.
@@ -178,8 +178,8 @@ class ZoomScenery:
 
     def _of(self, scene: int, target: int) -> Annotation:
         every = self.pictures.annotation(scene)
-        kept = every.labels == target
-        return Annotation(every.boxes[kept], every.labels[kept], every.crowd[kept], every.size)
+        of_target = every.labels == target
+        return Annotation(every.boxes[of_target], every.labels[of_target], every.crowd[of_target], every.size)
 
     def image(self, scene: int) -> Tensor:
         """Pixels of a picture.
@@ -193,7 +193,7 @@ class ZoomScenery:
         return self.pictures[scene].image
 
 
-class _Given(WindowLooking):
+class _PictureLooking(WindowLooking):
     """Given large pictures, or those of a folder without annotations."""
 
     def __init__(self, config: WindowLookingConfig, scenes: Source) -> None:
@@ -280,7 +280,7 @@ def open_zoom_scenery(
         cache=None if cache is None else Path(cache),
         store=store,
     )
-    looking = _Given(config, scenes)
-    found, names = looking.scenes.classes, looking.eye.detector.classes
-    check(found == names, "scenes", "the classes of the detector", f"{len(found)} others")
+    looking = _PictureLooking(config, scenes)
+    classes, names = looking.scenes.classes, looking.eye.detector.classes
+    check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
     return ZoomScenery(looking, passes, targets)

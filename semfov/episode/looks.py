@@ -191,6 +191,6 @@ class StoredLooks(Looks):
         if observer not in self._weighed:
             centres = self.grid.centres.to(self.like)
             targets = self._classes if observer.by_target else [None]
-            said = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
-            self._weighed[observer] = said[0] if len(said) == 1 else type(said[0]).join(said)
+            looks = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
+            self._weighed[observer] = looks[0] if len(looks) == 1 else type(looks[0]).join(looks)
         return self._weighed[observer]

@@ -95,8 +95,8 @@ def search_curves(
                 outcomes = run_episodes(
                     episodes, Candidate(strategy), looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
-            found = np.array([outcome.found_at for outcome in outcomes])
-            curves[name].append(cumulative_performance(found, protocol.shifts))
+            shifts = np.array([outcome.found_at for outcome in outcomes])
+            curves[name].append(cumulative_performance(shifts, protocol.shifts))
     return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
 
 

@@ -80,15 +80,15 @@ def fit_detector(
         raise InputError(
             f"settings: expected names among {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}"
         )
-    given = {name: value for name, value in settings.items() if name in of_detector}
-    if given.get("classes") is not None:
-        given["classes"] = tuple(given["classes"])
-    if given.get("weights") is not None:
-        given["weights"] = Path(given["weights"])
+    options = {name: value for name, value in settings.items() if name in of_detector}
+    if options.get("classes") is not None:
+        options["classes"] = tuple(options["classes"])
+    if options.get("weights") is not None:
+        options["weights"] = Path(options["weights"])
     config = FitDetectorConfig(
         model=Path(model),
         data=DataConfig(Path(root), Path(annotations), limit, min_instances=0, max_target_area=None),
-        detector=DetectorConfig(**given),
+        detector=DetectorConfig(**options),
         out=Path(out),
         workers=workers,
         **{name: value for name, value in settings.items() if name in of_fit},

@@ -163,18 +163,18 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         """
         holdout = self.holdout or 5
         held_out = -(-photographs // holdout)
-        kept = min(photographs - held_out, _FOR_MOSAICS)
+        training = min(photographs - held_out, _FOR_MOSAICS)
         return FitZoomConfig(
             data=self.data,
             detector=self.detector,
             holdout=holdout,
-            mosaics=max(1, kept // 5),
-            far=max(1, kept // 60),
-            crowded=max(1, kept // 10),
+            mosaics=max(1, training // 5),
+            far=max(1, training // 60),
+            crowded=max(1, training // 10),
             judged=max(8, min(held_out // 3, 30)),
             judged_far=1,
             kinds=(),
-            searched=max(8, kept // 12),
+            searched=max(8, training // 12),
             sought=3,
             passes=16,
             tile=tile,

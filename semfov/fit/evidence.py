@@ -177,20 +177,20 @@ def judge_evidence(
     there = goal.any(-1)
     judged = []
     for number in (each for each in JUDGED if each <= len(present)):
-        cells, image, seen = present[number - 1], anywhere[number - 1], visited[number - 1]
+        cells, image, fixated = present[number - 1], anywhere[number - 1], visited[number - 1]
         judged.append(
             {
                 "looks": number,
-                "found": float((seen & goal).any(-1)[there].double().mean()),
+                "found": float((fixated & goal).any(-1)[there].double().mean()),
                 "cells_nll": float(F.binary_cross_entropy(cells.double(), goal.double())),
                 "cells_ece": float(calibration_error(cells.flatten(), goal.flatten())),
-                "visited_ece": float(calibration_error(cells[seen], goal[seen])),
+                "visited_ece": float(calibration_error(cells[fixated], goal[fixated])),
                 "presence_area": area_under_roc(image, there),
                 "presence_ece": float(calibration_error(image, there)),
             }
         )
-    cells, seen = torch.stack(present), torch.stack(visited)
-    place = cells.masked_fill(~seen, 0).amax(-1) * place_known(cells, seen)
+    cells, fixated = torch.stack(present), torch.stack(visited)
+    place = cells.masked_fill(~fixated, 0).amax(-1) * place_known(cells, fixated)
     return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 

@@ -70,7 +70,7 @@ def make_examples(
     Raises:
         DataError: no photograph has a class that may be searched for.
     """
-    parts = []
+    rows = []
     for index in track(range(len(run.scenes)) if scenes is None else scenes, "describing looks", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         covered = grid.footprint(annotation.boxes)
@@ -85,7 +85,7 @@ def make_examples(
                 features = look_features(detections, grid.centres, grid, target).half()
             score = highest_score(detections, target)
             row = features, score, grid.cell_distance, torch.tensor(index), goal, torch.tensor(target)
-            parts.append(row)
-    if not parts:
+            rows.append(row)
+    if not rows:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
-    return TargetExamples(*(torch.stack(column) for column in zip(*parts, strict=True)))
+    return TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))

@@ -155,11 +155,11 @@ def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, 
             steps = list(explorations(model, chosen, grid, config.looks, config.astray, generator))
         for step in steps:
             if before is not None:
-                known = before.belief
-                assert isinstance(known, MapBelief)
+                belief = before.belief
+                assert isinstance(belief, MapBelief)
                 brought = right(step, chosen.answers) - right(before, chosen.answers)
                 distance = chosen.distance[torch.arange(len(chosen)), step.cell][:, None]
-                expected = model.gain(known.probabilities, known.closest, known.looks, distance)[:, 0]
+                expected = model.gain(belief.probabilities, belief.closest, belief.looks, distance)[:, 0]
                 loss = loss + (expected - brought).square().mean() * 100
             before = step
         return loss
@@ -192,8 +192,8 @@ def judge_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, g
         gained = (0.0, 0.0)
         if before is not None:
             distance = examples.distance[torch.arange(len(examples)), step.cell][:, None]
-            known, was = before
-            gained = float(known.sum(-1).mean()), float((now - was).sum(-1).mean())
+            expected, was = before
+            gained = float(expected.sum(-1).mean()), float((now - was).sum(-1).mean())
         if step.shift + 1 in _JUDGED:
             judged.append(
                 {

@@ -64,7 +64,7 @@ def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> Map
     Raises:
         DataError: no photograph has an object.
     """
-    parts = []
+    rows = []
     components = len(run.scenes.classes) + 1
     for index in track(range(len(run.scenes)), "describing looks", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
@@ -90,7 +90,7 @@ def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> Map
         answers = answers_of(annotation, grid, components)
         answers = torch.cat([~answers.any(-1, keepdim=True), answers[:, every[chosen]]], -1)
         row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), answers, every[chosen], stands_for
-        parts.append(row)
-    if not parts:
+        rows.append(row)
+    if not rows:
         raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")
-    return MapExamples(*(torch.stack(column) for column in zip(*parts, strict=True)))
+    return MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))

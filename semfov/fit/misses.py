@@ -30,8 +30,8 @@ def count_misses(
         if index not in scenes:
             continue
         annotation = photographs.annotation(index)
-        grid, distance, seen = cells(annotation.size, samples.fixations[look])
-        level = torch.bucketize(distance, edges)[seen]
+        grid, distance, in_view = cells(annotation.size, samples.fixations[look])
+        level = torch.bucketize(distance, edges)[in_view]
         detected, objects = grid.footprint(boxes).any(0), grid.footprint(annotation.boxes)
-        misses.update(detected[seen], objects[:, seen], annotation.labels, level)
+        misses.update(detected[in_view], objects[:, in_view], annotation.labels, level)
     return misses

@@ -112,12 +112,13 @@ def fit_fom(config: FitObservationConfig) -> None:
             f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
             "detections in all; give more photographs"
         )
-    statistics = statistics_of(
-        config, sampler, (part[part.scene % config.holdout != 0] for part in sampler.parts())
-    )  # fmt: skip
+    training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
+    statistics = statistics_of(config, sampler, training)
     model = fit_model(config, sampler, statistics, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
-    counts = (count_misses(sampler.scenes, part, fitted_on, model.edges, sampler.cells) for part in sampler.parts())
+    counts = (
+        count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
+    )
     misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
@@ -202,22 +203,22 @@ def fit_published(
         ).eval()
 
 
-def statistics_of(config: FitObservationConfig, sampler: Looker, parts: Iterable[Samples]) -> DirichletStatistics:
-    """Sum the sufficient statistics of detections by class and level, part by part.
+def statistics_of(config: FitObservationConfig, sampler: Looker, shards: Iterable[Samples]) -> DirichletStatistics:
+    """Sum the sufficient statistics of detections by class and level, shard by shard.
 
     Args:
         config: the settings.
         sampler: the source of the detections.
-        parts: the labelled detections.
+        shards: the labelled detections.
 
     Returns:
-        The statistics, which do not depend on how the detections are divided into parts.
+        The statistics, which do not depend on how the detections are divided into shards.
     """
     model = FovealObservationModel.identity(sampler.eye.detector.classes, config.edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
-    for part in parts:
-        statistics.update(part.scores, (part.labels, model.level(part.distance)))
+    for samples in shards:
+        statistics.update(samples.scores, (samples.labels, model.level(samples.distance)))
     return statistics
 
 
@@ -366,11 +367,11 @@ def counts_csv(model: FovealObservationModel) -> str:
 
 def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
     """Record the command, the commit, the versions and the model that the measures come from."""
-    known = {key: value for key, value in model.metadata.items() if key != "counts"}
+    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
     return {
         "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
         "commit": commit(),
         "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
-        "model": known,
+        "model": metadata,
         "held_out": {name: asdict(figure) for name, figure in figures.items()},
     }

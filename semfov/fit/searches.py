@@ -199,7 +199,7 @@ def open_photographs(
     Returns:
         The photographs with classes to search for.
     """
-    found: list[SearchedPhotograph] = []
+    photographs: list[SearchedPhotograph] = []
     for index in chosen:
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
@@ -209,7 +209,7 @@ def open_photographs(
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
         wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
-        wanted = tuple(
+        search_targets = tuple(
             SearchTarget(
                 target,
                 covered[annotation.labels == target].any(0),
@@ -219,8 +219,10 @@ def open_photographs(
             for number, target in enumerate(wide)
         )
         if targets:
-            found.append(SearchedPhotograph(eye, scenes, index, len(found), grid, wanted, store, everywhere))
-    return found
+            photographs.append(
+                SearchedPhotograph(eye, scenes, index, len(photographs), grid, search_targets, store, everywhere)
+            )
+    return photographs
 
 
 def search_photograph(
@@ -288,16 +290,16 @@ class PhotographSearch(TargetSearch[Step]):
 
     def found(self, index: int) -> bool:
         """Whether an object of the class overlaps the cell with the strongest evidence."""
-        shown = [step.detections for step in self.steps[: index + 1]]
-        decision = conclude(1, self.steps[index].belief, shown, self.photograph.grid, self.target)
+        looks = [step.detections for step in self.steps[: index + 1]]
+        decision = conclude(1, self.steps[index].belief, looks, self.photograph.grid, self.target)
         return bool(self.goal[decision.cell])
 
 
 def photograph_searches(
-    seen: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
+    photographs: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
 ) -> Iterator[PhotographSearch]:
     """Search photographs for all their classes; after the searches of one, its looks are stored and freed."""
-    for photograph in track(seen, title, "photograph"):
+    for photograph in track(photographs, title, "photograph"):
         for target in photograph.targets:
             yield PhotographSearch(photograph, target, evidence, looks)
         photograph.close()

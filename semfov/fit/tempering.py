@@ -148,14 +148,16 @@ def hit_rates(
         grid = Grid(config.columns, config.rows, annotation.size)
         covered = grid.footprint(annotation.boxes)
         goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
-        share = hit_rate(observer, samples.seen(looks), samples.fixations[looks], grid, torch.tensor(targets), goal)
+        share = hit_rate(
+            observer, samples.detections_of(looks), samples.fixations[looks], grid, torch.tensor(targets), goal
+        )
         if share is not None:
             rates[index] = share
     return rates
 
 
 def hit_rate(
-    observer: Semantic, seen: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
+    observer: Semantic, detections: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
 ) -> float | None:
     """Compute the share of next fixations that hit the target in one photograph.
 
@@ -165,7 +167,7 @@ def hit_rate(
 
     Args:
         observer: the observer that fuses the looks.
-        seen: detections of R looks at the photograph.
+        detections: detections of R looks at the photograph.
         fixations: `(R, 2)`, fixations of the looks, `(x, y)` in pixels.
         grid: the grid of cells.
         targets: `(T,)`, classes to search for.
@@ -174,8 +176,8 @@ def hit_rate(
     Returns:
         The share, or None if every look fixates every target.
     """
-    evidence = observer.weigh(seen, fixations, grid)
-    belief = observer.start(len(targets), grid, seen.scores)
+    evidence = observer.weigh(detections, fixations, grid)
+    belief = observer.start(len(targets), grid, detections.scores)
     visited = torch.zeros_like(goal)
     hits = []
     for look, cell in enumerate(grid.cell_of(fixations).tolist()):

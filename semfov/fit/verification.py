@@ -163,15 +163,15 @@ def fit_verification(config: FitVerificationConfig) -> None:
     left_out = set()
     if config.fitted is not None:
         data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
-        known = make_scenes(data, eye.detector.classes).ids
+        ids = make_scenes(data, eye.detector.classes).ids
         holdout = evidence.metadata.get("training", {}).get("holdout", 5)
-        left_out = {name for number, name in enumerate(known) if number % holdout}
+        left_out = {name for number, name in enumerate(ids) if number % holdout}
     chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
     size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
     store = cell_store(store_folder(config.cache) / "searches", eye.settings(), *size, components)
-    seen = open_photographs(
+    photographs = open_photographs(
         eye,
         scenes,
         chosen,
@@ -182,16 +182,16 @@ def fit_verification(config: FitVerificationConfig) -> None:
         seed=config.seed,
         store=store,
     )
-    fitted = fit_in_folds(seen, evidence, config)
+    fitted = fit_in_folds(photographs, evidence, config)
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
-    text, figures = verification_report(fitted, f"{len(seen)} photographs")
+    text, figures = verification_report(fitted, f"{len(photographs)} photographs")
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
 def fit_in_folds(
-    seen: Sequence[SearchedPhotograph],
+    photographs: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
     config: FitVerificationConfig,
     prior: Verification | None = None,
@@ -200,7 +200,7 @@ def fit_in_folds(
     """Fit the model to closer looks at photographs, repeat the searches in folds, and choose the threshold `confirm`.
 
     Args:
-        seen: the photographs.
+        photographs: the photographs.
         evidence: the target evidence.
         config: the settings.
         prior: model towards which to fit (`fit`).
@@ -212,12 +212,12 @@ def fit_in_folds(
     Raises:
         DataError: there is no candidate, or none of them is right, or none wrong.
     """
-    closer = examine(photograph_searches(seen, evidence, config.looks, "looking"), config.folds)
+    closer = examine(photograph_searches(photographs, evidence, config.looks, "looking"), config.folds)
     if closer is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
     folds = [fit(closer, closer.fold != fold, prior) for fold in range(config.folds)]
     model = fit(closer, closer.fold >= 0, prior)
-    again = photograph_searches(seen, evidence, config.looks, "verifying")
+    again = photograph_searches(photographs, evidence, config.looks, "verifying")
     limits = Thresholds(1.0, config.give_up, config.place)
     searches = list(verify(again, folds, limits, evidence.thresholds))
     confirm = choose_confirm(searches, config.false_alarms, surest)
@@ -343,8 +343,8 @@ def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) 
     centre, level = torch.zeros(2, CLOSER_FEATURES, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     weights, biases = _RIDGE, 0.0
     if prior is not None:
-        given = prior.linear.weight.detach().double()
-        centre, level = given * scale, prior.linear.bias.detach().double() + given @ mean
+        prior_weight = prior.linear.weight.detach().double()
+        centre, level = prior_weight * scale, prior.linear.bias.detach().double() + prior_weight @ mean
         weights = biases = STRENGTH / len(phi)
     weight, bias = centre.clone().requires_grad_(True), level.clone().requires_grad_(True)
     optimiser = torch.optim.LBFGS([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
@@ -417,7 +417,7 @@ def verification_report(
         ("in the image, before", "image"),
         ("in the image, after", "presence"),
     ):
-        chances.append([where, *(_shown(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
+        chances.append([where, *(_figure_text(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
     assert fitted.model.thresholds is not None
     chosen = fitted.model.thresholds.confirm
     decisions = [["confirm", "found, there", "found, not there", "place right", "looks, there", "looks, not there"]]
@@ -435,8 +435,9 @@ def verification_report(
             "",
             *table(chances),
             "",
-            f"Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
-            f"the target evidence decide. Area under the ROC of the final probability: {_shown(figures['area'])}.",
+            "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
+            "the target evidence decide. Area under the ROC of the final probability: "
+            f"{_figure_text(figures['area'])}.",
             "",
             *table(decisions),
             "",
@@ -448,7 +449,7 @@ def _area(score: Tensor, there: Tensor) -> float | None:
     return area_under_roc(score, there) if there.any() and not there.all() else None
 
 
-def _shown(figure: float | None) -> str:
+def _figure_text(figure: float | None) -> str:
     return "-" if figure is None else f"{figure:.3f}"
 
 

@@ -167,17 +167,17 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         The mosaics: `near`, `far`, `small` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of
         held-out photographs, and `searched` to fit decisions on.
     """
-    kept, held = split_photographs(config.data, classes, config.holdout)
+    training, held_out = split_photographs(config.data, classes, config.holdout)
     tile = config.tile, config.tile * 3 // 4
     return {
-        "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
-        "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
-        "small": Mosaics(kept, 12, 12, tile=(tile[0] // 2, tile[1] // 2), count=config.far, seed=config.seed + 7),
-        "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
-        "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
-        "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
-        "crowded": Mosaics(Crowded(kept, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
-        "judged crowded": Mosaics(Crowded(held, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
+        "near": Mosaics(training, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
+        "far": Mosaics(training, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
+        "small": Mosaics(training, 12, 12, tile=(tile[0] // 2, tile[1] // 2), count=config.far, seed=config.seed + 7),
+        "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
+        "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
+        "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
+        "crowded": Mosaics(Crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
+        "judged crowded": Mosaics(Crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
     }
 
 
@@ -191,11 +191,11 @@ def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Sce
     Returns:
         By kind, pictures to fit on; and as `judged` with the kind, pictures of held-out photographs.
     """
-    kept, held = split_photographs(config.data, classes, config.holdout)
+    training, held_out = split_photographs(config.data, classes, config.holdout)
     pictures: dict[str, Scenes] = {}
     for kind in PICTURE_KINDS:
-        pictures[kind] = compose_pictures(kind, kept, config.each, config.seed, config.tile)
-        pictures[f"judged {kind}"] = compose_pictures(kind, held, config.judged_each, config.seed + 20, config.tile)
+        pictures[kind] = compose_pictures(kind, training, config.each, config.seed, config.tile)
+        pictures[f"judged {kind}"] = compose_pictures(kind, held_out, config.judged_each, config.seed + 20, config.tile)
     return pictures
 
 
@@ -239,7 +239,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     mosaics = make_mosaics(config, eye.detector.classes)
     pictures = {**mosaics, **make_kinds(config, eye.detector.classes)}
     store = make_store(config, eye)
-    parts: list[str] = []
+    lines: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
     refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
@@ -252,31 +252,31 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model = fit_looks(config, eye, mosaics["near"], examples)
         text, figures = judge_windows(model, examples["judged"])
         tried = choose_patience(model, eye, mosaics["judged"], store)
-        parts += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
+        lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
         if "presence" in refit:
-            parts += fit_further(config, model, examples)
+            lines += fit_further(config, model, examples)
     if "survey" in refit:
         measured = survey_again(config, model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
         tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
+        lines += [*figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
-        parts += fit_decision(config, model, eye, pictures, store)
+        lines += fit_decision(config, model, eye, pictures, store)
         # A verification belongs to the probability that it was fitted with.
         model.verification = None
         model.metadata.pop("verification", None)
     if "verification" in refit:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        parts += fit_closer_looks(config, model, eye, pictures, store)
+        lines += fit_closer_looks(config, model, eye, pictures, store)
     if "certainty" in refit:
-        parts += fit_counts(config, model, eye, pictures, store)
+        lines += fit_counts(config, model, eye, pictures, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
-    write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
+    write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
 
 
 def look_at_all(
@@ -315,13 +315,13 @@ def fit_looks(
     random.seed(config.seed)
     metadata = {**eye.settings(), **training_of(config, near, "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
-    known = known_looks(config, examples)
-    fit_presence(model, pair_windows(known), config.steps)
-    fit_rates(model, known, config.steps)
+    looks = training_looks(config, examples)
+    fit_presence(model, pair_windows(looks), config.steps)
+    fit_rates(model, looks, config.steps)
     return model.eval().requires_grad_(False)
 
 
-def known_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
+def training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
     """The looks to learn from what closer looks show."""
     return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
 
@@ -340,7 +340,7 @@ def fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping
     torch.manual_seed(config.seed)
     judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
     before = {kind: cross_entropies(model, windows) for kind, windows in judged.items()}
-    fit_presence(model.requires_grad_(True), pair_windows(known_looks(config, examples)), config.steps, rate=FURTHER)
+    fit_presence(model.requires_grad_(True), pair_windows(training_looks(config, examples)), config.steps, rate=FURTHER)
     model.requires_grad_(False)
     model.metadata["presence"] = {name: getattr(config, name) for name in PREDICTING}
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]
@@ -462,11 +462,11 @@ def fit_counts(
     # These mosaics have three and nine times as many photographs.
     some = {"far": max(1, config.searched // 5), "small": max(1, config.searched // 10)}
     names = dict.fromkeys((*fitted, *some)), dict.fromkeys(judged)
-    known, held_out = (
+    training, held_out = (
         {kind: (pictures[kind], open_all(eye, pictures[kind], store)[: some.get(kind)]) for kind in kinds}
         for kinds in names
     )
-    lines = certainty_again(model, known, held_out, passes=config.passes)
+    lines = certainty_again(model, training, held_out, passes=config.passes)
     model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     return lines
 
@@ -489,12 +489,12 @@ def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[
         figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
         figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
     slots = first[windows.slot[first]]
-    odds, shown = presence_log_odds(model, windows, slots), windows.shown[slots]
+    odds, presence = presence_log_odds(model, windows, slots), windows.presence[slots]
     passes: dict[str, list[int]] = defaultdict(list)
     for mosaic in windows.mosaic[slots].unique():
         here = windows.mosaic[slots] == mosaic
-        for target in shown[here].any(0).nonzero()[:, 0].tolist():
-            hits = shown[here, target]
+        for target in presence[here].any(0).nonzero()[:, 0].tolist():
+            hits = presence[here, target]
             for name, value in (("evidence", odds), ("raw score", windows.scores[slots])):
                 order = value[here, target].argsort(descending=True, stable=True)
                 passes[name].append(2 + int(hits[order].int().argmax()))

@@ -84,9 +84,9 @@ def mosaic_explorations(
                 promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
             facts, right = [], []
             for number in sorted({min(n, len(glances)) for n in (*_AFTER, passes)}):
-                objects, told = merge_with_facts(glances[:number], looks.lattice, target)
+                objects, object_facts = merge_with_facts(glances[:number], looks.lattice, target)
                 hits = right_boxes(objects, annotation)
-                facts.append(told[hits >= 0])
+                facts.append(object_facts[hits >= 0])
                 right.append(hits[hits >= 0] > 0)
             yield MosaicExploration(looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right))
         looks.save()
@@ -122,16 +122,16 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
     weight[-2:] = 0.5
     prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
     prior[0] = 1e-6
-    found = torch.zeros_like(prior)
+    coefficients = torch.zeros_like(prior)
     for _ in range(steps):
-        chance = (inputs @ found).sigmoid()
-        gradient = inputs.T @ (weight * (there - chance)) - prior * found
+        chance = (inputs @ coefficients).sigmoid()
+        gradient = inputs.T @ (weight * (there - chance)) - prior * coefficients
         curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
         step = torch.linalg.solve(curvature, gradient).clamp(-2, 2)
-        found = found + step
+        coefficients = coefficients + step
         if float(step.abs().max()) < 1e-9:
             break
-    offset, *weights = found.tolist()
+    offset, *weights = coefficients.tolist()
     return Certainty(offset, tuple(weights))
 
 
@@ -157,11 +157,11 @@ def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> C
             cases.append(case)
     if not cases:
         return certainty
-    remaining, promised, shown, more = torch.tensor(cases, dtype=torch.float64).unbind(-1)
+    remaining, promised, discoveries, more = torch.tensor(cases, dtype=torch.float64).unbind(-1)
 
     def likelihood(scale: float, strength: float) -> float:
         """Log likelihood of the negative binomial distribution, for numbers that need not be whole."""
-        shape, rate = strength * scale + shown, strength + promised
+        shape, rate = strength * scale + discoveries, strength + promised
         odds = remaining / (remaining + rate)
         terms = torch.lgamma(shape + more) - torch.lgamma(shape) - torch.lgamma(more + 1)
         return float((terms + shape * (1 - odds).log() + more * odds.clamp(min=1e-12).log()).sum())
@@ -190,7 +190,7 @@ def certainty_again(
     Returns:
         Lines of the report in Markdown.
     """
-    known, held_out = (
+    training, held_out = (
         [
             each
             for kind, (pictures, opened) in some.items()
@@ -198,14 +198,16 @@ def certainty_again(
         ]
         for some in (fitted, judged)
     )
-    regression = fit_certainty(torch.cat([each.facts for each in known]), torch.cat([each.right for each in known]))
-    model.certainty = fit_unseen(regression, known)
+    regression = fit_certainty(
+        torch.cat([each.facts for each in training]), torch.cat([each.right for each in training])
+    )
+    model.certainty = fit_unseen(regression, training)
     facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
     chances = model.certainty.probability(facts)
     sure, error = chances >= 0.5, BinarySums.of(chances, right).ece
     weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, model.certainty.weights, strict=True))
     return [
-        f"Probability of an object, fitted on {sum(len(each.right) for each in known)} objects: offset "
+        f"Probability of an object, fitted on {sum(len(each.right) for each in training)} objects: offset "
         f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
         f"strength {model.certainty.strength:g}.",
         "",

@@ -51,7 +51,7 @@ def choose_foresight(
         for glances in chain.from_iterable(opened):
             glances.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
-    share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
+    share = {value: sum(r / m for r, m in zip(by_kind, most, strict=True)) for value, by_kind in recalls.items()}
     model.survey.foresight = max(share, key=share.__getitem__)
     return rows
 
@@ -102,19 +102,19 @@ def mean_recall(
     Returns:
         The share of the objects of all mosaics that were found, as a mean over the passes.
     """
-    found = 0
+    total = 0
     for looks, annotation in zip(glances, objects, strict=True):
-        seen: list[Glance] = []
+        history: list[Glance] = []
         path = find_everything(looks, model)
         count = 0
         for _ in range(passes):
             turn = next(path, None)
             if turn is not None:
-                seen.append(turn.glance)
-                count = int(found_in(seen, annotation).sum())
+                history.append(turn.glance)
+                count = int(found_in(history, annotation).sum())
             # When no window is left, the number of found objects stays the same for the remaining passes.
-            found += count
-    return found / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
+            total += count
+    return total / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
 
 
 def mean_passes(
@@ -133,8 +133,8 @@ def mean_passes(
     """
     counts = []
     for looks, photographs in zip(glances, slots, strict=True):
-        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= least
-        for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
+        presence = torch.stack([glance.show for glance in looks.see(photographs)]) >= least
+        for target in (presence.any(0).nonzero()[:, 0] + 1).tolist():
             path = look_for(looks, model, target, confirm=least, slices=photographs)
             counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
     return sum(counts) / max(len(counts), 1)

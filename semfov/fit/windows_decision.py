@@ -48,9 +48,9 @@ class Searches:
     there: Tensor
 
     @classmethod
-    def join(cls, parts: Sequence[Searches]) -> Searches:
+    def join(cls, searches: Sequence[Searches]) -> Searches:
         """Join several sets of searches."""
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+        return cls(*(torch.cat([getattr(some, name) for some in searches]) for name in cls.__dataclass_fields__))
 
 
 @torch.inference_mode()

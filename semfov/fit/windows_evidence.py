@@ -17,7 +17,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
-from semfov.zoom.gist import FOUND, Gist
+from semfov.zoom.gist import DETECTION_SCORE, Gist
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
@@ -81,7 +81,7 @@ def closer_windows(
             yield closer, steps, (x1, y1, x2, y2)
 
 
-def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: float = 0.5) -> Tensor:
+def found_by(glance: Glance, annotation: Annotation, score: float = DETECTION_SCORE, iou: float = 0.5) -> Tensor:
     """Find the objects that a look shows with a detection of their class.
 
     Args:
@@ -125,7 +125,7 @@ class Windows:
         scores: `(N, K)`, highest score of each class that the look shows inside the window.
         summary: `(N, 3)`, further features of the window in the look (`semfov.zoom.evidence.pool`).
         steps: `(N,)`, number of octaves by which the window is looked at closer.
-        shown: `(N, K)`, whether the closer look showed the class.
+        presence: `(N, K)`, whether the closer look showed the class.
         before: `(N,)`, row of the overview for the same window; -1 for rows of the overview itself.
         slot: `(N,)`, whether the window is a photograph of the mosaic.
         mosaic: `(N,)`, number of the mosaic.
@@ -134,7 +134,7 @@ class Windows:
     scores: Tensor
     summary: Tensor
     steps: Tensor
-    shown: Tensor
+    presence: Tensor
     before: Tensor
     slot: Tensor
     mosaic: Tensor
@@ -200,7 +200,7 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
 def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
     """Compute the mean cross-entropy of `presence_log_odds` over rows and classes."""
     odds = presence_log_odds(model, windows, rows)
-    return F.binary_cross_entropy_with_logits(odds, windows.shown[rows].to(odds))
+    return F.binary_cross_entropy_with_logits(odds, windows.presence[rows].to(odds))
 
 
 def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
@@ -291,14 +291,14 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     Returns:
         The mean over looks, a scalar.
     """
-    shown = torch.stack([look.show for look in example.looks]).amax(0)
+    strongest = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (
-        (shown >= example.least).nonzero()[:, 0] + 1,
-        ((shown >= 0.02) & (shown < example.least)).nonzero()[:, 0] + 1,
+        (strongest >= example.least).nonzero()[:, 0] + 1,
+        ((strongest >= 0.02) & (strongest < example.least)).nonzero()[:, 0] + 1,
     )
     targets = torch.cat([_some(sure, 8), _some(faint, 4)])
     if not len(targets):
-        targets = _some(torch.arange(len(shown)) + 1, 1)
+        targets = _some(torch.arange(len(strongest)) + 1, 1)
     looks = [look for look in example.looks if look.gist is not None]
     overview, *others = looks
     assert overview.gist is not None
@@ -307,9 +307,9 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     for closer in random.sample(others, min(2, len(others))):
         assert closer.gist is not None
         before = rates_before(overview.gist, logs.detach(), closer.gist)
-        seen = overview.found | closer.found
+        earlier = overview.found | closer.found
         closer_logs = model.rates(closer.gist, targets, before)
-        losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, seen))
+        losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, earlier))
     return torch.stack(losses).mean()
 
 
@@ -335,7 +335,12 @@ def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
 
 
 def _likelihood_loss(
-    model: GlimpseEvidence, example: ZoomExample, looked_at: WindowResult, logs: Tensor, targets: Tensor, seen: Tensor
+    model: GlimpseEvidence,
+    example: ZoomExample,
+    looked_at: WindowResult,
+    logs: Tensor,
+    targets: Tensor,
+    earlier: Tensor,
 ) -> Tensor:
     """Compute the mean negative log likelihood over the closer windows inside a look."""
     rates = logs.exp()
@@ -344,7 +349,7 @@ def _likelihood_loss(
         weight = model.taper(x2 - x1)
         part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
         expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
-        new = example.labels[closer.found & ~seen]
+        new = example.labels[closer.found & ~earlier]
         count = (new == targets[:, None]).sum(-1)
         terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
     return torch.stack(terms).mean() if terms else logs.sum() * 0

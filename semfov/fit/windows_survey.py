@@ -31,22 +31,22 @@ class LookCounts:
     counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
 
     @classmethod
-    def of(cls, example: ZoomExample, looked: WindowResult, seen: Tensor) -> "LookCounts":
+    def of(cls, example: ZoomExample, looked: WindowResult, earlier: Tensor) -> "LookCounts":
         """Compare a look with all closer looks inside it.
 
         Args:
             example: the mosaic.
             looked: the look.
-            seen: `(M,)`, objects of the mosaic that were found before.
+            earlier: `(M,)`, objects of the mosaic that were found before.
 
         Returns:
             The look with the numbers of new objects.
         """
-        found = defaultdict(list)
+        by_size = defaultdict(list)
         for closer, steps, (x1, y1, x2, _) in closer_windows(example, looked):
-            found[steps, x2 - x1].append((y1, x1, int((closer.found & ~seen).sum())))
+            by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
         assert looked.gist is not None
-        counts = {key: torch.tensor(rows).unbind(-1) for key, rows in found.items()}
+        counts = {key: torch.tensor(rows).unbind(-1) for key, rows in by_size.items()}
         return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
 
     def loss(self, survey: Survey, logs: Tensor) -> Tensor:
@@ -99,11 +99,11 @@ class SurveyExample:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
         first = self.overview.gist
         logs = survey.rates(first)
-        found = [self.overview.loss(survey, logs[0])]
+        losses = [self.overview.loss(survey, logs[0])]
         for counted in closer:
             before = rates_before(first, logs.detach(), counted.gist)
-            found.append(counted.loss(survey, survey.rates(counted.gist, before=before)[0]))
-        return found
+            losses.append(counted.loss(survey, survey.rates(counted.gist, before=before)[0]))
+        return losses
 
 
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:

@@ -160,9 +160,9 @@ def mosaic_searches(
         states: list[WindowLook] = []
         boxes: list[Tensor | None] = []
         for number, (turn, facts) in enumerate(turns, 1):
-            seen, presence = turn.glance.detections, facts.presence(turn.ahead)
+            detections, presence = turn.glance.detections, facts.presence(turn.ahead)
             glances.append(turn.glance)
-            states.append(WindowLook(seen, number, presence, facts.best, turn.ahead))
+            states.append(WindowLook(detections, number, presence, facts.best, turn.ahead))
             boxes.append(facts.box if facts.detected else None)
         objects = annotation.boxes[annotation.labels == target]
         likely = model.thresholds.confirm
@@ -172,8 +172,8 @@ def mosaic_searches(
 def shipped_verification() -> Verification:
     """Return the mean of the verifications of all shipped evidence, without thresholds."""
     files = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-    known = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
-    return mean_of([each for each in known if each is not None])
+    verifications = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
+    return mean_of([each for each in verifications if each is not None])
 
 
 def fit_closer(
@@ -202,14 +202,14 @@ def fit_closer(
         ]
         for use, title in (("searched", "looking closely"), ("judged", "looking closely at held-out pictures"))
     }
-    known, held_out = (examine(searches[use]) for use in ("searched", "judged"))
+    training, held_out = (examine(searches[use]) for use in ("searched", "judged"))
     looks_of = [looks for kinds in pictures.values() for _, opened in kinds for looks in opened]
     for looks in looks_of:
         looks.save()
     model.verification = None
-    if known is None or held_out is None:
+    if training is None or held_out is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
-    fitted = fit(known, known.fold == 0, prior)
+    fitted = fit(training, training.fold == 0, prior)
     assert model.thresholds is not None
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     decisions = list(verify(searches["judged"], [fitted], limits, model.thresholds))
@@ -218,6 +218,6 @@ def fit_closer(
     model.verification = fitted
     for looks in looks_of:
         looks.save()
-    how = f"The model was fitted to {len(known.fold)} closer looks at pictures of other photographs."
+    how = f"The model was fitted to {len(training.fold)} closer looks at pictures of other photographs."
     judged = f"{sum(len(opened) for _, opened in pictures['judged'])} pictures of held-out photographs"
     return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), judged, how)[0]

@@ -91,9 +91,9 @@ class GazeHabits(Pretrained):
             ascending = bool((ends.diff() > 0).all()) and bool((ends >= low).all())
             check(len(ends) == len(table) - 1 and ascending, name, f"{len(table) - 1} ascending numbers", ends.tolist())
             self.register_buffer(name, ends)
-        for name, given in (("pull", torch.tensor(pull)), ("place", place), ("step", step), ("back", back)):
-            check_finite(given, name)
-            self.register_buffer(name, given.detach().to(place.dtype).clone())
+        for name, values in (("pull", torch.tensor(pull)), ("place", place), ("step", step), ("back", back)):
+            check_finite(values, name)
+            self.register_buffer(name, values.detach().to(place.dtype).clone())
 
     def forward(self, values: Tensor, cell: Tensor, age: Tensor, grid: Grid) -> Tensor:
         """Log probability of every cell as the next one, up to a constant.

@@ -110,7 +110,7 @@ class IVSN(nn.Module):
 
         try:
             tensors = load_file(str(weights))
-            known = {name.removeprefix("features."): value for name, value in tensors.items()}
-            self.features.load_state_dict({name: known[name] for name in self.features.state_dict()})
+            features = {name.removeprefix("features."): value for name, value in tensors.items()}
+            self.features.load_state_dict({name: features[name] for name in self.features.state_dict()})
         except (OSError, SafetensorError, KeyError, RuntimeError) as error:
             raise DataError(f"{weights}: expected the weights of VGG16's features ({error})") from None

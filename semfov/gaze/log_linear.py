@@ -77,10 +77,10 @@ def log_probability(features: Tensor, chosen: Tensor, weights: Tensor, *, chunk:
     """
     if features.shape[-1] != len(weights):
         raise InputError(f"weights: expected {features.shape[-1]} numbers, one a feature, got {len(weights)}")
-    parts = []
-    for some, taken in zip(features.split(chunk), chosen.split(chunk), strict=True):
-        parts.append((some.double() @ weights).log_softmax(-1).gather(-1, taken[:, None])[:, 0])
-    return torch.cat(parts)
+    logs = []
+    for some, choice in zip(features.split(chunk), chosen.split(chunk), strict=True):
+        logs.append((some.double() @ weights).log_softmax(-1).gather(-1, choice[:, None])[:, 0])
+    return torch.cat(logs)
 
 
 def _derivatives(
@@ -90,13 +90,13 @@ def _derivatives(
     value = -0.5 * ridge * float(weights @ weights)
     slope = -ridge * weights
     curvature = ridge * torch.eye(len(weights), dtype=weights.dtype, device=weights.device)
-    for some, taken in zip(features.split(chunk), chosen.split(chunk), strict=True):
+    for some, choice in zip(features.split(chunk), chosen.split(chunk), strict=True):
         phi = some.double()
         log = (phi @ weights).log_softmax(-1)
-        value += float(log.gather(-1, taken[:, None]).sum())
+        value += float(log.gather(-1, choice[:, None]).sum())
         p = log.exp()[..., None]
         mean = (p * phi).sum(1)
-        own = phi.take_along_dim(taken[:, None, None], 1)[:, 0]
+        own = phi.take_along_dim(choice[:, None, None], 1)[:, 0]
         slope = slope + (own - mean).sum(0)
         apart = (phi - mean[:, None]) * p.sqrt()
         flat = apart.flatten(0, 1)

@@ -135,26 +135,26 @@ class SceneObserver(Observer):
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         """The belief after one more look."""
-        known, seen = own(belief, SceneBelief, "belief"), own(look, SceneLook, "look")
-        views, grid, pose = self.views, self.views.view_grid, seen.pose
-        values = known.values
-        if not bool(known.looks):
-            values = self._unseen(seen.inner, values)
-        before = known.views[pose]
-        view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, seen.inner)
+        belief, look = own(belief, SceneBelief, "belief"), own(look, SceneLook, "look")
+        views, grid, pose = self.views, self.views.view_grid, look.pose
+        values = belief.values
+        if not bool(belief.looks):
+            values = self._unseen(look.inner, values)
+        before = belief.views[pose]
+        view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, look.inner)
         probabilities = views.spread(self._probabilities(view), pose).mT
         cells = views.visible[pose].cells
         nearest = torch.minimum(
-            self._distance(pose, seen),
-            torch.where(known.owner[0, cells] == pose, known.closest[0, cells], torch.inf),
+            self._distance(pose, look),
+            torch.where(belief.owner[0, cells] == pose, belief.closest[0, cells], torch.inf),
         )
-        mine = (nearest <= known.closest[0, cells]) | (known.owner[0, cells] == pose)
+        mine = (nearest <= belief.closest[0, cells]) | (belief.owner[0, cells] == pose)
         at = cells[mine]
-        values, closest, owner = values.clone(), known.closest.clone(), known.owner.clone()
+        values, closest, owner = values.clone(), belief.closest.clone(), belief.owner.clone()
         values[0, at], closest[0, at], owner[0, at] = probabilities[mine], nearest[mine], pose
-        examined = known.examined.scatter(-1, seen.gaze[:, None], True)
-        after = (*known.views[:pose], view, *known.views[pose + 1 :])
-        return SceneBelief(values, closest, owner, examined, known.looks + 1, after)
+        examined = belief.examined.scatter(-1, look.gaze[:, None], True)
+        after = (*belief.views[:pose], view, *belief.views[pose + 1 :])
+        return SceneBelief(values, closest, owner, examined, belief.looks + 1, after)
 
     def _distance(self, pose: int, look: SceneLook) -> Tensor:
         """Distances from the gaze to the cells that its view shows, `(V,)`."""

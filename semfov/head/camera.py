@@ -21,7 +21,7 @@ TRIES = 25
 """Largest number of frames that are asked for until one is from the right direction."""
 
 _WIDEST = 8192  # pixels of the panorama in which objects are located
-_KEPT = 480  # width of the frames that are kept for drawing
+_DRAWING_WIDTH = 480  # width of the frames that are kept for drawing
 _DRAWN = 1280  # pixels across the panorama of its frames
 
 
@@ -134,21 +134,21 @@ class CameraScene(Sphere):
         for _ in range(TRIES):
             frame = self.camera.look_at((pan, tilt), field)
             if not isinstance(frame, CameraFrame):
-                return self._seen(frame, pose, pose)
+                return self._image_of(frame, pose, pose)
             at = pose.new_tensor([*frame.direction, field if frame.field is None else frame.field])
             off = max(float(Sphere.turn(self, at, pose)), abs(float(at[2]) - field))
             if off <= field / 10:
-                return self._seen(frame.image, at, pose)
+                return self._image_of(frame.image, at, pose)
         expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {TRIES} attempts"
         got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*at.tolist())
         raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
 
-    def _seen(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    def _image_of(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """A frame as an image of the right size, and its pose; a small copy is kept for drawing."""
         image = as_image(picture, color=self.color, argument="frame")
         got = image.shape[-1], image.shape[-2]
         check(got == tuple(self.size), "frame", f"{self.size[0]} × {self.size[1]} pixels, as `size` has it", got)
-        width = min(self.size[0], _KEPT)
+        width = min(self.size[0], _DRAWING_WIDTH)
         small = resized(image.mul(255).byte().cpu(), (max(1, round(width * self.size[1] / self.size[0])), width))[0]
         self._frames[tuple(pose.tolist())] = small, at
         return image, at

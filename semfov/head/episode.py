@@ -72,8 +72,8 @@ def live(eye: Eye, views: Views) -> Detect:
         opened = number, eye.open(image[None].to(eye.sensor.like.device))
         if at is pose:
             return eye.look(opened[1], views.view_grid.centres[cell][None]).to(pose.device)
-        seen = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0]).to(pose.device)
-        return replace(seen, boxes=boxes_from(world, seen.boxes, at, pose))
+        detections = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0]).to(pose.device)
+        return replace(detections, boxes=boxes_from(world, detections.boxes, at, pose))
 
     return detect
 

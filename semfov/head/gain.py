@@ -83,13 +83,13 @@ class SearchGain(LookGain):
         """Gains `(A,)`, in probabilities of a find."""
         views = self.views
         chance = belief.probability(0)[0]
-        known = views.acuity(belief.closest[0])
-        wanted = chance * views.world.area
+        sharpness = views.acuity(belief.closest[0])
+        weighted = chance * views.world.area
         here_found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
         gains = torch.zeros_like(here_found)
         for pose in poses:
             cells = views.visible[pose].cells
-            aside = (self._acuity[pose] - known[cells]).clamp(min=0) @ wanted[cells]
+            aside = (self._acuity[pose] - sharpness[cells]).clamp(min=0) @ weighted[cells]
             rows = slice(pose * views.cells, (pose + 1) * views.cells)
             gains[rows] = here_found[rows] + self.foresight * aside
         return gains
@@ -129,14 +129,14 @@ class ExploreGain(LookGain):
         """Gains `(A,)`, in cells of average area; the lowest value where the eye does not land."""
         views = self.views
         probabilities = belief.class_probabilities()
-        known = belief.owner[0] >= 0
-        worth = torch.where(known, 0.0, self.unseen * views.world.area)
+        has_view = belief.owner[0] >= 0
+        worth = torch.where(has_view, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
             cells = views.visible[pose].cells
             rows = torch.arange(views.cells) if pose == here else self._landings
             total = self._acuity[pose][rows] @ worth[cells]
-            some = known[cells]
+            some = has_view[cells]
             if bool(some.any()):
                 old = cells[some]
                 distance = views.distances[pose][rows][:, some]
@@ -212,15 +212,15 @@ class Scan(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(1, A)`; `OUT` for all poses but the next one."""
-        known, cells = own(belief, SceneBelief, "belief"), self.gain.views.cells
-        turn = int(known.looks) // self.dwell
+        belief, cells = own(belief, SceneBelief, "belief"), self.gain.views.cells
+        turn = int(belief.looks) // self.dwell
         for _ in self.order:
             pose = self.order[turn % len(self.order)]
             rows = slice(pose * cells, (pose + 1) * cells)
             if not bool(visited[0, rows].all()):
                 break
             turn += 1
-        gains = self.gain(known, self.action // cells, [pose])
+        gains = self.gain(belief, self.action // cells, [pose])
         values = torch.full_like(gains, OUT)
         values[rows] = gains[rows]
         return values[None]

@@ -105,9 +105,9 @@ class Panoramas:
             One patch for each slot.
         """
         generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
-        slots, known = sum(number for _, number in self.rings), len(self.scenes)
-        rounds = -(-slots // known)
-        order = np.concatenate([generator.permutation(known) for _ in range(rounds)])[:slots].tolist()
+        slots, count = sum(number for _, number in self.rings), len(self.scenes)
+        rounds = -(-slots // count)
+        order = np.concatenate([generator.permutation(count) for _ in range(rounds)])[:slots].tolist()
         places = []
         for latitude, number in self.rings:
             turn = float(generator.uniform(0, 360))
@@ -149,9 +149,9 @@ class Panoramas:
         low, high = points.new_tensor([x1, y1]) - 0.5, points.new_tensor([x2, y2]) - 0.5
         inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
         place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, len(rows), len(columns), 2)
-        seen = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
+        projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
         row, column = inside.nonzero().unbind(-1)
-        canvas[:, rows[row], columns[column]] = seen[:, row, column]
+        canvas[:, rows[row], columns[column]] = projection[:, row, column]
 
     def regions(self, index: int) -> Regions:
         """The exact regions of the objects of a panorama: boxes in the planes of their photographs.
@@ -163,9 +163,10 @@ class Panoramas:
             One region for each object.
         """
         patches = self.patches(index)
-        parts = [self.scenes.annotation(patch.index).boxes for patch in patches]
-        poses = [torch.tensor([patch.pose]).expand(len(part), 3) for patch, part in zip(patches, parts, strict=True)]
-        boxes = [self._moved(part, patch) for patch, part in zip(patches, parts, strict=True)]
+        photograph_boxes = [self.scenes.annotation(patch.index).boxes for patch in patches]
+        pairs = list(zip(patches, photograph_boxes, strict=True))
+        poses = [torch.tensor([patch.pose]).expand(len(own), 3) for patch, own in pairs]
+        boxes = [self._moved(own, patch) for patch, own in pairs]
         return Regions(Camera(torch.cat(poses), _SLOT), torch.cat(boxes))
 
     def _moved(self, boxes: Tensor, patch: Patch) -> Tensor:
@@ -185,8 +186,9 @@ class Panoramas:
             Classes of the objects, and the smallest boxes around them in pixels of the panorama. A box that crosses the
             seam extends beyond the right border.
         """
-        parts = [self.scenes.annotation(patch.index) for patch in self.patches(index)]
-        labels, crowd = torch.cat([part.labels for part in parts]), torch.cat([part.crowd for part in parts])
+        annotations = [self.scenes.annotation(patch.index) for patch in self.patches(index)]
+        labels = torch.cat([annotation.labels for annotation in annotations])
+        crowd = torch.cat([annotation.crowd for annotation in annotations])
         return Annotation(self.regions(index).panorama_boxes(self.size), labels, crowd, self.size)
 
     def targets(self, index: int) -> list[int]:
@@ -209,5 +211,5 @@ class Panoramas:
         Returns:
             64 hexadecimal digits.
         """
-        parts = [(self.scenes.digest(patch.index), patch.pose, patch.box) for patch in self.patches(index)]
-        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, parts]).encode()).hexdigest()
+        patches = [(self.scenes.digest(patch.index), patch.pose, patch.box) for patch in self.patches(index)]
+        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, patches]).encode()).hexdigest()

@@ -236,8 +236,8 @@ class Flat(World):
         """Pixels of the view that show points of the picture."""
         x1, y1, x2, y2 = self._box(pose)
         size = points.new_tensor(self.size)
-        seen = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
-        return seen, ((seen >= -0.5) & (seen <= size - 0.5)).all(-1)
+        pixels = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
+        return pixels, ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
         """Points of the picture that pixels of the view show."""

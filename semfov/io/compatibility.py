@@ -76,11 +76,11 @@ def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: st
 
 def check_background(fitted: Mapping[str, Any], background: str | None, what: str) -> None:
     """Raise `InputError` where the background policy is not the one that the model was fitted with."""
-    known = fitted.get("background")
-    if background is not None and known is not None and background != known:
+    policy = fitted.get("background")
+    if background is not None and policy is not None and background != policy:
         raise InputError(
-            f"background: the {what} was fitted on scores with background policy {known!r}, got "
-            f"{background!r}; load the detector with background={known!r}, or fit a model for {background!r}"
+            f"background: the {what} was fitted on scores with background policy {policy!r}, got "
+            f"{background!r}; load the detector with background={policy!r}, or fit a model for {background!r}"
         )
 
 
@@ -140,11 +140,11 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
     Raises:
         InputError: the grid has fewer than half or more than twice as many columns or rows.
     """
-    known = fitted.get("columns"), fitted.get("rows")
-    if None not in known and not all(n / 2 <= side <= 2 * n for n, side in zip(known, grid, strict=True)):  # type: ignore[operator]
+    cells = fitted.get("columns"), fitted.get("rows")
+    if None not in cells and not all(n / 2 <= side <= 2 * n for n, side in zip(cells, grid, strict=True)):  # type: ignore[operator]
         raise InputError(
-            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells and is valid for half to twice as many "
-            f"along each side, got {grid[0]} × {grid[1]}; use grid={known}, or fit models on such a grid (python -m "
+            f"grid: the {what} was fitted on {cells[0]} × {cells[1]} cells and is valid for half to twice as many "
+            f"along each side, got {grid[0]} × {grid[1]}; use grid={cells}, or fit models on such a grid (python -m "
             f"train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
         )
 
@@ -152,19 +152,19 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
 def check_shipped_sensor(sigma: float, growth: float) -> None:
     """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
     if growth not in SHIPPED_GROWTHS:
-        known = " and ".join(f"{value:g}" for value in SHIPPED_GROWTHS)
-        raise InputError(f"growth: models are shipped for {known}, got {growth}; {_FIT}")
+        growths = " and ".join(f"{value:g}" for value in SHIPPED_GROWTHS)
+        raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
     if sigma != SHIPPED_SIGMA:
         raise InputError(
             f"sigma: models are shipped for {SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
         )
 
 
-def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str]) -> list[str]:
+def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], exempt: set[str]) -> list[str]:
     """The settings that differ, in words."""
     return [
         f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
-        for key in sorted((fitted.keys() | used.keys()) - known)
+        for key in sorted((fitted.keys() | used.keys()) - exempt)
         if _plain(fitted.get(key)) != _plain(used.get(key))
     ]
 

@@ -145,8 +145,8 @@ class Manifest:
             if part.file is not None:
                 _check_file(inside(Path(folder), part.file), part.sha256)
         columns, rows = record["grid"]
-        known = {name: record[name] for name in ("detector", "sensor", "training")}
-        return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **known)
+        settings = {name: record[name] for name in ("detector", "sensor", "training")}
+        return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **settings)
 
 
 _AGAIN = "run semfov fit again, or copy the folder again"

@@ -36,7 +36,7 @@ class DetectionTensors(Protocol):
         """Which rows hold a detection, `(..., L)` boolean."""
 
 
-class Found(Protocol):
+class DecisionValues(Protocol):
     """The decision of a search (`semfov.decision.Decision`)."""
 
     @property
@@ -96,7 +96,7 @@ def detection_array(
     check_shape(scores, "detections.scores", None, len(classes) + 1)
     if mask.ndim > 1:
         boxes, scores, mask = boxes[0], scores[0], mask[0]
-    head, found = header(stamp, frame), []
+    head, entries = header(stamp, frame), []
     for box, each in zip(boxes[mask].tolist(), scores[mask, 1:], strict=True):
         top = each.topk(min(most, len(classes)))
         hypotheses = [
@@ -105,11 +105,11 @@ def detection_array(
             if score >= least
         ]
         if hypotheses:
-            found.append({"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""})
-    return {"header": head, "detections": found}
+            entries.append({"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""})
+    return {"header": head, "detections": entries}
 
 
-def found_array(decision: Found | None, name: str, *, stamp: Any, frame: str) -> Values:
+def found_array(decision: DecisionValues | None, name: str, *, stamp: Any, frame: str) -> Values:
     """Make a `vision_msgs/Detection2DArray` of a decision: the box of the target if it was found, otherwise none.
 
     Args:
@@ -125,12 +125,12 @@ def found_array(decision: Found | None, name: str, *, stamp: Any, frame: str) ->
     >>> found_array(None, "cup", stamp=0, frame="camera")["detections"]
     []
     """
-    head, found = header(stamp, frame), []
+    head, entries = header(stamp, frame), []
     if decision is not None and decision.box is not None:
         score = decision.probability if decision.place is None else decision.place
         result = {"hypothesis": {"class_id": name, "score": score}}
-        found.append({"header": head, "results": [result], "bbox": _bounds(decision.box.tolist()), "id": ""})
-    return {"header": head, "detections": found}
+        entries.append({"header": head, "results": [result], "bbox": _bounds(decision.box.tolist()), "id": ""})
+    return {"header": head, "detections": entries}
 
 
 def _bounds(box: Sequence[float]) -> Values:
@@ -202,10 +202,13 @@ def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
         if isinstance(value, Mapping):
             fill(getattr(message, name), value, *kinds)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            wanted = fields[name].removeprefix("sequence<").partition(">")[0].partition("/")[2].split(",")[0]
-            kind = next((kind for kind in kinds if kind.__name__ == wanted), None)
+            kind_name = fields[name].removeprefix("sequence<").partition(">")[0].partition("/")[2].split(",")[0]
+            kind = next((kind for kind in kinds if kind.__name__ == kind_name), None)
             check(
-                kind is not None, "kinds", f"{wanted} among them", ", ".join(each.__name__ for each in kinds) or "none"
+                kind is not None,
+                "kinds",
+                f"{kind_name} among them",
+                ", ".join(each.__name__ for each in kinds) or "none",
             )
             assert kind is not None
             setattr(message, name, [fill(kind(), each, *kinds) for each in value])

@@ -55,8 +55,8 @@ class Field:
         """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
         fits = tensor.ndim == len(self.shape) and all(map(_fits, self.shape, tensor.shape, [sizes] * tensor.ndim))
         shape = ", ".join(str(size) for size in self.shape)
-        known = ", ".join(f"{key} = {value}" for key, value in sizes.items())
-        check(fits, name, f"shape ({shape})" + (f" with {known}" if known else ""), tuple(tensor.shape))
+        equations = ", ".join(f"{key} = {value}" for key, value in sizes.items())
+        check(fits, name, f"shape ({shape})" + (f" with {equations}" if equations else ""), tuple(tensor.shape))
         types = _FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
         if not tensor.numel() or not self.finite:
@@ -344,7 +344,7 @@ def _fits(size: Size, number: int, sizes: Sizes) -> bool:
     if isinstance(size, int):
         return size == number
     for sign, factor in (("+", -1), ("-", 1)):
-        name, found, offset = size.partition(sign)
-        if found:
+        name, separator, offset = size.partition(sign)
+        if separator:
             return sizes.setdefault(name, number + factor * int(offset)) == number + factor * int(offset)
     return sizes.setdefault(size, number) == number

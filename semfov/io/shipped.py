@@ -36,9 +36,9 @@ def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
     """
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
-    known = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
+    names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
     raise InputError(
-        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(known)}; fit all models to it with "
+        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(names)}; fit all models to it with "
         f"`{fit_command(model)}` or semfov.fit_detector, and load them with "
         "ActivePerception.from_pretrained('mymodels'); ActivePerception.raw needs no model"
     )

@@ -68,8 +68,8 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     except KeyError:
         raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
     if not isinstance(record, dict) or record.get("kind") != kind:
-        found = record.get("kind") if isinstance(record, dict) else type(record).__name__
-        raise DataError(f"{path}: expected a file of kind {kind}, got {found}; check the path")
+        got = record.get("kind") if isinstance(record, dict) else type(record).__name__
+        raise DataError(f"{path}: expected a file of kind {kind}, got {got}; check the path")
     recorded = record.pop(_CHECKSUM, None)
     if recorded is None:
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")

@@ -57,9 +57,9 @@ class FramePerception(ABC):
 
     def describe(self) -> str:
         """What is done in a few words."""
-        wanted = self.targets or (() if self.target is None else (self.target,))
-        names = ", ".join(f"“{self.classes[number]}”" for number in wanted)
-        if not wanted:
+        numbers = self.targets or (() if self.target is None else (self.target,))
+        names = ", ".join(f"“{self.classes[number]}”" for number in numbers)
+        if not numbers:
             return "exploring"
         return f"searching for {names}" if self.searches else f"finding all {names}"
 
@@ -70,5 +70,5 @@ class FramePerception(ABC):
             size: `(width, height)` of the frame.
         """
         first = self._size = self._size or size
-        wanted = f"{first[0]} × {first[1]} pixels, the size of the first frame"
-        check(size == first, "frame", wanted, f"{size[0]} × {size[1]}")
+        expected = f"{first[0]} × {first[1]} pixels, the size of the first frame"
+        check(size == first, "frame", expected, f"{size[0]} × {size[1]}")

@@ -73,14 +73,14 @@ class LivePerception(FramePerception):
         check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
         self.how = "windows" if targets else how
         self._start, self._canvas = start, windows.eye.detector.input_size
-        given: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "color": color}
+        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "color": color}
         self._fovea = FovealPerception(
             fovea, target, rate=RATE if rate is None else rate, start=start, seed=seed,
-            closer=MOST_CLOSER if closer is None else closer, **given,
+            closer=MOST_CLOSER if closer is None else closer, **settings,
         )  # fmt: skip
         self._windows = WindowPerception(
             windows, target, targets, rate=WINDOW_RATE if rate is None else rate,
-            closer=CLOSER if closer is None else closer, **given,
+            closer=CLOSER if closer is None else closer, **settings,
         )  # fmt: skip
         self._check_start()
 

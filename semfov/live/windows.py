@@ -83,14 +83,14 @@ class WindowPerception(FramePerception):
         self._thresholds = confirm, give_up
         self._decisions: WindowDecisions | None = None
         if self.evidence is not None and target is not None:
-            given: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer}
+            settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer}
             self._decisions = WindowDecisions(
-                self.evidence, target, self._close_up, forgetting=self.forgetting, **given
+                self.evidence, target, self._close_up, forgetting=self.forgetting, **settings
             )
         self._glances: LiveGlances | None = None
         self._turns: Iterator[WindowStep[Any]] = iter(())
         self._last: WindowStep[Any] | None = None
-        self._kept: list[_Look] = []
+        self._looks: list[_Look] = []
         self._number = 0
 
     def step(self, frame: ImageLike) -> WindowMoment:
@@ -107,7 +107,7 @@ class WindowPerception(FramePerception):
             if self._decisions is not None and self._decisions.candidate is not None:
                 value = self._decisions.candidate.probability
                 self._decisions.look()
-                self._kept[-1] = replace(self._kept[-1], value=value)
+                self._looks[-1] = replace(self._looks[-1], value=value)
             else:
                 self._look()
             moment = self._moment(self._glances, view.picture)
@@ -116,10 +116,10 @@ class WindowPerception(FramePerception):
 
     def _begin(self, glances: LiveGlances) -> Iterator[WindowStep[Any]]:
         """Start the episode, which never ends."""
-        wanted = (self.target,) if self.target is not None else self.targets
+        targets = (self.target,) if self.target is not None else self.targets
         if self.evidence is None:
             return look_by_look(
-                glances, ranked(usual_slices(glances.lattice), wanted), None, forgetting=self.forgetting
+                glances, ranked(usual_slices(glances.lattice), targets), None, forgetting=self.forgetting
             )
         if self.searches:
             assert self.target is not None
@@ -129,10 +129,10 @@ class WindowPerception(FramePerception):
     def _look(self) -> None:
         """Spend the frame on the next look of the episode."""
         turn = self._last = next(self._turns)
-        self._kept.append(_Look(self._number, turn.glance, turn.worth))
+        self._looks.append(_Look(self._number, turn.glance, turn.worth))
         counting, oldest = {id(look) for look in turn.looks}, self._number - self.forgetting.span
-        self._kept = [
-            look for look in self._kept if (look.frame >= oldest if look.closely else id(look.glance) in counting)
+        self._looks = [
+            look for look in self._looks if (look.frame >= oldest if look.closely else id(look.glance) in counting)
         ]
         if self._decisions is not None:
             self._decisions.see(turn, self._number + 1, last=turn.ahead == 0)
@@ -141,22 +141,22 @@ class WindowPerception(FramePerception):
         """Spend the frame on a closer look at a box."""
         assert self._glances is not None
         glance = look_closely(self._glances, box)
-        self._kept.append(_Look(self._number, glance, 0.0, closely=True))
+        self._looks.append(_Look(self._number, glance, 0.0, closely=True))
         return glance.detections
 
     def _moment(self, glances: LiveGlances, picture: LargePicture) -> WindowMoment:
-        seen = [look.glance for look in self._kept]
-        places = {look.frame: place for place, look in enumerate(self._kept)}
+        history = [look.glance for look in self._looks]
+        places = {look.frame: place for place, look in enumerate(self._looks)}
         closer = () if self._decisions is None else self._decisions.looks
-        shown = without_replaced(seen, glances.lattice) if self.forgetting.rate else seen
+        current = without_replaced(history, glances.lattice) if self.forgetting.rate else history
         certainty = None if self.evidence is None else self.evidence.certainty
         objects, unseen = window_objects(
-            shown,
+            current,
             glances.lattice,
             self.targets or self.target,
             certainty,
             None if self._last is None or self.searches else self._last.belief,
-            sum(look.value for look in self._kept[1:] if not look.closely and math.isfinite(look.value)),
+            sum(look.value for look in self._looks[1:] if not look.closely and math.isfinite(look.value)),
             latest=self.forgetting.rate > 0,
         )
         return WindowMoment(
@@ -164,10 +164,10 @@ class WindowPerception(FramePerception):
             classes=self.classes,
             target=self.target,
             targets=self.targets,
-            decision=self._decision(seen),
+            decision=self._decision(history),
             number=self._number,
-            glances=tuple(seen),
-            values=tuple(look.value for look in self._kept),
+            glances=tuple(history),
+            values=tuple(look.value for look in self._looks),
             candidates=objects,
             unseen=unseen,
             least=least_of(certainty),
@@ -182,10 +182,10 @@ class WindowPerception(FramePerception):
         candidate = None if self._decisions is None else self._decisions.candidate
         return self._last.choices[0][0] if candidate is None else closer_window(glances.lattice, candidate.box)
 
-    def _decision(self, seen: list[Glance]) -> Decision | None:
+    def _decision(self, history: list[Glance]) -> Decision | None:
         """The decision of a search at the frame."""
         if self._decisions is not None:
             return self._decisions.decision()
         if not self.searches or self.target is None:
             return None
-        return decide_by_score(seen, self.target, self._thresholds[0])
+        return decide_by_score(history, self.target, self._thresholds[0])

@@ -96,6 +96,6 @@ def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
     """
     check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
     levels = score.unique(sorted=True).flip(0)[:, None]
-    told = score >= levels
-    shares = [(told[:, kind].double().mean(1)).tolist() for kind in (~present, present)]
+    positive = score >= levels
+    shares = [(positive[:, kind].double().mean(1)).tolist() for kind in (~present, present)]
     return [0.0, *shares[0]], [0.0, *shares[1]]

@@ -40,10 +40,10 @@ def fit_tables(
     """Fit all tables of an observation model, and warn of levels that fell back; arguments as for `fit_table`."""
     alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
     if fallback:
-        told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
-        told += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
+        text = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
+        text += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
-        warnings.warn(f"levels with fewer than {minimum} objects fall back: {told}", stacklevel=4)
+        warnings.warn(f"levels with fewer than {minimum} objects fall back: {text}", stacklevel=4)
     prior, expected = estimate_prior(statistics.count, shrinkage), expected_table(statistics, fallback, shrinkage)
     record = {
         "counts": statistics.count.tolist(),

@@ -296,8 +296,8 @@ class FovealObservationModel(Pretrained):
             InputError: the statistics are for another table or epsilon, or a setting is out of range.
         """
         components, levels = self.log_alpha.shape[:2]
-        wanted, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
-        check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
+        required, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
+        check(got == required, "statistics", f"shape and epsilon {required}", got)
         check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
         tables = fit_tables(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)

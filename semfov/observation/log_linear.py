@@ -35,12 +35,12 @@ class LinearCache:
     """Keeps the linear map of a parameter `ln α` until the parameter changes."""
 
     def __init__(self) -> None:
-        self._kept: tuple[Tensor, int, int, Tensor, Tensor] | None = None
+        self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
 
     def __call__(self, log_alpha: Tensor) -> tuple[Tensor, Tensor]:
         """The map of this parameter, computed if it is not the one that is kept."""
         key = (log_alpha, log_alpha._version, log_alpha.data_ptr())
-        if self._kept is None or self._kept[0] is not log_alpha or self._kept[1:3] != key[1:]:
+        if self._cache is None or self._cache[0] is not log_alpha or self._cache[1:3] != key[1:]:
             with torch.inference_mode(False), torch.no_grad():
-                self._kept = (*key, *linear_map(log_alpha.exp()))
-        return self._kept[3:]
+                self._cache = (*key, *linear_map(log_alpha.exp()))
+        return self._cache[3:]

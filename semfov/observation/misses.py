@@ -54,9 +54,9 @@ class MissCounts:
         there[0] = ~objects.any(0)
         for label in labels.unique():
             there[label] = objects[labels == label].any(0)
-        seen_from = torch.nn.functional.one_hot(level, self.total.shape[1])
-        self.total += there.long() @ seen_from
-        self.missed += (there & ~detected).long() @ seen_from
+        one_hot = torch.nn.functional.one_hot(level, self.total.shape[1])
+        self.total += there.long() @ one_hot
+        self.missed += (there & ~detected).long() @ one_hot
         return self
 
     @classmethod

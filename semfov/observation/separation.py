@@ -102,5 +102,5 @@ def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tupl
 
 def _mixed(mean: Tensor, variance: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance of a variable that is 0 with probability `missed` and otherwise has the given moments."""
-    seen = 1 - missed
-    return seen * mean, seen * (variance + missed * mean.square())
+    detected = 1 - missed
+    return detected * mean, detected * (variance + missed * mean.square())

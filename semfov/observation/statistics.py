@@ -199,16 +199,16 @@ class DirichletStatistics:
 
     def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
         """Row-major cell numbers, after checking the index."""
-        parts = (index,) if isinstance(index, Tensor) else tuple(index)
+        indices = (index,) if isinstance(index, Tensor) else tuple(index)
         sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
-        check(len(parts) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(parts))
-        cells = torch.zeros(samples, dtype=torch.int64, device=parts[0].device)
-        for part, size in zip(parts, sizes, strict=True):
-            whole = not part.is_floating_point() and part.dtype != torch.bool
-            check(whole and part.shape == (samples,), "index", f"({samples},) integers", (part.dtype, part.shape))
-            inside = bool(((part >= 0) & (part < size)).all())
+        check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
+        cells = torch.zeros(samples, dtype=torch.int64, device=indices[0].device)
+        for row, size in zip(indices, sizes, strict=True):
+            whole = not row.is_floating_point() and row.dtype != torch.bool
+            check(whole and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
+            inside = bool(((row >= 0) & (row < size)).all())
             check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
-            cells = cells * size + part
+            cells = cells * size + row
         return cells
 
     def _check_room(self, count: Tensor) -> None:

@@ -216,8 +216,8 @@ class Record(Conversion):
         """The most confident objects in words."""
         objects, sure = self.objects, self.confirmed.tolist()
         named = [
-            f"{self.classes[label]} {score:.2f}{' (confirmed)' if known else ''}"
-            for label, score, known in zip(
+            f"{self.classes[label]} {score:.2f}{' (confirmed)' if confirmed else ''}"
+            for label, score, confirmed in zip(
                 objects.labels.tolist()[:_NAMED], objects.scores.tolist(), sure, strict=False
             )
         ]
@@ -299,7 +299,7 @@ class Record(Conversion):
             One dictionary for each object.
         """
         objects = self.objects
-        parts = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
+        columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
         return [
             {
                 "object": number,
@@ -315,7 +315,7 @@ class Record(Conversion):
                 "look": look,
             }
             for number, (label, score, sure, look, (x1, y1, x2, y2)) in enumerate(
-                zip(*(part.tolist() for part in parts), strict=True)
+                zip(*(column.tolist() for column in columns), strict=True)
             )
         ]
 
@@ -328,7 +328,7 @@ class Record(Conversion):
         Raises:
             DataError: the file cannot be written.
         """
-        self._format.write(path, self._base(), *self._parts())
+        self._format.write(path, self._base(), *self._contents())
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -356,7 +356,7 @@ class Record(Conversion):
         return vars(self)
 
     @abstractmethod
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON values of a file, beside those of the base."""
 
     @classmethod
@@ -454,8 +454,14 @@ class GazeRecord(Record):
     def __iter__(self) -> Iterator[RecordedLook]:
         """The looks in their order."""
         for number, (x, y) in enumerate(self._gaze()[0].tolist()):
-            parts = self.region(number), self._in_picture(number), self._duration(number), self._value(number)
-            yield RecordedLook(number, (x, y), *parts)
+            yield RecordedLook(
+                number,
+                (x, y),
+                self.region(number),
+                self._in_picture(number),
+                self._duration(number),
+                self._value(number),
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -545,8 +551,8 @@ class GazeRecord(Record):
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.
         """
-        found: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
-        return found
+        scores: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
+        return scores
 
     @abstractmethod
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
@@ -570,8 +576,8 @@ def detections_in_words(detections: Detections, classes: Sequence[str], most: in
     >>> detections_in_words(cups, ("background", "cup"), most=1), detections_in_words(cups, ("", "cup"), score=0.95)
     ('cup 0.90 and 1 more', 'nothing')
     """
-    parts = (detections.labels, detections.confidence, detections.mask)
-    looks = zip(*(part.flatten().tolist() for part in parts), strict=True)
+    columns = (detections.labels, detections.confidence, detections.mask)
+    looks = zip(*(column.flatten().tolist() for column in columns), strict=True)
     sure = [f"{classes[label]} {confidence:.2f}" for label, confidence, real in looks if real and confidence >= score]
     more = f" and {len(sure) - most} more" if len(sure) > most else ""
     return ", ".join(sure[:most]) + more or "nothing"

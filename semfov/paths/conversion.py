@@ -95,14 +95,14 @@ class Conversion(ABC):
         objects, names = self.objects, self.classes[1:]
         if categories is None:
             categories = coco_categories()
-            known = {canonical_name(str(each["name"])) for each in categories}
-            strange = [name for name in names if canonical_name(name) not in known]
+            category_names = {canonical_name(str(each["name"])) for each in categories}
+            strange = [name for name in names if canonical_name(name) not in category_names]
             check(not strange, "categories", "those of the annotation file, for classes that COCO has not",
                   f"None with the class {', '.join(strange[:3])}")  # fmt: skip
         if any(isinstance(each, Mapping) for each in categories):
             present = sorted(set(objects.labels.tolist()))
-            found = category_ids(categories, [names[label - 1] for label in present])
-            ids = dict(zip(present, found, strict=True))
+            numbers = category_ids(categories, [names[label - 1] for label in present])
+            ids = dict(zip(present, numbers, strict=True))
         else:
             check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
             ids = dict(enumerate(category_ids(categories), 1))

@@ -176,7 +176,7 @@ class Format:
         photograph = tensors.get("photograph")
         sides = (1,) if photograph is None else photograph.shape[1:]
         check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
-        parts = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
+        looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
         decision, closer = record.get("decision"), record.get("closer") or []
         boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
         check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
@@ -191,7 +191,7 @@ class Format:
             "least": LEAST if least is None else least,
             "source": record.get("source"),
             "photograph": photograph,
-            "detections": tuple(Detections(*(part[None] for part in look)) for look in parts),
+            "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
             "found": record["found"],
             "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
             "closer": tuple(

@@ -114,8 +114,8 @@ class HeadPath(GazeRecord):
         """
         distances, cut = [], []
         width, height = self.views.world.size
-        for number, (action, seen) in enumerate(zip(self.actions, self.detections, strict=True)):
-            boxes, field = seen.boxes[0], float(self.pose(number)[2])
+        for number, (action, detections) in enumerate(zip(self.actions, self.detections, strict=True)):
+            boxes, field = detections.boxes[0], float(self.pose(number)[2])
             point = self.views.view_grid.centres[action % self.views.cells]
             distances.append(distances_to(boxes, point) * field / width)
             border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
@@ -182,13 +182,13 @@ class HeadPath(GazeRecord):
         Returns:
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
-        seen = self.detections[look]
-        best, label = seen.scores[0, :, 1:].max(-1)
+        detections = self.detections[look]
+        best, label = detections.scores[0, :, 1:].max(-1)
         label = label + 1
-        kept = seen.mask[0] & (best >= score)
+        chosen = detections.mask[0] & (best >= score)
         if self.target is not None:
-            kept &= label == self.target
-        return self.views.world.places(seen.boxes[0, kept], self.pose(look)), label[kept], best[kept]
+            chosen &= label == self.target
+        return self.views.world.places(detections.boxes[0, chosen], self.pose(look)), label[chosen], best[chosen]
 
     def describe(self) -> str:
         """Describe the outcome in one line."""
@@ -232,9 +232,9 @@ class HeadPath(GazeRecord):
         return rows
 
     def _in_picture(self, number: int) -> Detections:
-        seen = self.detections[number]
-        boxes = self.views.world.boxes(seen.boxes[0], self.pose(number))
-        return replace(seen, boxes=boxes[None].to(seen.boxes))
+        detections = self.detections[number]
+        boxes = self.views.world.boxes(detections.boxes[0], self.pose(number))
+        return replace(detections, boxes=boxes[None].to(detections.boxes))
 
     def _duration(self, number: int) -> float | None:
         return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
@@ -252,7 +252,7 @@ class HeadPath(GazeRecord):
         width, height = (int(side) for side in self.views.world.scene.extent)
         return self.views.world.pixels_of(self.views.gaze[[*self.actions]]), (width, height)
 
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         views = self.views
         record = {"fields": list(views.fields), "fovea": views.fovea, "seconds": list(self.seconds)}
         tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}

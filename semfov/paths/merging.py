@@ -63,14 +63,14 @@ def merge_fixations(
     tensor([[ 0.,  1., 11., 10.]])
     """
     boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []
-    for number, (seen, distance) in enumerate(zip(looks, distances, strict=True)):
-        kept = seen.mask[0] & (seen.confidence[0] >= FAINTEST)
-        boxes.append(seen.boxes[0, kept].detach().float().cpu())
-        scores.append(seen.confidence[0, kept].detach().float().cpu())
-        labels.append(seen.labels[0, kept].cpu())
+    for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
+        chosen = detections.mask[0] & (detections.confidence[0] >= FAINTEST)
+        boxes.append(detections.boxes[0, chosen].detach().float().cpu())
+        scores.append(detections.confidence[0, chosen].detach().float().cpu())
+        labels.append(detections.labels[0, chosen].cpu())
         numbers.append(torch.full((len(boxes[-1]),), number))
-        sharpness.append(-distance[kept].detach().float().cpu())
-        broken.append(torch.zeros(len(boxes[-1])).bool() if cut is None else cut[number][kept].cpu())
+        sharpness.append(-distance[chosen].detach().float().cpu())
+        broken.append(torch.zeros(len(boxes[-1])).bool() if cut is None else cut[number][chosen].cpu())
     for look in closer:
         boxes.append(look.box[None].detach().float().cpu())
         scores.append(torch.tensor([look.place]))
@@ -80,8 +80,8 @@ def merge_fixations(
         broken.append(torch.tensor([False]))
     if not boxes:
         return Objects.none()
-    parts = (torch.cat(part) for part in (boxes, scores, labels, numbers, broken, sharpness))
-    return merge_looks(*parts, score=0.0, around=around).above(FAINTEST)
+    columns = (torch.cat(column) for column in (boxes, scores, labels, numbers, broken, sharpness))
+    return merge_looks(*columns, score=0.0, around=around).above(FAINTEST)
 
 
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
@@ -121,13 +121,13 @@ def places_confirmed(
     Returns:
         The places, each one once.
     """
-    found = decision.box if decision is not None and decision.outcome == "found" else None
-    others = [look for look in closer if look.place >= CONFIRMED and (found is None or not look.box.equal(found))]
+    box = decision.box if decision is not None and decision.outcome == "found" else None
+    others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
     places = [ConfirmedPlace(look.box, look.target, look.place, number_of(look)) for look in others]
-    if found is not None and decision is not None and target is not None:
-        last = next((number_of(look) for look in closer if look.box.equal(found)), last)
+    if box is not None and decision is not None and target is not None:
+        last = next((number_of(look) for look in closer if look.box.equal(box)), last)
         probability = decision.probability if decision.place is None else decision.place
-        places.append(ConfirmedPlace(found, target, probability, last))
+        places.append(ConfirmedPlace(box, target, probability, last))
     return places
 
 

@@ -206,11 +206,11 @@ class FoveaMoment(Moment):
         ]
 
     def _base(self) -> Mapping[str, Any]:
-        parts = {"detections": (self.detections,), "closer": self.closer_looks, "ending": None}
+        record = {"detections": (self.detections,), "closer": self.closer_looks, "ending": None}
         found = self.decision is not None and self.decision.outcome == "found"
-        return {**vars(self), **parts, "found": found}
+        return {**vars(self), **record, "found": found}
 
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
         record = {name: getattr(self, name) for name in ("number", "cell", "next_cell")}
         record |= {"grid": [self.grid.columns, self.grid.rows], "size": size, "seconds": dict(self.seconds)}
@@ -285,8 +285,8 @@ class WindowMoment(ZoomPath, Moment):
         """The frame, the windows and the objects."""
         return [f"frame {self.number}", *super()._lines()]
 
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        tensors, record = super()._parts()
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors, record = super()._contents()
         return tensors, {**record, "number": self.number, "next_window": window_values(self.next_window)}
 
     @classmethod

@@ -127,7 +127,7 @@ class Scanpath(GazeRecord):
         a closer look is the probability that the target is there.
         """
         points = self.fixations
-        distances = [distances_to(seen.boxes[0], point) for seen, point in zip(self.detections, points, strict=True)]
+        distances = [distances_to(look.boxes[0], point) for look, point in zip(self.detections, points, strict=True)]
         return merge_fixations(self.detections, distances, self.closer)
 
     def views(self) -> list[Tensor]:
@@ -232,7 +232,7 @@ class Scanpath(GazeRecord):
         width, height = (int(side) for side in self.grid.extent)
         return self.fixations, (width, height)
 
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {name: getattr(self, name) for name in ("cells", "fixations", "probabilities", "values")}
         tensors |= {name: getattr(self, name) for name in _OPTIONAL if getattr(self, name) is not None}
         size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
@@ -260,8 +260,8 @@ class Scanpath(GazeRecord):
         check(int(cells.max()) < len(grid), "cells", f"cell numbers below {len(grid)}", int(cells.max()))
         check(len(seconds) in (0, len(cells)), "seconds", f"times of {len(cells)} looks, or none", len(seconds))
         decision = shared["decision"]
-        found = None if decision is None else decision.cell
-        check(found is None or found < len(grid), "decision.cell", f"a cell number below {len(grid)}", found)
+        cell = None if decision is None else decision.cell
+        check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         for look in shared["closer"]:
             check(look.cell < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
         stimulus = Stimulus.restored(tensors, record)

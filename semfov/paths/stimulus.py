@@ -81,17 +81,17 @@ class Stimulus:
         Raises:
             InputError: a part is missing, or the photograph does not fit on the canvas.
         """
-        kept = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
+        pictures = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
         values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
         if "canvas" not in tensors and not values:
             return None
         check(
-            len(kept) == len(values) == 2,
+            len(pictures) == len(values) == 2,
             "photograph",
             "photograph, canvas, placement and settings together",
-            f"{len(kept) + len(values)} of these 4",
+            f"{len(pictures) + len(values)} of these 4",
         )
-        photograph, canvas = kept
+        photograph, canvas = pictures
         placement = Placement(**{name: tuple(value) for name, value in values[0].items()})
         for axis in (0, 1):
             room, side = canvas.shape[2 - axis], placement.size[axis] * placement.scale[axis]
@@ -151,8 +151,8 @@ def sensor_in_words(sensor: Mapping[str, Any]) -> str:
     'log-polar, fovea 40, reference 640'
     """
     if "sigma" not in sensor or "growth" not in sensor:
-        told = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
-        return ", ".join([str(sensor.get("kind", "sensor")), *told])
+        settings = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
+        return ", ".join([str(sensor.get("kind", "sensor")), *settings])
     return f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
 
 
@@ -173,7 +173,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(height * scale)), max(1, round(width * scale))
-    pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, kept=1))
+    pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
     return resized(pixels, size)[0].contiguous()
 
 

@@ -45,7 +45,7 @@ class Trace:
         self.grid, self.classes, self.target, self.beside, self.least = grid, classes, target, beside, least
         self.steps: list[Step] = []
         self._maps: list[torch.Tensor] = []
-        self._known: Belief | None = None
+        self._belief: Belief | None = None
 
     def add(self, step: Step) -> None:
         """Keep a step.
@@ -53,12 +53,12 @@ class Trace:
         Args:
             step: the next step of the episode.
         """
-        known = step.belief
+        belief = step.belief
         if self.beside is not None:
-            before = self.beside.start(1, self.grid, step.values) if self._known is None else self._known
-            known = self.beside(before, step.detections, step.fixation, self.grid)
-        self._known = known
-        self._maps.append(known.class_probabilities()[0])
+            before = self.beside.start(1, self.grid, step.values) if self._belief is None else self._belief
+            belief = self.beside(before, step.detections, step.fixation, self.grid)
+        self._belief = belief
+        self._maps.append(belief.class_probabilities()[0])
         self.steps.append(step)
 
     def scanpath(self) -> Scanpath:
@@ -106,7 +106,7 @@ def trace(
         steps = rollout(looks, observer, acquisition, start, choice, most=10)
         scanpath = trace(steps, grid, ("background", "cup"), target=1, beside=None)
     """
-    kept = Trace(grid, classes, target, beside)
+    episode = Trace(grid, classes, target, beside)
     for step in steps:
-        kept.add(step)
-    return kept.scanpath()
+        episode.add(step)
+    return episode.scanpath()

@@ -178,11 +178,11 @@ class ZoomPath(GazeRecord):
         Returns:
             A phrase such as `41 × person from probability 0.5, about 47 ± 5 in all`.
         """
-        told = super().objects_in_words()
+        text = super().objects_in_words()
         if self.unseen is None:
-            return told
+            return text
         mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
-        return f"{told}, about {mean:.0f} ± {variance**0.5:.0f} in all"
+        return f"{text}, about {mean:.0f} ± {variance**0.5:.0f} in all"
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
@@ -240,7 +240,7 @@ class ZoomPath(GazeRecord):
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
         return torch.tensor([glance.window.fixation[:2] for glance in self.glances]), self.lattice.size
 
-    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
@@ -274,8 +274,8 @@ class ZoomPath(GazeRecord):
         return {
             "lattice": lattice,
             "glances": tuple(
-                Glance(window, seen, cut, show, None)
-                for window, seen, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
+                Glance(window, detections, cut, show, None)
+                for window, detections, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
             ),
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,

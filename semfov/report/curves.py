@@ -41,19 +41,19 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
         return f"{x:.1f},{y:.1f}"
 
     named = highlighted(curves)
-    parts = [_axes(last, top)]
+    shapes = [_axes(last, top)]
     rest = [curve for name, curve in curves.items() if name not in named]
     for curve in rest:
         points = " ".join(point(*p) for p in enumerate(curve))
-        parts.append(f'<polyline class="rest" points="{points}"/>')
+        shapes.append(f'<polyline class="rest" points="{points}"/>')
     for order, name in enumerate(named):
         curve, band = curves[name], errors.get(name)
         if band is not None and np.isfinite(band).all():
             around = [*enumerate(curve + band), *reversed(list(enumerate(curve - band)))]
-            parts.append(f'<polygon class="c{order % _COLOURS}" points="{" ".join(point(*p) for p in around)}"/>')
+            shapes.append(f'<polygon class="c{order % _COLOURS}" points="{" ".join(point(*p) for p in around)}"/>')
     for order, name in enumerate(named):
         points = " ".join(point(*p) for p in enumerate(curves[name]))
-        parts.append(f'<polyline {_line(order, len(named))} points="{points}"/>')
+        shapes.append(f'<polyline {_line(order, len(named))} points="{points}"/>')
     samples = [f'<polyline {_line(order, len(named))} points="0,6 38,6"/>' for order in range(len(named))]
     if rest:
         named = [*named, others_named(len(rest))]
@@ -65,7 +65,7 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
     title = escape(f"{label} after 0 to {last} gaze shifts; the table below has the numbers")
     return (
         f'<div class="curves"><p>{escape(label)}</p>'
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">{"".join(shapes)}</svg>'
         f'<ul class="legend">{legend}</ul></div>'
     )
 
@@ -99,17 +99,17 @@ def _line(order: int, count: int) -> str:
 
 def _axes(last: int, top: float) -> str:
     left, right, bottom = _LEFT, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
-    parts = []
+    shapes = []
     for step in range(6):
         y = bottom - step / 5 * (bottom - _TOP)
-        parts.append(f'<line class="tick" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{left - 10}" y="{y + 5:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
+        shapes.append(f'<line class="tick" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        shapes.append(f'<text x="{left - 10}" y="{y + 5:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
     every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 10**6) if last / step <= 10)
     for shift in range(0, last + 1, every):
         x = left + shift / max(last, 1) * (right - left)
         # On a phone, where letters are larger, only every second number is shown.
         minor = ' class="minor"' if (shift // every) % 2 else ""
-        parts.append(f'<text{minor} x="{x:.1f}" y="{bottom + 27}" text-anchor="middle">{shift}</text>')
-    parts.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
-    parts.append(f'<text x="{(left + right) / 2}" y="{_HEIGHT - 8}" text-anchor="middle">gaze shifts</text>')
-    return "".join(parts)
+        shapes.append(f'<text{minor} x="{x:.1f}" y="{bottom + 27}" text-anchor="middle">{shift}</text>')
+    shapes.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
+    shapes.append(f'<text x="{(left + right) / 2}" y="{_HEIGHT - 8}" text-anchor="middle">gaze shifts</text>')
+    return "".join(shapes)

@@ -73,7 +73,7 @@ def episode_data(
     size = grid.extent.tolist()
     timed = len(scanpath.seconds) > 0
     after = [*scanpath.cells.tolist()[1:], None]
-    shown: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views
+    every_view: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views
     fixations = [
         {
             "cell": cell,
@@ -83,7 +83,7 @@ def episode_data(
             "next": after[number],
             "seconds": dict(scanpath.seconds[number]) if timed else None,
         }
-        for number, (cell, view) in enumerate(zip(scanpath.cells.tolist(), shown, strict=True))
+        for number, (cell, view) in enumerate(zip(scanpath.cells.tolist(), every_view, strict=True))
     ]
     return {
         "name": name,
@@ -115,10 +115,10 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
         assert look.cell is not None
         row, column = divmod(look.cell, scanpath.grid.columns)
         decision += f" Closer look at column {column}, row {row}: probability {look.place:.2f}."
-    told = None if settings is None else sensor_in_words(settings["sensor"])
+    sensor = None if settings is None else sensor_in_words(settings["sensor"])
     return {
         "detector": None if settings is None else settings["detector"]["name"],
-        "sensor": told,
+        "sensor": sensor,
         "decision": decision,
     }
 
@@ -148,23 +148,23 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
         For each detection its box, its label, pairs of class name and score, and the rectangle of its label.
     """
     looked, classes = scanpath.detections[fixation][0], scanpath.classes
-    kept = []
+    detections = []
     for box, vector in zip(looked.boxes[:most], looked.scores[:most], strict=True):
         if float(vector[1:].max()) >= FAINTEST:
             best = vector.topk(min(scores, len(vector)))
             pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
             top = [[classes[index], rounded(score)] for score, index in pairs]
             label = classes[int(vector[1:].argmax()) + 1]
-            kept.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
+            detections.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
     width, height = scanpath.grid.extent.tolist()
     unit = width / 640
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()
-    texts = [f"{number} {detection['label']}" for number, detection in enumerate(kept, 1)]
-    return tagged(kept, texts, (width, height), [(x - 14 * unit, y - 14 * unit, x + 14 * unit, y + 14 * unit)])
+    texts = [f"{number} {detection['label']}" for number, detection in enumerate(detections, 1)]
+    return tagged(detections, texts, (width, height), [(x - 14 * unit, y - 14 * unit, x + 14 * unit, y + 14 * unit)])
 
 
 def tagged(
-    detections: list[Data], texts: Sequence[str], frame: tuple[float, float], taken: Sequence[LabelBox] = ()
+    detections: list[Data], texts: Sequence[str], frame: tuple[float, float], obstacles: Sequence[LabelBox] = ()
 ) -> list[Data]:
     """Detections with `tag`, the rectangle of their text.
 
@@ -172,14 +172,14 @@ def tagged(
         detections: each with its `box`.
         texts: text of each.
         frame: `(width, height)` of the picture in which they are drawn.
-        taken: rectangles that no text may cover.
+        obstacles: rectangles that no text may cover.
 
     Returns:
         The detections.
     """
     unit = frame[0] / 640
     sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
-    places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, taken)
+    places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, obstacles)
     return [
         {**detection, "tag": [round(x, 1) for x in place]} for detection, place in zip(detections, places, strict=True)
     ]
@@ -203,8 +203,8 @@ def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     if target is not None:
         order = [index for index in order if index != target]
         maps.append({"label": scanpath.classes[target], **quantised(class_posterior(scanpath))})
-    kept = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
-    maps += [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
+    labels = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
+    maps += [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in labels]
     # Some detectors give several classes the same name. A number tells their entries apart.
     times: Counter[str] = Counter()
     for each in maps:

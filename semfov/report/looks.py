@@ -33,8 +33,8 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         HTML.
     """
     name, count = escape(data["name"]), data["count"]
-    told = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
-    head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
+    facts = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
+    head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'
     looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
     return (
@@ -102,7 +102,7 @@ def _look(data: Data, number: int, place: str) -> str:
         del facts["Value when it was chosen"]
     if look["closer"] is not None:
         facts["Closer look"] = look["closer"]
-    told = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
+    facts_html = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
     table = "<p>No detections.</p>"
     if len(rows) > 1:
         table = table_html(rows, f"Detections of look {number}, with boxes (x1, y1, x2, y2) in picture pixels")
@@ -113,7 +113,7 @@ def _look(data: Data, number: int, place: str) -> str:
         f'<h4 id="{place}-title">Look {number}{": the whole picture" if look["whole"] else ""}</h4>'
         f'<svg viewBox="0 0 {size[0]} {size[1]}" role="img" aria-label="{label}">'
         f"{_image(look['view'], size)}{''.join(shapes)}{''.join(tags)}</svg>"
-        f'<dl class="facts">{told}</dl>{table}{_left_out(left, "detection")}</section>'
+        f'<dl class="facts">{facts_html}</dl>{table}{_left_out(left, "detection")}</section>'
     )
 
 

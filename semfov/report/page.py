@@ -72,7 +72,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
-    parts = {
+    contents = {
         "title": escape(title),
         "style": (FOLDER / "page.css").read_text(encoding="utf-8"),
         "program": (FOLDER / "page.js").read_text(encoding="utf-8"),
@@ -88,20 +88,20 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     }
     template = (FOLDER / "page.html").read_text(encoding="utf-8")
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
-    return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template)
 
 
 def about_html(episodes: Sequence[Data]) -> str:
     """The head of the page: facts about the first episode, which the script updates for other episodes."""
     if not episodes:
         return ""
-    told = []
+    rows = []
     for key, label in ABOUT.items():
         if any(key in episode for episode in episodes):
             hidden = "" if key in episodes[0] else " hidden"
             fact = escape(episodes[0].get(key) or "not recorded")
-            told.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
-    return f'<dl id="about" class="facts">{"".join(told)}</dl>'
+            rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
+    return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
 
 
 def _place(number: int) -> str:

@@ -18,7 +18,7 @@ from semfov.paths.stimulus import LONGEST
 from semfov.report.episode import Data, jpeg_uri, rounded, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.viz.head import head_views
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
 _Frame = tuple[int, int, int, int]
@@ -29,7 +29,7 @@ DRAWN = 500
 LISTED = 100
 """Largest number of objects in the table."""
 
-SHOWN = 15
+MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
 
 
@@ -204,11 +204,11 @@ def outcome_in_words(path: Record) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
     reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
     if path.decision is None:
-        told = f"{path.objects_in_words()}."
+        text = f"{path.objects_in_words()}."
     else:
         outcome, probability = path.decision.outcome, path.decision.probability
-        told = f"“{path.target_name}” {outcome}, probability that the picture holds it: {probability:.2f}."
-    return f"{told} {reason}".rstrip()
+        text = f"“{path.target_name}” {outcome}, probability that the picture holds it: {probability:.2f}."
+    return f"{text} {reason}".rstrip()
 
 
 def _objects(path: Record) -> list[Data]:
@@ -236,13 +236,13 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
     closer = next((each for each in path.closer_looks if each.number == number), None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     last = sum(1 for _ in path) - 1
-    told = [f"Look {number} of {last}"]
-    told[0] += ", at the whole picture." if whole else f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}."
+    where = ", at the whole picture" if whole else f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}"
+    sentences = [f"Look {number} of {last}{where}."]
     if look.value is not None:
-        told.append(f"Its value was {look.value:.2g}.")
+        sentences.append(f"Its value was {look.value:.2g}.")
     if closer is not None:
-        told.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
-    told.append(f"Objects that it brought: {kinds or 'none'}.")
+        sentences.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
+    sentences.append(f"Objects that it brought: {kinds or 'none'}.")
     return {
         "view": jpeg_uri(view.pixels, view.across, quality),
         "box": [round(side) for side in look.region],
@@ -251,30 +251,37 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "magnification": rounded(magnification),
         "value": None if look.value is None else rounded(look.value),
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
-        "detections": detections[:SHOWN],
+        "detections": detections[:MOST_DETECTIONS],
         "count": len(detections),
         "brought": kinds or "none",
-        "status": " ".join(told),
+        "status": " ".join(sentences),
     }
 
 
 def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     """Detections of a look, those of the target first, with boxes and labels in the unit of the view."""
-    seen, rows = look.detections, []
-    parts = (view.boxes.tolist(), seen.boxes[0].tolist(), seen.labels[0].tolist(), seen.confidence[0].tolist())
-    for box, place, vector, label, score in zip(*parts[:2], seen.scores[0], *parts[2:], strict=True):
+    detections, rows = look.detections, []
+    columns = zip(
+        view.boxes.tolist(),
+        detections.boxes[0].tolist(),
+        detections.scores[0],
+        detections.labels[0].tolist(),
+        detections.confidence[0].tolist(),
+        strict=True,
+    )
+    for box, place, vector, label, score in columns:
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label and float(vector[path.target]) >= FOUND:
+        if path.target is not None and label and float(vector[path.target]) >= DETECTION_SCORE:
             label, score = path.target, float(vector[path.target])
-        if score >= FOUND:
+        if score >= DETECTION_SCORE:
             first = label == path.target
             corners = {"box": [round(n, 1) for n in box], "place": [round(n, 1) for n in place]}
             rows.append((first, score, {**corners, "label": path.classes[label], "score": rounded(score)}))
     rows.sort(key=lambda row: row[:2], reverse=True)
-    kept = [detection for _, _, detection in rows]
+    entries = [detection for _, _, detection in rows]
     # Names would cover small objects. The table has them.
-    numbers = [str(number) for number in range(1, min(len(kept), SHOWN) + 1)]
-    return [*tagged(kept[:SHOWN], numbers, view.size), *kept[SHOWN:]]
+    numbers = [str(number) for number in range(1, min(len(entries), MOST_DETECTIONS) + 1)]
+    return [*tagged(entries[:MOST_DETECTIONS], numbers, view.size), *entries[MOST_DETECTIONS:]]
 
 
 def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int]) -> _Frame:

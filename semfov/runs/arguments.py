@@ -37,27 +37,27 @@ def usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[st
     >>> usual_form(["--give-up", "0.2", "--looks", "--draw", "path,views"], Example, ["--give_up", "--looks", "--draw"])
     ['--give_up', '0.2', '--looks=true', '--draw=[path,views]']
     """
-    hints, known, found = setting_types(config), set(options), list[str]()
+    hints, option_names, usual = setting_types(config), set(options), list[str]()
     rest = list(arguments)
     while rest:
         word = rest.pop(0)
         name, equals, value = word.partition("=")
         option = "--" + name[2:].replace("-", "_")
         if word == "--":
-            return [*found, word, *rest]
-        if not word.startswith("--") or option not in known:
-            found.append(word)
+            return [*usual, word, *rest]
+        if not word.startswith("--") or option not in option_names:
+            usual.append(word)
             continue
-        hint, given = hints.get(option[2:]), bool(equals)
-        if hint is bool and not given:
+        hint, has_value = hints.get(option[2:]), bool(equals)
+        if hint is bool and not has_value:
             value = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
-            given = True
-        elif _is_list(hint) and not given and rest and not rest[0].startswith("--"):
-            value, given = rest.pop(0), True
-        if given and _is_list(hint) and not value.startswith("["):
+            has_value = True
+        elif _is_list(hint) and not has_value and rest and not rest[0].startswith("--"):
+            value, has_value = rest.pop(0), True
+        if has_value and _is_list(hint) and not value.startswith("["):
             value = f"[{'' if value in ('none', '') else value}]"
-        found.append(f"{option}={value}" if given else option)
-    return found
+        usual.append(f"{option}={value}" if has_value else option)
+    return usual
 
 
 def in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str:
@@ -87,20 +87,20 @@ def in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str:
 
 def setting_types(config: type[Any]) -> dict[str, Any]:
     """Types of settings, without None, by their dotted names."""
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     hints = get_type_hints(config, include_extras=True)
     for field in fields(config):
         hint = _without_none(hints[field.name])
-        found[field.name] = hint
+        types[field.name] = hint
         if is_dataclass(hint) and isinstance(hint, type):
-            found |= {f"{field.name}.{name}": each for name, each in setting_types(hint).items()}
-    return found
+            types |= {f"{field.name}.{name}": each for name, each in setting_types(hint).items()}
+    return types
 
 
 def _without_none(hint: Any) -> Any:
     if get_origin(hint) in (Union, UnionType):
-        kept = [each for each in get_args(hint) if each is not type(None)]
-        return kept[0] if len(kept) == 1 else hint
+        hints = [each for each in get_args(hint) if each is not type(None)]
+        return hints[0] if len(hints) == 1 else hint
     return hint
 
 

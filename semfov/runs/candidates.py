@@ -143,7 +143,9 @@ def make_strategy(
             f"{policy.policy!r}"
         )
     inner = _strategy(policy, task, belief, components, models, fovea)
-    prior = _given(models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context")
+    prior = _required(
+        models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context"
+    )
     place, cooccurrence = prior.weights_for("evidence" if inner.observer.by_target else "map")
     weights = place * (context != "cooccurrence"), cooccurrence * (context != "place")
     return Strategy(Context(inner.observer, prior, weights), inner.policy)
@@ -153,24 +155,24 @@ def _strategy(
     policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
 ) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
-        return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
+        return Strategy(Target(_required(models.evidence, "policy", "learned target evidence")), NonPredictive())
     calibrated = policy.scores == "calibrated"
     means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
     chosen = named_policy(policy.policy, task, means)
     if by_evidence(policy, task):
-        return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
+        return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
-        return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
+        return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
     misses = _of(policy.misses, belief.misses)
     observer = Semantic(
         components,
-        _given(models.observation, "scores", "an observation model") if calibrated else None,
+        _required(models.observation, "scores", "an observation model") if calibrated else None,
         prior=belief.prior,
         fusion=belief.fusion,
         footprint=_of(policy.footprint, belief.footprint),
         tempering=_of(policy.tempering, belief.tempering),
         memory=_of(policy.memory, belief.memory),
-        misses=_given(models.observation, "misses", "an observation model") if misses else None,
+        misses=_required(models.observation, "misses", "an observation model") if misses else None,
     )
     return Strategy(observer, chosen)
 
@@ -179,7 +181,7 @@ def _of(own: T | None, common: T) -> T:
     return common if own is None else own
 
 
-def _given(model: T | None, argument: str, expected: str) -> T:
+def _required(model: T | None, argument: str, expected: str) -> T:
     if model is None:
         raise InputError(f"{argument}: expected {expected}, got none")
     return model

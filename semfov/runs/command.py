@@ -29,7 +29,7 @@ GOES_ON = "; give the same command again to continue"
 _PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
              "skimage": "scikit-image", "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
 """Names under which packages are installed, where they are not those of their modules."""
-_SAID: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+_ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def make_parser(
@@ -57,8 +57,8 @@ def make_parser(
         def error(self, message: str, ex: Exception | None = None) -> NoReturn:
             if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells
                 super().error(message, ex)
-            known = [option for option in self._option_string_actions if option.startswith("--")]
-            print(f"error: {in_one_line(message, config, known)}", file=sys.stderr)
+            options = [option for option in self._option_string_actions if option.startswith("--")]
+            print(f"error: {in_one_line(message, config, options)}", file=sys.stderr)
             self.exit(2)
 
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
@@ -123,8 +123,8 @@ def run_command(
     try:
         with _signals(goes_on):
             parser = make_parser(config, description, positional, program)
-            given = sys.argv[1:] if arguments is None else arguments
-            parsed = parser.parse_args(usual_form(given, config, parser._option_string_actions))
+            command_line = sys.argv[1:] if arguments is None else arguments
+            parsed = parser.parse_args(usual_form(command_line, config, parser._option_string_actions))
             parsed.pop("config", None)
             check_settings(config, parsed)
             settings = parser.instantiate(parsed)
@@ -148,10 +148,10 @@ def run_command(
         # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
         # it and would end by the signal although it was caught here. A string that runs to its end resets this.
         exec("")
-        print(f"{_SAID[signal.SIGINT]}{goes_on}", file=sys.stderr)
+        print(f"{_ENDINGS[signal.SIGINT]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated:
-        print(f"{_SAID[signal.SIGTERM]}{goes_on}", file=sys.stderr)
+        print(f"{_ENDINGS[signal.SIGTERM]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGTERM
     return code or 0
 
@@ -172,12 +172,12 @@ def _signals(goes_on: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, _leave)
         if _importing(frame):
             # An exception from here would pass through the start of a native module, and some abort the process.
-            os.write(sys.stderr.fileno(), f"{_SAID[number]}{goes_on}\n".encode())
+            os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{goes_on}\n".encode())
             _leave(number, frame)
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
 
-    wanted = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, end) for number in wanted}
+    signals = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, end) for number in signals}
     try:
         yield
     finally:

@@ -99,9 +99,9 @@ def run_explorations(
             choice,
             most=shifts + 1,
         ):
-            known = step.belief.class_probabilities()
+            probabilities = step.belief.class_probabilities()
             visits.append(step.cell)
-            counts.append(counts_of(known, answers))
+            counts.append(counts_of(probabilities, answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
         tables = torch.stack(visits, 1).tolist(), *(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True))

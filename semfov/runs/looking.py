@@ -109,8 +109,8 @@ class CellLooks(Looks):
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Look, and weigh; the fixations are the centres of the cells."""
-        seen = Detections.stack([self.look(number) for number in cell.tolist()])
-        return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
+        detections = Detections.stack([self.look(number) for number in cell.tolist()])
+        return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
 
 
 def looking_of(config: Any) -> Looking:

@@ -80,7 +80,7 @@ class PolicyLooking(Looking):
         """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""
         crops = self.eye.sensor.crops
         check(crops == 1, "sensor", "one view in a look, from which class templates are computed", f"{crops} crops")
-        templates, found = self.models.templates, []
+        templates, tables = self.models.templates, []
         assert templates is not None
         with one_thread(), torch.inference_mode():
             image, grid = self.scenes[index].image, self.grid(index)
@@ -88,8 +88,8 @@ class PolicyLooking(Looking):
             for point in points:
                 canvas = self.eye.foveated(view, point[None])
                 maps = templates(self.eye.detector.features(canvas))
-                found.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
-            return torch.cat(found)
+                tables.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
+            return torch.cat(tables)
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""

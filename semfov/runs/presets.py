@@ -37,7 +37,7 @@ PolicyChoice = str | PolicyConfig
 """A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
 
 
-def known_policies(task: Task) -> list[str]:
+def valid_policies(task: Task) -> list[str]:
     """The values that `PolicyConfig.policy` may have."""
     return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
 
@@ -103,13 +103,13 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     Raises:
         InputError: there is no such preset, no such policy, or its settings contradict each other.
     """
-    known = presets(task)
+    by_name = presets(task)
     if isinstance(choice, str):
         if choice[:1] in ("[", "{"):
             settings = ", ".join(field.name for field in fields(PolicyConfig))
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
-        return known[lookup(choice, known, "policy")]
-    lookup(choice.policy, known_policies(task), "policy")
+        return by_name[lookup(choice, by_name, "policy")]
+    lookup(choice.policy, valid_policies(task), "policy")
     if table_of(choice) == "saliency" and choice.saliency is None:
         models = ", ".join(SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
@@ -126,11 +126,11 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
     if choice.scores == "learned" or choice.policy == TARGET_EVIDENCE:
-        given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
-        if given is not None:
+        conflict = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
+        if conflict is not None:
             raise InputError(
-                f"{given}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
-                f"belief, got {getattr(choice, given)!r}"
+                f"{conflict}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
+                f"belief, got {getattr(choice, conflict)!r}"
             )
     return choice
 
@@ -160,8 +160,8 @@ def label(choice: PolicyChoice, task: Task) -> str:
     for field in fields(PolicyConfig)[2:]:
         value = getattr(settings, field.name)
         if value is not None and not (field.name == "saliency" and alone is not None):
-            shown = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
-            differs.append(field.name if value is True else f"{field.name} {shown}")
+            text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
+            differs.append(field.name if value is True else f"{field.name} {text}")
     return ", ".join([base, *differs])
 
 

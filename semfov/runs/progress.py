@@ -20,7 +20,7 @@ class Bar(Protocol):
     def update(self, n: float = 1) -> object:
         """Count `n` more units as done."""
 
-    def set_postfix(self, **told: object) -> None:
+    def set_postfix(self, **values: object) -> None:
         """Show values beside the bar."""
 
     def close(self) -> None:
@@ -98,7 +98,7 @@ class _Task:
     def update(self, n: float = 1) -> None:
         self._whole._move(self._whole._at + n * self._step)
 
-    def set_postfix(self, **told: object) -> None:
+    def set_postfix(self, **values: object) -> None:
         """Show nothing: values of one task say nothing about the whole."""
 
     def close(self) -> None:
@@ -111,8 +111,8 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Ba
     if whole is not None:
         return whole.task(title, total)
     bar: Any = tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
-    shown: Bar = bar
-    return shown
+    task: Bar = bar
+    return task
 
 
 def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:

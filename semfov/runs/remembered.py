@@ -83,6 +83,6 @@ def look_everywhere(
         The detections, a batch of X·Y.
     """
     looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)
-    seen = Detections.stack([looks(cell) for cell in range(len(grid))])
+    detections = Detections.stack([looks(cell) for cell in range(len(grid))])
     looks.save()
-    return seen
+    return detections

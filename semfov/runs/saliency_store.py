@@ -102,14 +102,14 @@ def saliency_table(
     with one_thread(), torch.inference_mode():
         if saliency.view == "picture":
             return saliency_of_cells(model, image[None], grid, saliency)
-        state, fixations = seen_by(sensor, reference, image, grid.centres)
+        state, fixations = open_at_reference(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
         return torch.cat(
             [saliency_of_cells(model, sensor.picture(state, point[None]), grid, saliency) for point in fixations]
         )
 
 
-def seen_by(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
+def open_at_reference(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
     """Open a photograph `(3, H, W)`, resized to a longer side of `reference`, and move `points` `(F, 2)` there."""
     scale = reference / max(image.shape[-2:])
     size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)

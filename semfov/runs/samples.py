@@ -66,7 +66,7 @@ class Samples:
         """Index of the scene of each detection, `(M,)`."""
         return self.scenes[self.look]
 
-    def seen(self, looks: slice) -> Detections:
+    def detections_of(self, looks: slice) -> Detections:
         """The detections of successive looks, as a batch."""
         numbers = torch.arange(looks.start, looks.stop + 1)
         bounds = torch.searchsorted(self.look, numbers).tolist()
@@ -78,11 +78,11 @@ class Samples:
 
     @classmethod
     @torch.inference_mode()
-    def of(cls, seen: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
+    def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
         """Label the detections of the looks at one scene.
 
         Args:
-            seen: the detections, a batch of R looks.
+            detections: the detections, a batch of R looks.
             fixations: `(R, 2)`, the fixation of each look.
             annotation: the scene's annotated objects.
             index: index of the scene.
@@ -93,14 +93,14 @@ class Samples:
         """
         labels = [
             match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
-            for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
+            for boxes, mask in zip(detections.boxes, detections.mask, strict=True)
         ]
         return cls(
-            boxes=seen.boxes[seen.mask],
-            scores=seen.scores[seen.mask],
-            distance=Grid(1, 1, annotation.size).box_distance(seen.boxes, fixations)[seen.mask],
+            boxes=detections.boxes[detections.mask],
+            scores=detections.scores[detections.mask],
+            distance=Grid(1, 1, annotation.size).box_distance(detections.boxes, fixations)[detections.mask],
             labels=torch.cat(labels),
-            look=seen.mask.nonzero()[:, 0],
+            look=detections.mask.nonzero()[:, 0],
             scenes=torch.full((len(fixations),), index),
             fixations=fixations,
         )
@@ -110,11 +110,11 @@ class Samples:
         return {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
-    def join(cls, parts: list[Samples]) -> Samples:
+    def join(cls, sets: list[Samples]) -> Samples:
         """Concatenate several sets of samples in order."""
-        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _NAMES}
-        counts = torch.tensor([len(part.scenes) for part in parts])
-        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(part) for part in parts]))
+        joined = {name: torch.cat([getattr(some, name) for some in sets]) for name in _NAMES}
+        counts = torch.tensor([len(some.scenes) for some in sets])
+        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(some) for some in sets]))
         return cls(**{**joined, "look": joined["look"] + first})
 
 
@@ -240,7 +240,7 @@ class Sampler:
         """Store the samples of a shard."""
         self.store.write(self.digest(shard), samples.tensors())
 
-    def parts(self) -> Iterator[Samples]:
+    def by_shard(self) -> Iterator[Samples]:
         """The samples of one shard after another, so that not all are in memory.
 
         Yields:
@@ -250,11 +250,11 @@ class Sampler:
             DataError: the file of a shard is missing or damaged.
         """
         for shard in self.shards:
-            part = self.load(shard)
-            if part is None:
+            samples = self.load(shard)
+            if samples is None:
                 path = self.store.path(self.digest(shard))
                 raise DataError(f"{path} is missing or damaged; run the same command again")
-            yield part
+            yield samples
 
     def drawn(self, most: int) -> Samples:
         """About so many detections, each drawn with the same probability, with all looks; all of them if they are less.
@@ -265,19 +265,21 @@ class Sampler:
         Returns:
             The detections, in the order of the photographs.
         """
-        share = most / max(sum(len(part) for part in self.parts()), 1)
+        share = most / max(sum(len(samples) for samples in self.by_shard()), 1)
         if share >= 1:
             return self.all()
         return Samples.join(
             [
-                part[torch.rand(len(part), generator=generator_for("detections", self.settings.seed, shard)) < share]
-                for shard, part in enumerate(self.parts())
+                samples[
+                    torch.rand(len(samples), generator=generator_for("detections", self.settings.seed, shard)) < share
+                ]
+                for shard, samples in enumerate(self.by_shard())
             ]
         )
 
     def all(self) -> Samples:
         """The samples of all photographs in order."""
-        return Samples.join(list(self.parts()))
+        return Samples.join(list(self.by_shard()))
 
     def scenes_of(self, shard: int) -> range:
         """The photographs of a shard."""
@@ -298,8 +300,8 @@ class Sampler:
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
-        seen = look_from(self.foveal_eye, scene.image, points)
-        return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
+        detections = look_from(self.foveal_eye, scene.image, points)
+        return Samples.of(detections, points, self.scenes.annotation(index), index, settings.iou)
 
 
 _process: dict[str, Sampler] = {}

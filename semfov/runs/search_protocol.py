@@ -205,12 +205,12 @@ def _run_batch(
         return goals[seeking[step.episodes], step.next_cell]
 
     if candidate.strategy.policy.by_belief:
-        observer, seen = candidate.observer, looks.of(seeking)
+        observer, source = candidate.observer, looks.of(seeking)
     else:
         # No look changes what the policy does, and most of the time would go into the belief.
-        observer, seen = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)
+        observer, source = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)
     choice = Greedy(drawn_from(noise[seeking]))
-    for step in rollout(seen, observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
+    for step in rollout(source, observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
         going = ~step.visited.all(-1)
         number = seeking[step.episodes[going]]
         visits[number, step.shift + 1] = step.next_cell[going]

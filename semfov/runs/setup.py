@@ -38,9 +38,9 @@ def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
 def check_data(data: DataConfig) -> None:
     """Raise an error unless photographs and annotations both exist, or the settings name neither of them."""
     if (data.root is None) != (data.annotations is None):
-        given, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
+        present, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
         raise InputError(
-            f"data: expected both data.root and data.annotations, or neither for the embedded scenes, got {given} "
+            f"data: expected both data.root and data.annotations, or neither for the embedded scenes, got {present} "
             f"alone; add {missing}"
         )
     if data.root is not None and not data.root.is_dir():
@@ -97,9 +97,9 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
     ids: list[Any] = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
-    kept = [name for number, name in enumerate(ids) if number % every]
+    others = [name for number, name in enumerate(ids) if number % every]
     return (
-        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
+        CocoScenes(data.root, data.annotations, classes, ids=others, **selection),
         CocoScenes(data.root, data.annotations, classes, ids=ids[::every], **selection),
     )
 
@@ -186,9 +186,9 @@ def observation_name(eye: Eye) -> str:
     """
     detector, settings = eye.detector, eye.sensor.settings()
     for sensor in PUBLISHED_SENSORS:
-        known = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()
+        published = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()
         name = published_model(detector.name, sensor, detector.selection.threshold)
-        if known and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
+        if published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
             return name
     return shipped_model(FovealObservationModel, recommended_model(detector.name, growth_of(eye)), "MODEL")
 

@@ -21,7 +21,7 @@ from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge
 
@@ -106,7 +106,7 @@ class WindowLooking:
 
 def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
     """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
-    objects = merge(looks, target, score=FOUND)
+    objects = merge(looks, target, score=DETECTION_SCORE)
     if not len(objects):
         return torch.zeros(len(annotation.boxes), dtype=torch.bool)
     hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
@@ -128,7 +128,7 @@ def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -
         `(M,)`: 1 for an object that matches an annotated one, 0 for one that does not, and -1 for one that matches none
         but lies by half in an area that is annotated as a crowd of its class, which is neither.
     """
-    found = torch.zeros(len(objects), dtype=torch.long)
+    verdicts = torch.zeros(len(objects), dtype=torch.long)
     for label in objects.labels.unique().tolist():
         mine = (objects.labels == label).nonzero()[:, 0]
         there = annotation.labels == label
@@ -142,5 +142,5 @@ def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -
                 :, None
             ]
             hits[(hits == 0) & (inside >= 0.5).any(-1)] = -1
-        found[mine] = hits
-    return found
+        verdicts[mine] = hits
+    return verdicts

@@ -129,13 +129,13 @@ class _Job(Generic[_Task, Result]):
         with _turn:
             if self.code is not None and package_digest() != self.code:
                 raise SemfovError("a worker has another version of semfov; install the same version on all machines")
-            wanted = (self.setup, self.settings)
-            if _ready != [wanted]:
+            preparation = (self.setup, self.settings)
+            if _ready != [preparation]:
                 _ready.clear()
                 if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
                     os.chdir(self.folder)
                 self.setup(*self.settings)
-                _ready.append(wanted)
+                _ready.append(preparation)
             return self.function(task)
 
 
@@ -188,10 +188,10 @@ def _in_processes(
             with _started(min(processes, len(tasks))) as pool:
                 yield from _results(pool, job, tasks, bar, _deaf_children())
         else:
-            pools, kept = shared
-            if processes not in kept:
-                kept[processes] = pools.enter_context(_started(processes))
-            yield from _results(kept[processes], job, tasks, bar, _deaf_children())
+            pools, executors = shared
+            if processes not in executors:
+                executors[processes] = pools.enter_context(_started(processes))
+            yield from _results(executors[processes], job, tasks, bar, _deaf_children())
     except BrokenProcessPool:
         raise SemfovError(
             f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "

@@ -55,16 +55,16 @@ class HeldOutMosaics:
         every: n.
     """
 
-    def __init__(self, kept: Mosaics, held: Mosaics, every: int) -> None:
-        self._kept, self._held, self._every = kept, held, every
-        self.classes, self.ids = kept.classes, list(kept.ids)
-        self.fingerprint = f"{kept.fingerprint} {held.fingerprint} {every}"
+    def __init__(self, training: Mosaics, held: Mosaics, every: int) -> None:
+        self._training, self._held, self._every = training, held, every
+        self.classes, self.ids = training.classes, list(training.ids)
+        self.fingerprint = f"{training.fingerprint} {held.fingerprint} {every}"
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def _of(self, index: int) -> Mosaics:
-        return self._kept if index % self._every else self._held
+        return self._training if index % self._every else self._held
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a mosaic."""
@@ -98,9 +98,10 @@ class MosaicSampler(Sampler):
         """Make the eye and the mosaics."""
         settings = self.settings
         eye = WindowEye(make_detector(settings.detector)).eval().requires_grad_(False)
-        kept, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
+        training, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
         near, far = (
-            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed) for some in (kept, held)
+            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed)
+            for some in (training, held)
         )
         return eye, HeldOutMosaics(near, far, settings.holdout)
 
@@ -110,9 +111,9 @@ class MosaicSampler(Sampler):
         grid = Grid(lattice.columns, lattice.rows, size)
         x, y, magnification = fixation.tolist()
         reach = torch.tensor(lattice.canvas) / magnification / 2
-        seen = ((grid.centres - torch.tensor([x, y])).abs() <= reach).all(-1)
+        in_view = ((grid.centres - torch.tensor([x, y])).abs() <= reach).all(-1)
         octaves = max(-math.log2(magnification), 0.0)
-        return grid, torch.full((len(grid),), octaves), seen
+        return grid, torch.full((len(grid),), octaves), in_view
 
     def _look(self, index: int) -> Samples:
         scene = self.scenes[index]
@@ -121,17 +122,17 @@ class MosaicSampler(Sampler):
         windows = choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
         fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]
         annotation = self.scenes.annotation(index)
-        parts = []
+        samples = []
         with one_thread(), torch.inference_mode():
             for number in range(len(windows)):
-                seen = eye.look(view, fixations[number : number + 1])
-                boxes = seen.boxes[0, seen.mask[0]]
+                detections = eye.look(view, fixations[number : number + 1])
+                boxes = detections.boxes[0, detections.mask[0]]
                 labels = match(boxes, annotation.boxes, annotation.labels, iou=self.settings.iou)
                 look = torch.zeros(len(boxes), dtype=torch.long)
                 distance = octaves[number].expand(len(boxes)).clone()
                 at = torch.tensor([index]), fixations[number : number + 1]
-                parts.append(Samples(boxes, seen.scores[0, seen.mask[0]], distance, labels, look, *at))
-        return Samples.join(parts)
+                samples.append(Samples(boxes, detections.scores[0, detections.mask[0]], distance, labels, look, *at))
+        return Samples.join(samples)
 
 
 def choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> Tensor:

@@ -147,18 +147,25 @@ def unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> li
     Returns:
         The gists of the looks; None for a look without one.
     """
-    full, found = (column.tolist() for column in tensors["gist.counts"].unbind(1))
-    parts = (tensors[f"gist.{name}"].split(full) for name in ("cells", "scores", "sizes"))
-    told = zip(windows, tensors["gist.frames"].tolist(), *parts, tensors["gist.found"].split(found), strict=True)
+    cell_counts, found_counts = (column.tolist() for column in tensors["gist.counts"].unbind(1))
+    looks = zip(
+        windows,
+        tensors["gist.frames"].tolist(),
+        tensors["gist.cells"].split(cell_counts),
+        tensors["gist.scores"].split(cell_counts),
+        tensors["gist.sizes"].split(cell_counts),
+        tensors["gist.found"].split(found_counts),
+        strict=True,
+    )
     kinds = tensors["gist.scores"].shape[-1]
     gists: list[Gist | None] = []
-    for window, (scale, rows, columns), cells, scores, sizes, seen in told:
+    for window, (scale, rows, columns), cells, scores, sizes, found in looks:
         if not scale:
             gists.append(None)
             continue
         values, size = torch.zeros(rows * columns, kinds), torch.zeros(rows * columns)
         sure = torch.zeros(rows * columns * kinds, dtype=torch.bool)
-        values[cells.long()], size[cells.long()], sure[seen.long()] = scores.float(), sizes.float(), True
+        values[cells.long()], size[cells.long()], sure[found.long()] = scores.float(), sizes.float(), True
         shape = rows, columns
         look = Gist(
             window.level, window.cells[:2], scale, values.view(*shape, -1), size.view(shape), sure.view(*shape, -1)

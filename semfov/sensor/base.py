@@ -186,8 +186,8 @@ class Sensor(nn.Module, ABC):
         Returns:
             The numbers among them with their names.
         """
-        told = {name: each for name, each in settings.items() if isinstance(each, int | float)}
-        return ", ".join(f"{name} {value:g}" for name, value in told.items())
+        numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
+        return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
 
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:

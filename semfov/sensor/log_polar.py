@@ -245,8 +245,8 @@ class LogPolar(Sensor):
     def look(self, state: LogPolarCanvas, gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         fixation, _ = fixations(gaze[None], state.levels[0])
-        seen = _sample(state.levels, fixation, state.retina)
-        return _project(seen, fixation, _size(state.levels[0]), state.retina)[0]
+        cortical = _sample(state.levels, fixation, state.retina)
+        return _project(cortical, fixation, _size(state.levels[0]), state.retina)[0]
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
@@ -277,16 +277,16 @@ def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
     # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
     place = (2 * (fixation[:, :, None, None] + offset) + 1) / finest.new_tensor(size) - 1
     rings, many = offset.shape[0], fixation.shape[1]
-    parts = []
+    by_level = []
     for level, first, weight in _shares(retina, size, finest.dtype, finest.device):
         if level >= len(levels):
             break
         last = first + len(weight)
         where = place[:, :, first:last].flatten(1, 2)
-        seen = F.grid_sample(levels[level], where, "bicubic", "border", align_corners=False)
-        seen = seen.unflatten(2, (many, last - first)) * weight[:, None]
-        parts.append(F.pad(seen, (0, 0, first, rings - last)))
-    return torch.stack(parts).sum(0).transpose(1, 2)
+        responses = F.grid_sample(levels[level], where, "bicubic", "border", align_corners=False)
+        responses = responses.unflatten(2, (many, last - first)) * weight[:, None]
+        by_level.append(F.pad(responses, (0, 0, first, rings - last)))
+    return torch.stack(by_level).sum(0).transpose(1, 2)
 
 
 def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: Retina) -> Tensor:
@@ -312,8 +312,8 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     whole = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
     whole = torch.cat([whole[..., -1:], whole, whole[..., :2]], -1).flatten(0, 1)
     where = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
-    seen = F.grid_sample(whole, where, "bicubic", "border", align_corners=True)
-    return seen.unflatten(0, (batch, many))
+    images = F.grid_sample(whole, where, "bicubic", "border", align_corners=True)
+    return images.unflatten(0, (batch, many))
 
 
 @constant
@@ -334,10 +334,10 @@ def _shares(
     """For each level of the pyramid that is read: its number, the first ring that reads it, and its weight by ring."""
     rings, top = retina.receptors(size)[0], retina.levels(size)
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
-    found = []
+    shares = []
     for level in range(top + 1):
         reading = [ring for ring in range(rings) if abs(levels[ring] - level) < 1]
         if reading:
             weight = [1 - abs(levels[ring] - level) for ring in range(reading[0], reading[-1] + 1)]
-            found.append((level, reading[0], torch.tensor(weight, dtype=torch.float64).to(device, dtype)))
-    return found
+            shares.append((level, reading[0], torch.tensor(weight, dtype=torch.float64).to(device, dtype)))
+    return shares

@@ -87,13 +87,13 @@ class MultiScaleFovea(Sensor):
         check_shape(image, "image", None, None, None, None)
         check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
         # A border of one pixel is black; it stands for everything that is farther outside.
-        found = [F.pad(image, (1, 1, 1, 1))]
+        means = [F.pad(image, (1, 1, 1, 1))]
         for scale in range(self.scales - 1):
             step = 2**scale
-            wider = F.pad(found[-1], (step, step, step, step))
+            wider = F.pad(means[-1], (step, step, step, step))
             wider = (wider[..., step:] + wider[..., :-step]) / 2
-            found.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
-        return tuple(found)
+            means.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
+        return tuple(means)
 
     def forward(self, image: Tensor | Planes, gaze: Tensor) -> Tensor:
         """Compute the crops around fixations.
@@ -146,14 +146,14 @@ class MultiScaleFovea(Sensor):
         fixation, _ = fixations(gaze, crops)
         windows = self.windows(fixation[:, 0])
         x, y = (torch.arange(n, dtype=crops.dtype, device=crops.device) + 0.5 for n in state.size)
-        shown = crops.new_zeros(len(crops), crops.shape[2], state.size[1], state.size[0])
+        picture = crops.new_zeros(len(crops), crops.shape[2], state.size[1], state.size[0])
         for scale in reversed(range(self.scales)):
             low, side = windows[:, scale, :2], self.side * 2**scale
             across, down = (2 * (place - low[:, axis, None]) / side - 1 for axis, place in enumerate((x, y)))
             where = torch.stack(torch.broadcast_tensors(across[:, None, :], down[:, :, None]), -1)
-            seen = F.grid_sample(crops[:, scale], where, "bilinear", "border", align_corners=False)
-            shown = torch.where((where.abs() <= 1).all(-1)[:, None], seen, shown)
-        return shown
+            crop = F.grid_sample(crops[:, scale], where, "bilinear", "border", align_corners=False)
+            picture = torch.where((where.abs() <= 1).all(-1)[:, None], crop, picture)
+        return picture
 
     def boxes_to_canvas(self, state: MultiScaleCanvas, gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
@@ -189,10 +189,10 @@ class MultiScaleFovea(Sensor):
         first = torch.minimum(torch.maximum(first, -reach), reach)
         whole = first.detach().floor()
         share = first - whole
-        taken = torch.arange(self.side, device=plane.device) * step
+        offsets = torch.arange(self.side, device=plane.device) * step
         places = []
         for axis, length in enumerate(sizes):
-            start = whole[..., axis, None].long() + taken
+            start = whole[..., axis, None].long() + offsets
             places.append([(start + more).clamp(0, length - 1) for more in (0, 1)])
         # Rows first: they are contiguous in memory.
         planes, image = plane.transpose(1, 2), torch.arange(len(plane), device=plane.device)[:, None, None]

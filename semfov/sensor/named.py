@@ -44,8 +44,8 @@ class NamedSensor:
             InputError: the sensor has no setting of such a name.
         """
         for name in changes:
-            known = ", ".join(self.make.names)
-            check(name in self.make.names, "sensor", f"settings of a {self.make.__name__} ({known})", name)
+            names = ", ".join(self.make.names)
+            check(name in self.make.names, "sensor", f"settings of a {self.make.__name__} ({names})", name)
         return {**self.settings, **changes}
 
 

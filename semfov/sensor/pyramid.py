@@ -156,10 +156,10 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     _check_image(image)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     lookup(convention, get_args(Convention), "pyramid convention")
-    found = [image]
+    pyramid = [image]
     for _ in range(levels):
-        found.append(reduce(found[-1], convention))
-    return tuple(found)
+        pyramid.append(reduce(pyramid[-1], convention))
+    return tuple(pyramid)
 
 
 @one_thread_if_small

@@ -82,7 +82,7 @@ def plot_belief(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_belief(scanpath), "belief.pdf")
     """
-    figure, (axes,) = make_figure(1, 1, width=5.6, height=4.6, layout="compressed", given=only(ax))
+    figure, (axes,) = make_figure(1, 1, width=5.6, height=4.6, layout="compressed", axes=only(ax))
     drawn = draw_belief(axes, scanpath, check_fixation(scanpath, fixation), target, _grey(scanpath, image))
     draw_scale(axes, drawn, f"probability of {_name(scanpath, target)}")
     return figure
@@ -120,18 +120,18 @@ def plot_belief_strip(
         save_figure(plot_belief_strip(scanpath, most=4, columns=2), "beliefs.pdf")
     """
     check(columns >= 1, "columns", "at least 1", columns)
-    shown, grey = choose_fixations(scanpath, most), _grey(scanpath, image)
-    columns = len(shown) if axes is not None else min(columns, len(shown))
-    rows = -(-len(shown) // columns)
+    fixations, grey = choose_fixations(scanpath, most), _grey(scanpath, image)
+    columns = len(fixations) if axes is not None else min(columns, len(fixations))
+    rows = -(-len(fixations) // columns)
     width, height = scanpath.grid.extent.tolist()
     size = max(2.6 * columns, 3.2) + 0.6, rows * (2.6 * height / width + 0.3)
-    figure, panels = make_figure(rows, columns, width=size[0], height=size[1], layout="compressed", given=axes)
-    used = panels[: len(shown)]
-    for panel, fixation in zip(used, shown, strict=True):
+    figure, panels = make_figure(rows, columns, width=size[0], height=size[1], layout="compressed", axes=axes)
+    used = panels[: len(fixations)]
+    for panel, fixation in zip(used, fixations, strict=True):
         drawn = draw_belief(panel, scanpath, fixation, target, grey)
         panel.set_title(f"fixation {fixation}: {panel.get_title()}", parse_math=False)
     draw_scale(used, drawn, f"probability of {_name(scanpath, target)}")
-    for panel in panels[len(shown) :]:
+    for panel in panels[len(fixations) :]:
         panel.remove()
     return figure
 
@@ -165,18 +165,20 @@ def plot_belief_bars(
     from matplotlib.figure import Figure
 
     posterior, name = class_posterior(scanpath, target).numpy(), _name(scanpath, target)
-    shown, grid = choose_fixations(scanpath, most), scanpath.grid
+    fixations, grid = choose_fixations(scanpath, most), scanpath.grid
     highest = max(float(posterior.max()), 1e-9)
     if axes is None:
-        figure = Figure(figsize=(3.3 * len(shown) + 0.4, 3.0), layout="constrained")
-        panels: list[Any] = [figure.add_subplot(1, len(shown), n + 1, projection="3d") for n in range(len(shown))]
+        figure = Figure(figsize=(3.3 * len(fixations) + 0.4, 3.0), layout="constrained")
+        panels: list[Any] = [
+            figure.add_subplot(1, len(fixations), n + 1, projection="3d") for n in range(len(fixations))
+        ]
     else:
-        check(len(axes) == len(shown), "axes", f"{len(shown)} axes, one for each fixation", len(axes))
+        check(len(axes) == len(fixations), "axes", f"{len(fixations)} axes, one for each fixation", len(axes))
         solid = all(hasattr(each, "bar3d") for each in axes)
         check(solid, "axes", 'axes with projection="3d"', "axes without it")
         figure, panels = root(axes[0]), list(axes)
     column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
-    for panel, fixation in zip(panels, shown, strict=True):
+    for panel, fixation in zip(panels, fixations, strict=True):
         bars = posterior[fixation]
         # Rows grow downwards in the picture and backwards in the plot.
         depth = grid.rows - 1 - row

@@ -101,13 +101,13 @@ def plot_curve_panels(
     check(len(panels) > 0, "panels", "at least one panel", 0)
     columns = len(panels) if axes is not None else columns
     rows = -(-len(panels) // columns)
-    figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5, given=axes)
+    figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5, axes=axes)
     for panel, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
         _draw(panel, curves, errors, band=0.15)
         panel.set(xlabel="gaze shifts", ylabel=label, title=title)
     for panel in every[len(panels) :]:
         panel.remove()
-    legend_of(figure, every[0], columns=3, given=axes is not None)
+    legend_of(figure, every[0], columns=3, inside=axes is not None)
     return figure
 
 
@@ -166,10 +166,10 @@ def _draw(axes: Axes, curves: _Curves, errors: _Curves | None, band: float, name
     axes.grid(alpha=0.3, linewidth=0.5)
 
 
-def legend_of(figure: Figure, axes: Axes, *, columns: int, given: bool) -> None:
-    """Draw the legend of axes below their figure, or inside the axes where the figure was given by the caller."""
+def legend_of(figure: Figure, axes: Axes, *, columns: int, inside: bool) -> None:
+    """Draw the legend of axes inside them, or below their figure."""
     lines, names = axes.get_legend_handles_labels()
-    if given:
+    if inside:
         axes.legend(lines, names)
     else:
         figure.legend(lines, names, loc="outside lower center", ncols=columns)
@@ -179,7 +179,7 @@ def _plot_curves(
     curves: _Curves, errors: _Curves | None, title: str, label: str, ax: Axes | None
 ) -> tuple[Figure, Axes]:
     check(len(curves) > 0, "curves", "at least one curve", 0)
-    figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, given=only(ax))
+    figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
     _draw(axes, curves, errors, band=0.15, named=highlighted(curves))
     axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     lines, names = axes.get_legend_handles_labels()

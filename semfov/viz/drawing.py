@@ -41,10 +41,10 @@ def photograph_of(record: Record, image: Tensor | None) -> Tensor:
     Raises:
         InputError: there is neither.
     """
-    shown = record.image if image is None else image
-    if shown is None:
+    picture = record.image if image is None else image
+    if picture is None:
         raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
-    return shown
+    return picture
 
 
 def check_fixation(scanpath: Scanpath, fixation: int) -> int:
@@ -84,10 +84,10 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
 def picture_array(image: Tensor, *, grey: bool = False) -> Any:
     """A picture `(3, h, w)` as an array for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
-    shown = image.detach().cpu().clamp(0, 1)
+    pixels = image.detach().cpu().clamp(0, 1)
     if grey:
-        shown = (shown * shown.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
-    return shown.permute(1, 2, 0).numpy()
+        pixels = (pixels * pixels.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
+    return pixels.permute(1, 2, 0).numpy()
 
 
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
@@ -152,29 +152,29 @@ def draw_cross(axes: Axes, point: Tensor) -> list[Artist]:
 
 
 def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6) -> list[Artist]:
-    """Draw the most confident detections of a look (`draw_seen`); labels do not cover the point of gaze."""
+    """Draw the most confident detections of a look (`draw_look`); labels do not cover the point of gaze."""
     width, height = scanpath.grid.extent.tolist()
     x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
     reach = 8 * per_point(axes)
     gaze = (x - reach, y - reach, x + reach, y + reach)
-    seen = seen_well(scanpath.detections[fixation], most)
-    return draw_seen(axes, seen, scanpath.classes, (width, height), target=scanpath.target, kept_free=[gaze])
+    detections = confident_detections(scanpath.detections[fixation], most)
+    return draw_look(axes, detections, scanpath.classes, (width, height), target=scanpath.target, obstacles=[gaze])
 
 
-def seen_well(detections: Detections, most: int) -> Detections:
+def confident_detections(detections: Detections, most: int) -> Detections:
     """The most confident detections of a look, a batch of one, without padding."""
     count = min(most, int((detections.confidence[0] >= CONFIDENT).sum()))
     return Detections(detections.boxes[:, :count], detections.scores[:, :count], detections.mask[:, :count]).to("cpu")
 
 
-def draw_seen(
+def draw_look(
     axes: Axes,
-    seen: Detections,
+    detections: Detections,
     classes: Sequence[str],
     frame: tuple[float, float],
     *,
     target: int | None = None,
-    kept_free: Sequence[LabelBox] = (),
+    obstacles: Sequence[LabelBox] = (),
 ) -> list[Artist]:
     """Draw detections, each labelled with its best class other than background.
 
@@ -182,23 +182,25 @@ def draw_seen(
 
     Args:
         axes: to draw in.
-        seen: the detections, a batch of one.
+        detections: the detections, a batch of one.
         classes: names of the classes, background first.
         frame: `(width, height)` of the picture.
         target: class whose detections have a colour of their own.
-        kept_free: rectangles that labels must not cover.
+        obstacles: rectangles that labels must not cover.
 
     Returns:
         The artists drawn.
     """
     tags: list[Tag] = []
     drawn: list[Artist] = []
-    for box, label, score in zip(seen.boxes[0], seen.labels[0].tolist(), seen.confidence[0].tolist(), strict=True):
+    for box, label, score in zip(
+        detections.boxes[0], detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True
+    ):
         colour = TARGET if label == target else OTHER
         x1, y1, x2, y2 = box.tolist()
         tags.append(Tag((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
         drawn += draw_boxes(axes, box[None], colour)
-    return [*drawn, *draw_tags(axes, tags, frame, kept_free)]
+    return [*drawn, *draw_tags(axes, tags, frame, obstacles)]
 
 
 class Tag(NamedTuple):
@@ -216,7 +218,7 @@ class Tag(NamedTuple):
 
 
 def draw_tags(
-    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], kept_free: Sequence[LabelBox], points: float = LABEL
+    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], points: float = LABEL
 ) -> list[Artist]:
     """Write the labels of boxes, so that none covers another; the figure must be laid out.
 
@@ -224,14 +226,14 @@ def draw_tags(
         axes: to draw in.
         tags: the labels.
         frame: `(width, height)` of the picture.
-        kept_free: rectangles that labels must not cover.
+        obstacles: rectangles that labels must not cover.
         points: font size.
 
     Returns:
         The texts.
     """
     sizes = [text_size(axes, tag.text, points) for tag in tags]
-    places = place_labels([tag.box for tag in tags], sizes, frame, kept_free)
+    places = place_labels([tag.box for tag in tags], sizes, frame, obstacles)
     return [
         axes.text(
             left,

@@ -95,49 +95,49 @@ class FixationFigure:
     ) -> None:
         self.scanpath = scanpath
         height = 4 * image.shape[-2] / image.shape[-1] + 0.3
-        self.figure, self.axes = make_figure(1, 3, width=12.6, height=height, layout="compressed", given=axes)
-        path, seen, believed = self.axes
+        self.figure, self.axes = make_figure(1, 3, width=12.6, height=height, layout="compressed", axes=axes)
+        path_axes, view_axes, belief_axes = self.axes
         if axes is None:
             # Hidden axes save the layout of ticks, a tenth of the time.
             for panel in self.axes:
                 panel.xaxis.set_visible(False)
                 panel.yaxis.set_visible(False)
-        draw_place(path, scanpath, image, boxes)
-        draw_legend(path, annotation_entries(scanpath, boxes))
-        self.view = draw_image(seen, view, scanpath.grid)
-        seen.set_title("what the eye sees")
+        draw_place(path_axes, scanpath, image, boxes)
+        draw_legend(path_axes, annotation_entries(scanpath, boxes))
+        self.view = draw_image(view_axes, view, scanpath.grid)
+        view_axes.set_title("what the eye sees")
         if scanpath.target is None:
-            self.belief = draw_semantic_map(believed, scanpath, 0, image)
+            self.belief = draw_semantic_map(belief_axes, scanpath, 0, image)
         else:
-            self.belief = draw_belief(believed, scanpath, 0, None, image)
+            self.belief = draw_belief(belief_axes, scanpath, 0, None, image)
         # `show` draws the cross of the gaze.
-        for line in list(believed.lines):
+        for line in list(belief_axes.lines):
             line.remove()
-        draw_scale(believed, self.belief, "probability")
-        path.set_title("fixation 0")
+        draw_scale(belief_axes, self.belief, "probability")
+        path_axes.set_title("fixation 0")
         lay_out(self.figure)
         if axes is None:
             # The layout does not change any more, and computing it again takes as long as drawing.
             self.figure.set_layout_engine("none")
-        self.path = path_of(path, scanpath)
+        self.path = path_of(path_axes, scanpath)
         self.changing: list[Artist] = []
 
     def show(self, fixation: int, view: Tensor) -> Figure:
         """Show a fixation, seen as `view` `(3, h, w)`."""
-        path, seen, believed = self.axes
+        path_axes, view_axes, belief_axes = self.axes
         for artist in self.changing:
             artist.remove()
         self.path.show(fixation)
-        path.set_title(f"fixation {fixation}")
+        path_axes.set_title(f"fixation {fixation}")
         self.view.set_data(picture_array(view))
-        self.changing = draw_gaze(seen, self.scanpath, fixation) + draw_gaze(believed, self.scanpath, fixation)
-        self.changing += draw_detections(seen, self.scanpath, fixation, MOST_BOXES)
+        self.changing = draw_gaze(view_axes, self.scanpath, fixation) + draw_gaze(belief_axes, self.scanpath, fixation)
+        self.changing += draw_detections(view_axes, self.scanpath, fixation, MOST_BOXES)
         if self.scanpath.target is None:
             values: Any = most_probable(self.scanpath, fixation)
-            believed.set_title(f"semantic map after fixation {fixation}")
-            self.changing += write_names(believed, self.scanpath, fixation)
+            belief_axes.set_title(f"semantic map after fixation {fixation}")
+            self.changing += write_names(belief_axes, self.scanpath, fixation)
         else:
             values = posterior_of(self.scanpath)[fixation]
-            believed.set_title(belief_title(self.scanpath, fixation), parse_math=False)
+            belief_axes.set_title(belief_title(self.scanpath, fixation), parse_math=False)
         self.belief.set_data(cell_table(self.scanpath.grid, values))
         return self.figure

@@ -55,7 +55,7 @@ def plot_head_path(
     check(1 <= count <= len(path), "looks", f"a number from 1 to {len(path)}", count)
     width, height = path.views.world.scene.extent.tolist()
     figure, (axes,) = make_figure(
-        1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", given=only(ax)
+        1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", axes=only(ax)
     )
     draw_path(axes, path, picture, count)
     axes.set_title(path.describe(), parse_math=False)
@@ -156,8 +156,8 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
     views = head_views(path, image)
     for look, action in enumerate(path.actions):
         figure = Figure(figsize=(7.2, high + 3.1), layout="constrained")
-        parts: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
-        above, below = parts
+        halves: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
+        above, below = halves
         axes = above.subplots()
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")

@@ -9,7 +9,7 @@ Point = tuple[float, float]
 
 
 def place_labels(
-    boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, taken: Sequence[LabelBox] = ()
+    boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
     """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
 
@@ -17,7 +17,7 @@ def place_labels(
         boxes: `(x1, y1, x2, y2)`, y growing downwards.
         sizes: `(width, height)` of each label.
         frame: `(width, height)` of the picture, which labels leave only if they do not fit.
-        taken: rectangles that labels must not cover.
+        obstacles: rectangles that labels must not cover.
 
     Returns:
         A rectangle `(x1, y1, x2, y2)` for each label, in their order.
@@ -25,7 +25,7 @@ def place_labels(
     >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
     [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
     """
-    placed: list[LabelBox] = list(taken)
+    placed: list[LabelBox] = list(obstacles)
     for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
         corners = [
             (x1, y1),
@@ -38,7 +38,7 @@ def place_labels(
         inside = [_into(x, y, width, height, frame) for x, y in corners]
         free = next((label for label in inside if not _covers_any(label, placed)), None)
         placed.append(free or _further(inside[0], placed))
-    return placed[len(taken) :]
+    return placed[len(obstacles) :]
 
 
 def place_numbers(points: Sequence[Point], sizes: Sequence[_Size], frame: _Size, reach: float) -> list[LabelBox | None]:
@@ -75,7 +75,7 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[_Size], frame: _Size,
 
 
 def place_within(
-    candidates: Sequence[Iterable[Point]], sizes: Sequence[_Size], frame: _Size, taken: Sequence[LabelBox] = ()
+    candidates: Sequence[Iterable[Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
     """Rectangles for labels whose middle may be at any of several points: at the first free one.
 
@@ -85,7 +85,7 @@ def place_within(
         candidates: for each label the possible middles, best first.
         sizes: `(width, height)` of each label.
         frame: `(width, height)` of the picture.
-        taken: rectangles that labels must not cover.
+        obstacles: rectangles that labels must not cover.
 
     Returns:
         A rectangle for each label, in their order.
@@ -93,12 +93,12 @@ def place_within(
     >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
     [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
     """
-    placed: list[LabelBox] = list(taken)
+    placed: list[LabelBox] = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x - width / 2, y - height / 2, width, height, frame) for x, y in points]
         free = next((label for label in inside if not _covers_any(label, placed)), None)
         placed.append(free or _further(inside[0], placed))
-    return placed[len(taken) :]
+    return placed[len(obstacles) :]
 
 
 def _around(point: Point, size: _Size, reach: float) -> Iterator[Point]:

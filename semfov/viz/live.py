@@ -58,18 +58,18 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
     picture = Image.fromarray(pixels.permute(1, 2, 0).cpu().numpy()).resize(size)
     across, down = size[0] / width, size[1] / height
 
-    def shown(box: Sequence[float]) -> _Box:
+    def to_drawing(box: Sequence[float]) -> _Box:
         """The box in pixels of the drawing."""
         x1, y1, x2, y2 = (c * s for c, s in zip(box, (across, down) * 2, strict=True))
         return min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2)
 
     if isinstance(moment, FoveaMoment):
-        _draw_gaze(picture, moment, (across, down), shown)
+        _draw_gaze(picture, moment, (across, down), to_drawing)
     elif isinstance(moment, WindowMoment):
-        _draw_windows(picture, moment, shown)
+        _draw_windows(picture, moment, to_drawing)
     draw = ImageDraw.Draw(picture)
     if moment.decision is not None and moment.decision.box is not None:
-        draw.rectangle(shown(moment.decision.box.tolist()), outline=FOUND, width=3)
+        draw.rectangle(to_drawing(moment.decision.box.tolist()), outline=FOUND, width=3)
     draw.rectangle((0, 0, size[0], 22), fill="black")
     # Pillow's own font has no such sign.
     draw.text((6, 2), text.replace("×", "x"), fill="white", font=ImageFont.load_default(14))
@@ -77,7 +77,7 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
 
 
 def _draw_gaze(
-    picture: Image.Image, moment: FoveaMoment, scale: tuple[float, float], shown: Callable[[Sequence[float]], _Box]
+    picture: Image.Image, moment: FoveaMoment, scale: tuple[float, float], to_drawing: Callable[[Sequence[float]], _Box]
 ) -> None:
     """Draw belief, gaze and closer look of a fovea."""
     from PIL import Image, ImageDraw
@@ -93,21 +93,21 @@ def _draw_gaze(
     if moment.closer is None:
         mark, here = draw.ellipse, (x - 9, y - 9, x + 9, y + 9)
     else:
-        left, top, right, bottom = shown(moment.closer.box.tolist())
+        left, top, right, bottom = to_drawing(moment.closer.box.tolist())
         mark, here = draw.rectangle, (left - 6, top - 6, right + 6, bottom + 6)
     mark(here, outline="white", width=5)
     mark(here, outline=GAZE, width=3)
 
 
-def _draw_windows(picture: Image.Image, moment: WindowMoment, shown: Callable[[Sequence[float]], _Box]) -> None:
+def _draw_windows(picture: Image.Image, moment: WindowMoment, to_drawing: Callable[[Sequence[float]], _Box]) -> None:
     """Draw the present and the next window, and the objects."""
     from PIL import ImageDraw
 
     draw = ImageDraw.Draw(picture)
     for box, sure in zip(moment.objects.boxes.tolist(), moment.confirmed.tolist(), strict=True):
-        draw.rectangle(shown(box), outline=FOUND if sure else TARGET, width=2)
-    draw.rectangle(shown(moment.next_window.region(moment.lattice)), outline=GAZE, width=1)
-    here = shown(moment.window.region(moment.lattice))
+        draw.rectangle(to_drawing(box), outline=FOUND if sure else TARGET, width=2)
+    draw.rectangle(to_drawing(moment.next_window.region(moment.lattice)), outline=GAZE, width=1)
+    here = to_drawing(moment.window.region(moment.lattice))
     draw.rectangle(here, outline="white", width=5)
     draw.rectangle(here, outline=GAZE, width=3)
 

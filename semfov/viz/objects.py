@@ -40,7 +40,7 @@ def object_entries(record: Record) -> list[LegendEntry]:
 def draw_objects(
     axes: Axes,
     record: Record,
-    kept_free: Sequence[LabelBox] = (),
+    obstacles: Sequence[LabelBox] = (),
     *,
     last: int | None = None,
     tagged: bool = True,
@@ -52,7 +52,7 @@ def draw_objects(
     Args:
         axes: axes that hold the picture.
         record: the record.
-        kept_free: rectangles that labels must not cover.
+        obstacles: rectangles that labels must not cover.
         last: number of the last look whose objects are drawn; None draws all.
         tagged: whether objects have labels.
     """
@@ -72,7 +72,7 @@ def draw_objects(
             draw_boxes(axes, Tensor([box]), colour, width=line)
             tags.append(Tag(box, text, colour))
     if tagged:
-        draw_tags(axes, tags[::-1][:_LABELLED], (width, height), kept_free, _SMALL if many else LABEL)
+        draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
 
 
 def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:

@@ -39,7 +39,7 @@ class GazePath:
 
     Attributes:
         numbers: text of each fixation's number; None where it did not fit.
-        taken: rectangles that the numbers occupy.
+        number_boxes: rectangles that the numbers occupy.
     """
 
     def __init__(self, axes: Axes, fixations: FixationValues, frame: tuple[float, float], *, found: bool) -> None:
@@ -66,7 +66,7 @@ class GazePath:
         sizes = [((0.64 * len(str(n)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale) for n in range(count)]
         points = [(float(x), float(y)) for x, y in self.path]
         places = place_numbers(points, sizes, self.frame, 60 * scale)
-        self.taken: list[LabelBox] = [place for place in places if place is not None]
+        self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
         written: list[Annotation | None] = []
         for number, (point, place) in enumerate(zip(points, places, strict=True)):
             if place is None:

@@ -33,7 +33,7 @@ def plot_roc(scores: Mapping[str, Tensor], present: Tensor, *, axes: Sequence[Ax
 
     >>> figure = plot_roc({"one look": torch.tensor([0.9, 0.4, 0.1])}, torch.tensor([True, True, False]))
     """
-    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed", given=axes)
+    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed", axes=axes)
     for panel, widest in zip(panels, (1.0, 0.1), strict=True):
         for (name, score), colour, line in zip(
             scores.items(), COLOURS * len(scores), LINES * len(scores), strict=False

@@ -37,7 +37,7 @@ def plot_reliability(
     >>> probabilities = torch.rand(200, 3).softmax(-1)
     >>> figure = plot_reliability({"random": (probabilities, torch.randint(3, (200,)))}, bins=5)
     """
-    figure, (above, below) = make_figure(2, 1, width=4.4, height=5.4, ratios=[3, 1], given=axes)
+    figure, (above, below) = make_figure(2, 1, width=4.4, height=5.4, ratios=[3, 1], axes=axes)
     above.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
     for order, (name, (probabilities, labels)) in enumerate(predictions.items()):
         confidence, predicted = probabilities.detach().cpu().max(-1)
@@ -84,14 +84,14 @@ def plot_cell_reliability(
     >>> figure = plot_cell_reliability(panels, errors, groups="cells")
     """
     shape = (2, -(-(len(panels) + 1) // 2)) if axes is None else (1, len(panels) + 1)
-    figure, every = make_figure(*shape, width=8.4, height=7.2, given=axes)
+    figure, every = make_figure(*shape, width=8.4, height=7.2, axes=axes)
     styles = {name: line_style(order, len(errors)) for order, name in enumerate(errors)}
     for panel, (title, beliefs) in zip(every, panels.items(), strict=False):
         panel.plot([1e-4, 1 - 1e-4], [1e-4, 1 - 1e-4], color="0.6", linewidth=1)
         for name, bins in beliefs.items():
             count, probability, right = bins.cpu().numpy()
-            shown = (count >= 20) & (right > 0) & (right < count)
-            at, share = probability[shown] / count[shown], right[shown] / count[shown]
+            filled = (count >= 20) & (right > 0) & (right < count)
+            at, share = probability[filled] / count[filled], right[filled] / count[filled]
             panel.plot(at, share, marker="o", markersize=3, label=name, **styles[name])
         for set_scale, set_ticks in ((panel.set_xscale, panel.set_xticks), (panel.set_yscale, panel.set_yticks)):
             set_scale("logit")
@@ -107,7 +107,7 @@ def plot_cell_reliability(
     last.grid(alpha=0.3, linewidth=0.5)
     for panel in every[len(panels) + 1 :]:
         panel.remove()
-    legend_of(figure, every[0], columns=len(errors), given=axes is not None)
+    legend_of(figure, every[0], columns=len(errors), inside=axes is not None)
     return figure
 
 

@@ -53,13 +53,13 @@ def plot_saliency(
     height, width = image.shape[-2:]
     panels = 2 if grid is None else 3
     size = 3.4 * panels + 0.6, 3.4 * height / width + 0.35
-    figure, every = make_figure(1, panels, width=size[0], height=size[1], layout="compressed", given=axes)
+    figure, every = make_figure(1, panels, width=size[0], height=size[1], layout="compressed", axes=axes)
     draw_image(every[0], image, grid or Grid(1, 1, (width, height)))
     every[0].set_title("photograph")
     values = saliency.detach().cpu()
-    shown = every[1].imshow(values.numpy(), extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
+    drawn = every[1].imshow(values.numpy(), extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
     every[1].set(xticks=[], yticks=[], title=title)
-    draw_scale(every[1], shown, "")
+    draw_scale(every[1], drawn, "")
     if grid is not None:
         cells = cell_saliency(values[None], grid.columns, grid.rows, reduction)[0]
         draw_cells(every[2], grid, cells, cmap=PROBABILITY, vmin=0)

@@ -71,14 +71,14 @@ def plot_scanpath(
         return _plot_person(scanpath, image, boxes, ax)
     image = photograph_of(scanpath, image)
     height = 6.4 * image.shape[-2] / image.shape[-1] + 0.6
-    figure, (axes,) = make_figure(1, 1, width=6.4, height=height, layout="compressed", given=only(ax))
+    figure, (axes,) = make_figure(1, 1, width=6.4, height=height, layout="compressed", axes=only(ax))
     draw_place(axes, scanpath, image, boxes)
     axes.set_title(scanpath.describe(), parse_math=False)
     draw_legend(axes, [*annotation_entries(scanpath, boxes), *(object_entries(scanpath) if objects else [])])
     lay_out(figure)
     path = path_of(axes, scanpath)
     if objects:
-        draw_objects(axes, scanpath, path.taken)
+        draw_objects(axes, scanpath, path.number_boxes)
     return figure
 
 
@@ -88,7 +88,7 @@ def _plot_person(fixations: Fixations, image: Tensor | None, boxes: Tensor | Non
         raise InputError("image: expected the photograph, as fixations of people hold none, got None")
     width, height = fixations.size
     tall = 6.4 * height / width + 0.6
-    figure, (axes,) = make_figure(1, 1, width=6.4, height=tall, layout="compressed", given=only(ax))
+    figure, (axes,) = make_figure(1, 1, width=6.4, height=tall, layout="compressed", axes=only(ax))
     draw_image(axes, image, Grid(1, 1, fixations.size))
     if boxes is None and fixations.box is not None:
         boxes = Tensor([fixations.box])
@@ -135,15 +135,15 @@ def plot_foveated_strip(
     """
     views = views_of(scanpath, views)
     check(columns >= 1, "columns", "at least 1", columns)
-    shown = choose_fixations(scanpath, most)
-    columns = len(shown) if axes is not None else min(columns, len(shown))
-    rows = -(-len(shown) // columns)
+    fixations = choose_fixations(scanpath, most)
+    columns = len(fixations) if axes is not None else min(columns, len(fixations))
+    rows = -(-len(fixations) // columns)
     height = rows * (2.6 * views[0].shape[-2] / views[0].shape[-1] + 0.3)
-    figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", given=axes)
-    used = list(zip(panels, shown, strict=False))
+    figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
+    used = list(zip(panels, fixations, strict=False))
     for panel, fixation in used:
         draw_view(panel, scanpath, fixation, views[fixation])
-    for panel in panels[len(shown) :]:
+    for panel in panels[len(fixations) :]:
         panel.remove()
     _label_views(figure, scanpath, used)
     return figure
@@ -185,9 +185,9 @@ def plot_episode(
     from matplotlib.figure import Figure
 
     image, views = photograph_of(scanpath, image), views_of(scanpath, views)
-    shown = choose_fixations(scanpath, most)
+    fixations = choose_fixations(scanpath, most)
     aspect = image.shape[-2] / image.shape[-1]
-    width = 2.5 * len(shown) + 5.8
+    width = 2.5 * len(fixations) + 5.8
     place: Any = figure or Figure(figsize=(width, 2 * 2.5 * aspect + 0.9), layout="constrained")
     sides: Any = place.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
     left, right = sides
@@ -195,8 +195,8 @@ def plot_episode(
     draw_place(first, scanpath, image, boxes)
     first.set_title(scanpath.describe(), parse_math=False)
     draw_legend(first, annotation_entries(scanpath, boxes))
-    panels = right.subplots(2, len(shown), squeeze=False)
-    for (above, below), fixation in zip(panels.T, shown, strict=True):
+    panels = right.subplots(2, len(fixations), squeeze=False)
+    for (above, below), fixation in zip(panels.T, fixations, strict=True):
         draw_view(above, scanpath, fixation, views[fixation])
         if scanpath.target is None:
             drawn = draw_semantic_map(below, scanpath, fixation, image)
@@ -204,10 +204,10 @@ def plot_episode(
             drawn = draw_belief(below, scanpath, fixation, None, image)
     draw_scale(list(panels.flat), drawn, "probability")
     whole = root(first)
-    _label_views(whole, scanpath, zip(panels[0], shown, strict=True))
+    _label_views(whole, scanpath, zip(panels[0], fixations, strict=True))
     path_of(first, scanpath)
     if scanpath.target is None:
-        for below, fixation in zip(panels[1], shown, strict=True):
+        for below, fixation in zip(panels[1], fixations, strict=True):
             write_names(below, scanpath, fixation)
     return whole
 

@@ -84,7 +84,7 @@ def plot_semantic_map(
     image = scanpath.image if image is None else image
     width, height = grid.extent.tolist()
     size = 12.4, 5.6 * height / width + 0.5
-    figure, (named, unsure) = make_figure(1, 2, width=size[0], height=size[1], layout="compressed", given=axes)
+    figure, (named, unsure) = make_figure(1, 2, width=size[0], height=size[1], layout="compressed", axes=axes)
     drawn = draw_semantic_map(named, scanpath, fixation, image)
     draw_scale(named, drawn, "probability of the most probable object")
     if image is not None:
@@ -155,7 +155,7 @@ def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]
     6
     """
     cells, edges = set(region), grid.edges.tolist()
-    found = []
+    lines = []
     for cell in region:
         column, (x1, y1, x2, y2) = cell % grid.columns, edges[cell]
         sides = (
@@ -164,8 +164,8 @@ def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]
             (cell - grid.columns, [(x1, y1), (x2, y1)]),
             (cell + grid.columns, [(x1, y2), (x2, y2)]),
         )
-        found += [line for beside, line in sides if beside not in cells]
-    return found
+        lines += [line for beside, line in sides if beside not in cells]
+    return lines
 
 
 def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
@@ -190,10 +190,10 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
     """
     grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)
-    known = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
-    best = torch.where(known, label + 1, 0)
-    found = regions(best.reshape(grid.rows, grid.columns))
-    named = [(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max())) for cells in found]
+    sure = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
+    best = torch.where(sure, label + 1, 0)
+    groups = regions(best.reshape(grid.rows, grid.columns))
+    named = [(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max())) for cells in groups]
     return sorted(named, key=lambda region: -len(region[1]))
 
 
@@ -210,7 +210,7 @@ def regions(labels: Tensor) -> list[list[int]]:
     [[0, 1, 4, 5], [3]]
     """
     rows, columns = labels.shape
-    flat, seen, found = labels.flatten().tolist(), set[int](), []
+    flat, seen, groups = labels.flatten().tolist(), set[int](), []
     for first in range(len(flat)):
         if flat[first] == 0 or first in seen:
             continue
@@ -225,5 +225,5 @@ def regions(labels: Tensor) -> list[list[int]]:
             same = {other for other in near if flat[other] == flat[first]}
             seen |= same
             todo += same
-        found.append(sorted(region))
-    return found
+        groups.append(sorted(region))
+    return groups

@@ -99,7 +99,7 @@ def make_figure(
     height: float,
     ratios: Sequence[float] | None = None,
     layout: Literal["constrained", "compressed"] = "constrained",
-    given: Sequence[Axes] | None = None,
+    axes: Sequence[Axes] | None = None,
 ) -> tuple[Figure, list[Axes]]:
     """Make a figure of `width` × `height` inches without a window, or use the given axes.
 
@@ -112,7 +112,7 @@ def make_figure(
         height: in inches.
         ratios: relative heights of the rows.
         layout: layout engine of matplotlib.
-        given: axes to use instead of a new figure.
+        axes: axes to use instead of a new figure.
 
     Returns:
         The figure, and its axes row by row.
@@ -122,8 +122,8 @@ def make_figure(
     """
     from matplotlib.figure import Figure
 
-    if given is not None:
-        every = list(given)
+    if axes is not None:
+        every = list(axes)
         check(len(every) == rows * columns, "axes", f"{rows * columns} axes", len(every))
         return root(every[0]), every
     figure = Figure(figsize=(width, height), layout=layout)

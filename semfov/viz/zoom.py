@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_SHOWN = 15  # largest number of detections of a window that are drawn
+_MOST_DETECTIONS = 15  # largest number of detections of a window that are drawn
 
 
 @styled
@@ -50,14 +50,14 @@ def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None
     image = photograph_of(path, image)
     width, height = path.size
     size = 7.2, 7.2 * height / width + 0.6
-    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
+    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", axes=only(ax))
     draw_image(axes, image, Grid(1, 1, (width, height)))
-    taken = draw_windows(axes, path)
+    number_boxes = draw_windows(axes, path)
     axes.set_title(path.describe(), parse_math=False)
-    windows = [(GAZE, "-", "windows of the looks")] if taken else []
+    windows = [(GAZE, "-", "windows of the looks")] if number_boxes else []
     draw_legend(axes, [*windows, *object_entries(path)])
     lay_out(figure)
-    draw_objects(axes, path, taken)
+    draw_objects(axes, path, number_boxes)
     return figure
 
 
@@ -66,7 +66,7 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
     from matplotlib.patches import Rectangle
 
     width, height = path.size
-    taken: list[tuple[float, float]] = []
+    numbers: list[tuple[float, float]] = []
     room = 0.025 * width
     for look in path:
         x1, y1, x2, y2 = look.region
@@ -74,14 +74,16 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
             continue
         style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
-        place = _free(look.region, taken, room)
-        taken.append(place)
+        place = _free(look.region, numbers, room)
+        numbers.append(place)
         axes.text(*place, str(look.number), color="white", fontsize=6, ha="center", va="center",
                   bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
-    return [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in taken]
+    return [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in numbers]
 
 
-def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
+def _free(
+    box: tuple[float, float, float, float], numbers: list[tuple[float, float]], room: float
+) -> tuple[float, float]:
     """Position `(x, y)` for the number of a window: the corner farthest from other numbers, or the middle."""
     x1, y1, x2, y2 = box
     left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
@@ -89,7 +91,7 @@ def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float
 
     def far(place: tuple[float, float]) -> float:
         # Distances beyond the width of a number count the same, so that the first free corner is taken.
-        return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
+        return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in numbers)])
 
     return max(places, key=far)
 
@@ -163,19 +165,19 @@ def _frames(path: Record, image: Tensor) -> Iterator[Figure]:
         figure, (whole, window) = make_figure(1, 2, width=4.8 + 1.15 * high, height=high + 0.4, layout="compressed")
         for axes in (whole, window):
             draw_image(axes, image, Grid(1, 1, (width, height)))
-        taken = draw_windows(whole, path, look.number)
+        number_boxes = draw_windows(whole, path, look.number)
         whole.set_title(f"look {look.number}")
         x1, y1, x2, y2 = look.region
         window.set(xlim=(x1, x2), ylim=(y2, y1), title="its window and detections")
         lay_out(figure)
-        draw_objects(whole, path, taken, last=look.number, tagged=False)
-        seen = look.detections
-        sure = seen.confidence[0] >= CONFIDENT
-        boxes, labels = seen.boxes[0][sure][:_SHOWN], seen.labels[0][sure].tolist()
+        draw_objects(whole, path, number_boxes, last=look.number, tagged=False)
+        detections = look.detections
+        sure = detections.confidence[0] >= CONFIDENT
+        boxes, labels = detections.boxes[0][sure][:_MOST_DETECTIONS], detections.labels[0][sure].tolist()
         draw_boxes(window, boxes, TARGET)
         tags = [
             Tag(tuple(box), f"{path.classes[label]} {score:.2f}", TARGET)
-            for box, label, score in zip(boxes.tolist(), labels, seen.confidence[0][sure].tolist(), strict=False)
+            for box, label, score in zip(boxes.tolist(), labels, detections.confidence[0][sure].tolist(), strict=False)
         ]
         draw_tags(window, tags, (x2, y2), [])
         yield figure

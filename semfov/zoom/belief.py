@@ -233,7 +233,7 @@ class ZoomBelief:
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
-        return torch.from_numpy(self._known(level).copy())
+        return torch.from_numpy(self._level_odds(level).copy())
 
     def chances(self, level: int) -> Cells:
         r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
@@ -250,10 +250,10 @@ class ZoomBelief:
         Returns:
             `(down, across)`.
         """
-        probability: Cells = torch.from_numpy(self._known(level)).sigmoid().numpy()
+        probability: Cells = torch.from_numpy(self._level_odds(level)).sigmoid().numpy()
         return probability * self.unseen(level)
 
-    def _known(self, level: int) -> Cells:
+    def _level_odds(self, level: int) -> Cells:
         if self._odds is None:
             self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.gists, self.left.numpy())
         return self._odds.update()[level]
@@ -279,8 +279,8 @@ class ZoomBelief:
             )
             pooled, summary = pool(look.scores, box)
             with torch.no_grad():
-                known = None if value is None or look.level == 0 else value
-                value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, known)
+                before = None if value is None or look.level == 0 else value
+                value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, before)
         self._odds_of[window] = float("-inf") if value is None else float(value)
         return self._odds_of[window]
 

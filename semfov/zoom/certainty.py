@@ -61,7 +61,7 @@ class Certainty:
     >>> certainty = Certainty.of([0.0, 1.0])
     >>> certainty.probability(torch.eye(len(FACTS))[:2])
     tensor([0.7311, 0.5000])
-    >>> Certainty.of([0.0, 1.0]).unseen(10.0, promised=5.0, shown=3.0)
+    >>> Certainty.of([0.0, 1.0]).unseen(10.0, promised=5.0, discoveries=3.0)
     (0.0, 0.0)
     """
 
@@ -107,25 +107,25 @@ class Certainty:
         """
         return (self.offset + facts @ facts.new_tensor(self.weights)).sigmoid()
 
-    def unseen(self, expected: float, *, promised: float, shown: float) -> tuple[float, float]:
+    def unseen(self, expected: float, *, promised: float, discoveries: float) -> tuple[float, float]:
         """How many objects further looks would show.
 
         Args:
             expected: R, the number of objects that the evidence expects further looks to show.
             promised: W, the number that it expected of the looks after the first.
-            shown: F, the number that they have shown.
+            discoveries: F, the number that they have shown.
 
         Returns:
             The expected number, and its variance.
         """
         if math.isinf(self.strength):
             return self.scale * expected, self.scale * expected
-        scale = (self.strength * self.scale + shown) / (self.strength + promised)
+        scale = (self.strength * self.scale + discoveries) / (self.strength + promised)
         return scale * expected, scale * expected * (1 + expected / (self.strength + promised))
 
 
 def object_facts(
-    kept: Tensor,
+    index: Tensor,
     boxes: Tensor,
     scores: Tensor,
     labels: Tensor,
@@ -145,7 +145,7 @@ def object_facts(
     not at its border.
 
     Args:
-        kept: `(M,)`, indices of the boxes that were kept as objects.
+        index: `(M,)`, indices of the boxes that stand for objects.
         boxes: `(L, 4)`, all boxes of all looks, in picture pixels.
         scores: `(L,)`, their scores.
         labels: `(L,)`, their classes.
@@ -166,13 +166,13 @@ def object_facts(
         object of its class, lies in one, and contains one, times the score of that object; `rival` how far it overlaps
         a better object of another class. `octaves` is the distance to the largest magnification.
     """
-    count = len(kept)
+    count = len(index)
     if not count:
         return scores.new_zeros(0, len(FACTS))
     corners, value, label, look, broken, view, scale = (
         each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
     )
-    chosen, scale = kept.numpy(), scale.astype(np.float32)
+    chosen, scale = index.numpy(), scale.astype(np.float32)
     first, second, shared, area = _pairs(corners)
     union = area[first] + area[second] - shared
     overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
@@ -187,9 +187,9 @@ def object_facts(
     best_of = np.zeros((count, len(view)), np.float32)
     best_of[np.arange(count), look[chosen]] = value[chosen]
     np.maximum.at(best_of, (place[first[shows]], look[second[shows]]), value[second[shows]])
-    seen_by, side = _visible(corners[chosen], view, scale, size, latest=latest)
-    shown = best_of > 0
-    usable = seen_by | shown
+    visible, side = _visible(corners[chosen], view, scale, size, latest=latest)
+    detected = best_of > 0
+    usable = visible | detected
     sharpness = np.where(usable, scale, 0)
     sharpest = sharpness.max(1)
     odds = _logit(best_of)
@@ -215,8 +215,8 @@ def object_facts(
         _logit(value[chosen]),
         best,
         np.where(sharpness >= sharpest[:, None] * (1 - 1e-6), odds, -np.inf).max(1),
-        np.log1p(shown.sum(1)),
-        np.log1p((seen_by & ~shown).sum(1)),
+        np.log1p(detected.sum(1)),
+        np.log1p((visible & ~detected).sum(1)),
         broken[chosen],
         extent,
         extent**2,

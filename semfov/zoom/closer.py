@@ -10,7 +10,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance, Glances, Window, around
 from semfov.zoom.lattice import Lattice
 
@@ -101,7 +101,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
     def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
         self._target, self.likely = target, likely
-        self._shown: list[_Dated] = []
+        self._detections: list[_Dated] = []
         self._examined: list[tuple[int, Tensor]] = []  # with their frames
         self._frame = self._number = 0
 
@@ -111,9 +111,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._look, self._number = look, look.number
         scores = look.detections.scores[0, :, self._target]
-        shown = look.detections.mask[0] & (scores >= FOUND)
-        if bool(shown.any()):
-            self._shown.append(_Dated(self._frame, look.detections.boxes[0][shown], scores[shown]))
+        of_target = look.detections.mask[0] & (scores >= DETECTION_SCORE)
+        if bool(of_target.any()):
+            self._detections.append(_Dated(self._frame, look.detections.boxes[0][of_target], scores[of_target]))
 
     @property
     def detections(self) -> Detections:
@@ -163,7 +163,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Let a frame pass: forget boxes of which less than half the evidence is left."""
         self._frame += 1
         oldest = self._frame - self.forgetting.span
-        self._shown = [each for each in self._shown if each.frame >= oldest]
+        self._detections = [each for each in self._detections if each.frame >= oldest]
         self._examined = [(frame, box) for frame, box in self._examined if frame >= oldest]
 
     def probability(self, look: CloseUp) -> float:
@@ -175,11 +175,11 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def _boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target that count, and their scores `(M,)`, faded."""
-        if not self._shown:
+        if not self._detections:
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
-        faded = [each.scores * keep ** (self._frame - each.frame) for each in self._shown]
-        return torch.cat([each.boxes for each in self._shown]), torch.cat(faded)
+        faded = [each.scores * keep ** (self._frame - each.frame) for each in self._detections]
+        return torch.cat([each.boxes for each in self._detections]), torch.cat(faded)
 
     def _chance(self, score: float) -> float:
         """Probability that the target is where the highest score is this one."""

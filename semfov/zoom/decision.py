@@ -154,9 +154,9 @@ def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None 
         The decision: `found` or `undecided`, with the highest score.
     """
     best, box = 0.0, None
-    for seen in (look.detections for look in looks):
-        scores = seen.confidence[0].masked_fill(~seen.mask[0] | (seen.labels[0] != target), 0)
+    for detections in (look.detections for look in looks):
+        scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
         if len(scores) and float(scores.max()) > best:
-            best, box = float(scores.max()), seen.boxes[0, scores.argmax()]
+            best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
     found = best >= (SCORE if confirm is None else confirm)
     return Decision("found" if found else "undecided", best, None, box if found else None)

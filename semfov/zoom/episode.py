@@ -93,14 +93,14 @@ class _Recent(Generic[_Belief]):
         if again and glance.window == first:
             dated = [dated[-1], *dated[1:-1]]
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
-        kept = [
+        recent = [
             (when, look)
             for when, look in dated
             if look is glance or (look.window != glance.window and (look.window == first or frame - when <= span))
         ]
-        self._frames, self.looks = [when for when, _ in kept], [look for _, look in kept]
+        self._frames, self.looks = [when for when, _ in recent], [look for _, look in recent]
         self.renewed = frame + 1 - self._frames[0] > span
-        return len(kept) < len(dated) or again
+        return len(recent) < len(dated) or again
 
 
 def look_by_look(

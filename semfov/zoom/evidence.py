@@ -198,8 +198,8 @@ class GlimpseEvidence(Pretrained):
             own, slope, offset = own[:, one], slope[one], offset[one]
         value = slope * own + offset + through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
-        parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), value]
-        return torch.stack(parts, -1)
+        facts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), value]
+        return torch.stack(facts, -1)
 
     def odds(self, facts: Tensor, before: Tensor | None = None) -> Tensor:
         """Complete `presence` by the log odds of an earlier look.
@@ -212,8 +212,8 @@ class GlimpseEvidence(Pretrained):
             `(...)`, log odds.
         """
         own = facts[..., :1]
-        known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
-        inputs = torch.cat([facts[..., :5], known, torch.full_like(own, float(before is not None))], -1)
+        earlier = torch.zeros_like(own) if before is None else before.view_as(own) / 3
+        inputs = torch.cat([facts[..., :5], earlier, torch.full_like(own, float(before is not None))], -1)
         value: Tensor = facts[..., 5] + through(self.shape, inputs)[..., 0]
         return value
 
@@ -233,17 +233,17 @@ class GlimpseEvidence(Pretrained):
             InputError: a target is no class.
         """
         if not torch.compiler.is_compiling():
-            asked = targets.tolist()
-            check(min(asked) >= 1, "targets", "classes from 1 on", asked)
-        wanted = targets - 1
-        shown = torch.cat([look.best[..., None], look.scores.index_select(-1, wanted)], -1)
-        hints = features(shown.movedim(-1, 0))
+            classes = targets.tolist()
+            check(min(classes) >= 1, "targets", "classes from 1 on", classes)
+        columns = targets - 1
+        scores = torch.cat([look.best[..., None], look.scores.index_select(-1, columns)], -1)
+        hints = features(scores.movedim(-1, 0))
         best, own = hints[0], hints[1:]
-        found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)
+        detections = look.found.index_select(-1, columns).movedim(-1, 0).to(own)
         usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
         crowd = neighbourhood_mean(best[None], CROWD)[0]
-        parts = [*hint_maps(own, best, found, look.size, crowd), usual.expand_as(own), *memory_maps(own, before)]
-        value: Tensor = through(self.rate, torch.stack(parts, -1)) + (bias[..., None] - 6)
+        maps = [*hint_maps(own, best, detections, look.size, crowd), usual.expand_as(own), *memory_maps(own, before)]
+        value: Tensor = through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
@@ -362,8 +362,8 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
     """
     best = scores.amax(-1)
-    parts = torch.cat([best[None], (best > _levels(scores.dtype, scores.device)).to(best)])
-    found: dict[int, tuple[Tensor, Tensor]] = {}
+    maps = torch.cat([best[None], (best > _levels(scores.dtype, scores.device)).to(best)])
+    by_span: dict[int, tuple[Tensor, Tensor]] = {}
     top, have = scores, (1, 1)
     for span in sorted(spans):
         size = min(span, scores.shape[0]), min(span, scores.shape[1])
@@ -371,10 +371,10 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
             top = _slide(top, axis, size[axis], have[axis])
         have = size
         # A product of matrices would be faster, but not right after a pass of the detector.
-        means = F.avg_pool2d(F.avg_pool2d(parts, (size[0], 1), 1), (1, size[1]), 1)
+        means = F.avg_pool2d(F.avg_pool2d(maps, (size[0], 1), 1), (1, size[1]), 1)
         total, hinted, clear = (means * (size[0] * size[1])).unbind()
-        found[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
-    return [found[span] for span in spans]
+        by_span[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
+    return [by_span[span] for span in spans]
 
 
 @constant

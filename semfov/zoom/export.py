@@ -86,8 +86,8 @@ def export_look(
     graph = LookGraph(detector)
     canvas, frame, start = graph.window("picture", "fixation")
     boxes, confidence, vectors = _propose(graph, detector, canvas)
-    shown, scores = graph.selection(boxes, confidence, vectors, detector.selection)
-    placed, cut = graph.placed(shown, frame, "picture")
+    on_canvas, scores = graph.selection(boxes, confidence, vectors, detector.selection)
+    placed, cut = graph.placed(on_canvas, frame, "picture")
     window = graph.add("Slice", frame, graph.constant([0]), graph.constant([4]))
     outputs: dict[str, tuple[str, list[Any]]] = {
         "boxes": (placed, ["found", 4]),
@@ -98,12 +98,14 @@ def export_look(
     if evidence is not None:
         faint, values = graph.hints(boxes, confidence, vectors)
         hints = graph.placed(faint, frame, "picture")[0], values
-        seen = graph.gist(hints, (placed, scores), start, cells, kinds)
-        said = graph.append(_exported(_Saying(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(seen))
-        parts = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]
-        shapes = [[kinds + 1, STEPS, cells, cells], *([kinds, part, part] for part in parts)]
+        gist = graph.gist(hints, (placed, scores), start, cells, kinds)
+        predictions = graph.append(
+            _exported(_Predicting(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(gist)
+        )
+        sides = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]
+        shapes = [[kinds + 1, STEPS, cells, cells], *([kinds, side, side] for side in sides)]
         names = ["rates", *(f"odds_{step}" for step in range(1, STEPS + 1))]
-        outputs |= dict(zip(names, zip(said, shapes, strict=True), strict=True))
+        outputs |= dict(zip(names, zip(predictions, shapes, strict=True), strict=True))
     for name, (value, _) in outputs.items():
         graph.add("Identity", value)
         graph.name_last(name)
@@ -121,8 +123,8 @@ def export_look(
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
     )
-    told = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
-    model.metadata_props.add(key=LOOK_METADATA_KEY, value=json.dumps(told))
+    metadata = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
+    model.metadata_props.add(key=LOOK_METADATA_KEY, value=json.dumps(metadata))
     checker.check_model(model)
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(model.SerializeToString())
@@ -147,11 +149,11 @@ class _Decoding(nn.Module):
         self.detector, self.names = detector, names
 
     def forward(self, *outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        given = dict(zip(self.names, outputs, strict=True))
-        return _columns(self.detector.decode(given, self.detector.input_size), self.detector)
+        by_name = dict(zip(self.names, outputs, strict=True))
+        return _columns(self.detector.decode(by_name, self.detector.input_size), self.detector)
 
 
-class _Saying(nn.Module):
+class _Predicting(nn.Module):
     """Module that returns the predictions of evidence for a gist."""
 
     def __init__(self, evidence: GlimpseEvidence, cells: int) -> None:
@@ -161,18 +163,18 @@ class _Saying(nn.Module):
     def forward(self, strongest: Tensor, size: Tensor, found: Tensor) -> tuple[Tensor, ...]:
         look = Gist(0, (0, 0), 1, strongest, size, found > 0)
         classes = torch.arange(1, self.evidence.classes + 1)
-        said = [torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)])]
+        predictions = [torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)])]
         for step in range(1, STEPS + 1):
             span = self.cells >> step
             scores, summary = pool_all(strongest, span)
             odds = self.evidence.presence(scores, summary, torch.full((len(scores),), step))
             side = self.cells - span + 1
-            said.append(odds.mT.unflatten(-1, (side, side)))
-        return tuple(said)
+            predictions.append(odds.mT.unflatten(-1, (side, side)))
+        return tuple(predictions)
 
 
-def _columns(found: Candidates, detector: Detector) -> tuple[Tensor, Tensor, Tensor]:
-    return found.boxes, found.confidence, score_vectors(found, detector.background)
+def _columns(candidates: Candidates, detector: Detector) -> tuple[Tensor, Tensor, Tensor]:
+    return candidates.boxes, candidates.confidence, score_vectors(candidates, detector.background)
 
 
 def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, str, str]:
@@ -182,12 +184,12 @@ def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, st
         outputs = _network(graph, detector, canvas)
         raw = probe(detector.session, detector.input_size)
         decoding = _exported(_Decoding(detector, list(raw)), *raw.values())
-        found = graph.append(decoding, "head/", _named(outputs))
+        proposals = graph.append(decoding, "head/", _named(outputs))
     else:
-        found = graph.append(
+        proposals = graph.append(
             _exported(_Proposing(detector), torch.zeros(1, 3, high, wide)), "detector/", {"x_0": canvas}
         )
-    boxes, confidence, vectors = found
+    boxes, confidence, vectors = proposals
     return boxes, confidence, vectors
 
 
@@ -196,20 +198,20 @@ def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]
     import onnx
     from onnx import version_converter
 
-    wanted = detector.preprocessing
-    if wanted.channels == "bgr":
+    preprocessing = detector.preprocessing
+    if preprocessing.channels == "bgr":
         canvas = graph.add("Gather", canvas, graph.constant([2, 1, 0]), axis=1)
     factor, shift = (
-        torch.tensor([value / std for value, std in zip(values, wanted.std, strict=True)]).view(1, 3, 1, 1)
-        for values in ([wanted.scale] * 3, wanted.mean)
+        torch.tensor([value / std for value, std in zip(values, preprocessing.std, strict=True)]).view(1, 3, 1, 1)
+        for values in ([preprocessing.scale] * 3, preprocessing.mean)
     )
     image = graph.add("Sub", graph.add("Mul", canvas, graph.constant(factor)), graph.constant(shift))
     model = onnx.load(detector.session.path)
     constants = {constant.name for constant in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in constants]
     if len(inputs) != 1 or detector.session.shape[0] not in (None, 1):
-        told = ", ".join(f"{value.name!r}" for value in inputs)
-        raise InputError(f"detector: expected a network that takes one image and nothing else, got inputs {told}")
+        names = ", ".join(f"{value.name!r}" for value in inputs)
+        raise InputError(f"detector: expected a network that takes one image and nothing else, got inputs {names}")
     try:
         model = version_converter.convert_version(model, OPSET)
     except Exception as error:  # the converter raises errors of many kinds

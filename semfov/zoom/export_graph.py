@@ -8,7 +8,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.export_graph import Graph
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 
 OPSET = 18
 """The first opset whose `Resize` has antialiasing."""
@@ -40,10 +40,10 @@ class LookGraph(Graph):
         from onnx import compose, inliner
 
         model = compose.add_prefix(inliner.inline_local_functions(model), prefix)
-        given = {prefix + name: value for name, value in inputs.items()}
+        sources = {prefix + name: value for name, value in inputs.items()}
         for node in model.graph.node:
             for place, name in enumerate(node.input):
-                node.input[place] = given.get(name, name)
+                node.input[place] = sources.get(name, name)
         self.nodes += list(model.graph.node)
         self.constants |= {constant.name: constant for constant in model.graph.initializer}
         return [output.name for output in model.graph.output]
@@ -115,7 +115,7 @@ class LookGraph(Graph):
             classes = self.add("Slice", vectors, self.constant([1]), self.constant([2**31 - 1]), self.constant([2]))
             label = self.add("Cast", self.add("ArgMax", classes, axis=2, keepdims=1), to=_FLOAT)
             apart = self.add("Add", boxes, self.add("Mul", label, self.constant(4.0 * max(self.wide, self.high))))
-        kept = self.add(
+        rows = self.add(
             "NonMaxSuppression",
             apart,
             self.add("Unsqueeze", ranked, self.constant([1])),
@@ -123,7 +123,7 @@ class LookGraph(Graph):
             self.constant([chosen.iou]),
             self.constant([0.0]),
         )
-        index = self.add("Gather", kept, self.constant(2), axis=1)
+        index = self.add("Gather", rows, self.constant(2), axis=1)
         box, vector = (
             self.add("Gather", self.add("Squeeze", each, self.constant([0])), index) for each in (boxes, vectors)
         )
@@ -200,14 +200,16 @@ class LookGraph(Graph):
         size = self.add("Where", leads, self.add("Max", size, self.constant(0.0)), self.constant(0.0))
         size = self.add("ScatterElements", alone, at, size, axis=0, reduction="max")
         there, vector = detections
-        seen = self._scores(vector)
-        own = self.add("Equal", seen, self.add("ReduceMax", seen, self.constant([1]), keepdims=1))
-        sure = self.add("GreaterOrEqual", seen, self.constant(FOUND))
+        detection_scores = self._scores(vector)
+        own = self.add(
+            "Equal", detection_scores, self.add("ReduceMax", detection_scores, self.constant([1]), keepdims=1)
+        )
+        sure = self.add("GreaterOrEqual", detection_scores, self.constant(DETECTION_SCORE))
         found = self.add("Cast", self.add("And", own, sure), to=_FLOAT)
         found = self._strongest(nothing, self._cells(there, start, cells), found, classes)
         shapes = [cells, cells, classes], [cells, cells], [cells, cells, classes]
-        said = zip((strongest, size, found), shapes, strict=True)
-        strongest, size, found = (self.add("Reshape", value, self.constant(shape)) for value, shape in said)
+        pairs = zip((strongest, size, found), shapes, strict=True)
+        strongest, size, found = (self.add("Reshape", value, self.constant(shape)) for value, shape in pairs)
         return strongest, size, found
 
     def _cells(self, boxes: str, start: str, cells: int) -> str:

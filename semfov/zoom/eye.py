@@ -140,25 +140,25 @@ class WindowEye(nn.Module):
         canvas, frames = self._resample(view, fixations, within)
         exact, here = canvas.dtype == torch.uint8, canvas.device
         canvas = canvas.to(next(self.detector.parameters(), canvas).device)
-        seen = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
-        candidates = seen.precise()
+        proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
+        candidates = proposals.precise()
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
         place = _Placement(frames, view.picture.size, selected.boxes)
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
-        found = Detections(boxes, selected.scores, selected.mask).to(here)
-        found, cut = self._treat(found, place.cut(selected).to(here))
+        detections = Detections(boxes, selected.scores, selected.mask).to(here)
+        detections, cut = self._treat(detections, place.cut(selected).to(here))
         windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
-            return WindowLooks(found, cut, None, windows)
+            return WindowLooks(detections, cut, None, windows)
         faint = [hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
         placed = [
             Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
             for number, each in enumerate(faint)
         ]
-        return WindowLooks(found, cut, tuple(placed), windows)
+        return WindowLooks(detections, cut, tuple(placed), windows)
 
     def glimpse(
         self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -195,9 +195,9 @@ class WindowEye(nn.Module):
         fill = 255 * float(self.detector.fill)
         exact = abs(fill - round(fill)) < 1e-6
         blank = torch.tensor(round(fill), dtype=torch.uint8) if exact else torch.tensor(fill)
-        shown = [self._show(blank, view.picture, row, limit) for row, limit in zip(rows, limits, strict=True)]
-        canvases = [canvas for canvas, _ in shown]
-        return canvases[0] if len(canvases) == 1 else torch.cat(canvases), [frame for _, frame in shown]
+        pairs = [self._show(blank, view.picture, row, limit) for row, limit in zip(rows, limits, strict=True)]
+        canvases = [canvas for canvas, _ in pairs]
+        return canvases[0] if len(canvases) == 1 else torch.cat(canvases), [frame for _, frame in pairs]
 
     def _show(
         self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None
@@ -207,8 +207,8 @@ class WindowEye(nn.Module):
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
         x, y, magnification = fixation
         reduction = picture.reduction(1 / magnification)
-        x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right, reduction)
-        y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom, reduction)
+        x1, x2, u1, u2 = _window_pixels(x, magnification, wide, picture.size[0], left, right, reduction)
+        y1, y2, v1, v2 = _window_pixels(y, magnification, high, picture.size[1], top, bottom, reduction)
         canvas = resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(blank.dtype)
         if (u1, v1, u2, v2) != (0, 0, wide, high):
             pixels, canvas = canvas, blank.expand(1, 3, high, wide).contiguous(memory_format=torch.channels_last)
@@ -220,10 +220,10 @@ class WindowEye(nn.Module):
         if self.cut == "keep" or not bool(cut.any()):
             return detections, cut
         if self.cut == "drop":
-            kept = [detections.mask[n] & ~cut[n] for n in range(len(cut))]
+            masks = [detections.mask[n] & ~cut[n] for n in range(len(cut))]
             whole = [
-                Detections(detections.boxes[n : n + 1, keep], detections.scores[n : n + 1, keep], keep[keep][None])
-                for n, keep in enumerate(kept)
+                Detections(detections.boxes[n : n + 1, mask], detections.scores[n : n + 1, mask], mask[mask][None])
+                for n, mask in enumerate(masks)
             ]
             left = Detections.stack(whole)
             return left, torch.zeros_like(left.mask)
@@ -259,7 +259,7 @@ def _unit(canvases: Tensor) -> Tensor:
     return canvases.to(torch.get_default_dtype()).contiguous() / 255
 
 
-def _shown(
+def _window_pixels(
     point: float, magnification: float, count: int, length: int, low: float, high: float, step: int
 ) -> tuple[int, int, int, int]:
     """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import CELLS, Lattice
 from semfov.zoom.networks import features
@@ -84,7 +84,7 @@ class SearchFacts:
     @property
     def detected(self) -> bool:
         """Whether a detection shows the target, so that a search can name a box as found."""
-        return any(look.found >= FOUND for look in self.looks)
+        return any(look.found >= DETECTION_SCORE for look in self.looks)
 
     def case(self, ahead: float) -> Tensor:
         """Facts about the search for `GlimpseEvidence.anywhere`.
@@ -106,7 +106,7 @@ class SearchFacts:
         closest, named = max(look.closest for look in looks), max(look.named for look in looks)
         hints = features(torch.tensor([best, second, closest, looks[0].score, named, ahead], dtype=torch.float32))
         left = [math.log(self._left() + 1e-3) / 4, float(self.belief.left.mean())]
-        counts = [math.log1p(sum(look.score >= FOUND for look in looks)) / 2, math.log(len(looks)) / 2]
+        counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
         return torch.cat([hints, torch.tensor([*left, *counts])])
 
     def _left(self) -> float:

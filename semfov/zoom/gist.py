@@ -15,7 +15,7 @@ from semfov.zoom.lattice import Lattice
 FINEST = 32
 """Largest number of cells along a side of a gist."""
 
-FOUND = 0.1
+DETECTION_SCORE = 0.1
 """Score from which on a detection counts as a found object."""
 
 
@@ -73,8 +73,8 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     kinds, cells = hints.scores.shape[-1], rows * columns
     boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
     confident = scores.amax(-1)
-    told = detections.scores[0, :, 1:].detach().float().numpy()
-    sure = (told.max(1, initial=0) >= FOUND).nonzero()[0]
+    class_scores = detections.scores[0, :, 1:].detach().float().numpy()
+    sure = (class_scores.max(1, initial=0) >= DETECTION_SCORE).nonzero()[0]
     corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
     cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
     across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
@@ -88,7 +88,7 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     size = np.zeros(cells, np.float32)
     size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
     found = np.zeros((cells, kinds), np.bool_)
-    found[there, told[sure].argmax(1)] = True
+    found[there, class_scores[sure].argmax(1)] = True
     shape = rows, columns
     return Gist(
         level,

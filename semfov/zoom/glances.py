@@ -151,23 +151,23 @@ class LiveGlances(Glances):
         """Resample the windows and detect in them."""
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         hints = hints or any(_points_closer(window, self.lattice) for window in windows)
-        seen = self.eye.glance(self.view, fixations, [window.within for window in windows], hints=hints)
-        return [glance(seen, n, window, self.lattice) for n, window in enumerate(windows)]
+        looks = self.eye.glance(self.view, fixations, [window.within for window in windows], hints=hints)
+        return [glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
-def glance(seen: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
+def glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
-    detections = _only(seen.detections, number)
-    told = None
-    if seen.hints is None:
+    detections = _only(looks.detections, number)
+    look_gist = None
+    if looks.hints is None:
         scores = detections.scores[0, :, 1:]
     elif _points_closer(window, lattice):
-        told = gist(seen.hints[number], detections, lattice, (window.level, *window.cells[:2]))
-        scores = told.scores.flatten(0, 1)
+        look_gist = gist(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
+        scores = look_gist.scores.flatten(0, 1)
     else:
-        scores = seen.hints[number].scores
+        scores = looks.hints[number].scores
     show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
-    return Glance(window, detections, seen.cut[number, : detections.mask.shape[1]], show, told)
+    return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist)
 
 
 def _points_closer(window: Window, lattice: Lattice) -> bool:
@@ -179,5 +179,5 @@ def _only(looks: Detections, number: int) -> Detections:
     """Detections of one look, a batch of one without padding."""
     if len(looks.mask) == 1:
         return looks
-    kept, one = int(looks.mask[number].sum()), slice(number, number + 1)
-    return Detections(looks.boxes[one, :kept], looks.scores[one, :kept], looks.mask[one, :kept])
+    count, one = int(looks.mask[number].sum()), slice(number, number + 1)
+    return Detections(looks.boxes[one, :count], looks.scores[one, :count], looks.mask[one, :count])

@@ -45,8 +45,8 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint
     """
     confidence = candidates.confidence[image].detach()
     index = (confidence >= faint).nonzero()[:, 0]
-    kept = candidates.take(image, index)
-    boxes = kept.boxes.detach()
+    selected = candidates.take(image, index)
+    boxes = selected.boxes.detach()
     check_candidates(image, confidence, boxes)
-    check_scores(image, kept)
-    return Hints(boxes, shares(kept, policy)[1].detach())
+    check_scores(image, selected)
+    return Hints(boxes, shares(selected, policy)[1].detach())

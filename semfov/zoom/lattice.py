@@ -127,12 +127,12 @@ class Lattice:
     @cached_property
     def actions(self) -> Tensor:
         """All windows, `(N, 3)`: level, column and row of the first cell; the windows of a level row by row."""
-        parts = []
+        by_level = []
         for level in range(self.levels):
             across, down = self.places(level)
             row, column = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
-            parts.append(torch.stack([torch.full_like(row, level), column, row], -1).reshape(-1, 3))
-        return torch.cat(parts)
+            by_level.append(torch.stack([torch.full_like(row, level), column, row], -1).reshape(-1, 3))
+        return torch.cat(by_level)
 
     def __len__(self) -> int:
         """Number of windows of all levels."""

@@ -21,13 +21,13 @@ def features(scores: Tensor) -> Tensor:
     return (scores + _FLOOR).log().mul_(0.25).add_(1.5)
 
 
-def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
+def hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
     """List what a look shows about each cell.
 
     Args:
         own: `(T, rows, columns)`, features of the strongest hint of each target.
         best: `(rows, columns)`, the same of any class.
-        found: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
+        detections: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
         size: `(rows, columns)`, as in `semfov.zoom.gist.Gist`.
         crowd: `(rows, columns)`, means of `best` over the square of `CROWD` cells about each cell.
 
@@ -39,7 +39,7 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor, crowd: Ten
         return values.expand(own.shape)
 
     # One call for the peaks of both: after a pass of the detector a call costs more than the work in it.
-    peak, near = neighbourhood_peak(torch.cat([own, found]), 3).chunk(2)
+    peak, near = neighbourhood_peak(torch.cat([own, detections]), 3).chunk(2)
     return [
         own,
         wide(best),
@@ -49,7 +49,7 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor, crowd: Ten
         wide(crowd),
         wide(size / 4 - 1),
         wide((size > 0).to(own)),
-        found,
+        detections,
         near,
         wide(own.amax((-1, -2), keepdim=True)),
     ]
@@ -57,8 +57,8 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor, crowd: Ten
 
 def memory_maps(own: Tensor, before: Tensor | None) -> list[Tensor]:
     """What an earlier, coarser look predicted for each cell, and whether there was one, two maps like `own`."""
-    known = torch.full_like(own, -1.0) if before is None else before / 4
-    return [known, torch.full_like(own, float(before is not None))]
+    prediction = torch.full_like(own, -1.0) if before is None else before / 4
+    return [prediction, torch.full_like(own, float(before is not None))]
 
 
 def tapered(border: Tensor, span: int) -> Tensor:

@@ -26,19 +26,19 @@ def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance
     Returns:
         The looks with the detections that no later window of at least the same magnification has shown.
     """
-    kept = []
+    current = []
     for number, glance in enumerate(glances):
-        seen, left = glance.detections, glance.detections.mask[0]
-        low, high = seen.boxes[0].split(2, -1)
+        detections, left = glance.detections, glance.detections.mask[0]
+        low, high = detections.boxes[0].split(2, -1)
         around = (high - low) / 2
         low, high = (low - around).clamp(min=0), (high + around).minimum(low.new_tensor(lattice.size))
         for later in (each.window for each in glances[number + 1 :]):
             if later.fixation[2] >= glance.window.fixation[2]:
                 first, last = low.new_tensor(later.region(lattice)).split(2)
                 left = left & ~((low >= first) & (high <= last)).all(-1)
-        parts = (part[:, left] for part in (seen.boxes, seen.scores, seen.mask))
-        kept.append(replace(glance, detections=Detections(*parts), cut=glance.cut[left]))
-    return kept
+        remaining = Detections(detections.boxes[:, left], detections.scores[:, left], detections.mask[:, left])
+        current.append(replace(glance, detections=remaining, cut=glance.cut[left]))
+    return current
 
 
 def merge(
@@ -102,13 +102,12 @@ def merge_with_facts(
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
-    kept = unlike(boxes, scores, labels, looks, cut, sharpness)
+    index = unlike(boxes, scores, labels, looks, cut, sharpness)
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]
-    seen = windows, scale, lattice.size, finest
-    facts = object_facts(kept, boxes, scores, labels, looks, cut, *seen, latest=latest)
-    return Objects(boxes[kept], scores[kept], labels[kept], looks[kept]), facts
+    facts = object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
+    return Objects(boxes[index], scores[index], labels[index], looks[index]), facts
 
 
 def probable_objects(
@@ -138,8 +137,8 @@ def probable_objects(
     """
     objects = _probable(*merge_with_facts(glances, lattice, target, latest=latest), certainty)
     before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
-    shown = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
-    return objects, certainty.unseen(remaining, promised=promised, shown=shown)
+    discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
+    return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
 
 
 def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
@@ -151,15 +150,17 @@ def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
 def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> tuple[Tensor, ...]:
     """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications."""
     looks = [glance.detections for glance in glances]
-    seen = Detections(
-        *(torch.cat(parts, 1) for parts in zip(*((d.boxes, d.scores, d.mask) for d in looks), strict=True))
+    detections = Detections(
+        torch.cat([look.boxes for look in looks], 1),
+        torch.cat([look.scores for look in looks], 1),
+        torch.cat([look.mask for look in looks], 1),
     )
-    value, label = seen.confidence[0], seen.labels[0]
+    value, label = detections.confidence[0], detections.labels[0]
     classes = [target] if isinstance(target, int) else list(target or ())
     if classes:
-        value, best = seen.scores[0][:, classes].max(-1)
+        value, best = detections.scores[0][:, classes].max(-1)
         label = torch.tensor(classes)[best]
-    counts = torch.tensor([found.mask.shape[1] for found in looks])
+    counts = torch.tensor([look.mask.shape[1] for look in looks])
     number = torch.arange(len(looks)).repeat_interleave(counts)
     closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]
-    return seen.boxes[0], value, label, number, torch.cat([glance.cut for glance in glances]), closer
+    return detections.boxes[0], value, label, number, torch.cat([glance.cut for glance in glances]), closer

@@ -221,25 +221,25 @@ class WindowOdds:
 
     def _read(self, looks: Sequence[_Look]) -> None:
         """Compute the facts of the windows whose hints have changed, of all looks in one call of the network."""
-        parts = [part for look in looks for part in look.pool(self._left)]
-        if not parts:
+        pools = [pool for look in looks for pool in look.pool(self._left)]
+        if not pools:
             return
-        counts = [len(part.scores) for part in parts]
-        scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
-        steps = torch.from_numpy(np.repeat([part.step for part in parts], counts))
+        counts = [len(pool.scores) for pool in pools]
+        scores, summary = torch.cat([pool.scores for pool in pools]), torch.cat([pool.summary for pool in pools])
+        steps = torch.from_numpy(np.repeat([pool.step for pool in pools], counts))
         facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0].numpy()
-        for part, values in zip(parts, np.split(facts, np.cumsum(counts)[:-1]), strict=True):
-            part.facts[:] = values.reshape(part.facts.shape)
-            part.stale[:] = True
+        for pool, values in zip(pools, np.split(facts, np.cumsum(counts)[:-1]), strict=True):
+            pool.facts[:] = values.reshape(pool.facts.shape)
+            pool.stale[:] = True
 
     def _judge(self, look: _Look) -> None:
         """Compute the log odds of the windows of a look for which the facts or the log odds before have changed."""
         coarsest = look.gist.level == 0
         for level, table in () if coarsest else look.tables.items():
-            known = self._odds[level].take(table.places)
-            known[known == -np.inf] = _UNKNOWN
-            look.stale[table.rows] |= known != look.before[table.rows]
-            look.before[table.rows] = known
+            coarser = self._odds[level].take(table.places)
+            coarser[coarser == -np.inf] = _UNKNOWN
+            look.stale[table.rows] |= coarser != look.before[table.rows]
+            look.before[table.rows] = coarser
         rows = look.stale.nonzero()[0]
         if len(rows):
             before = None if coarsest else torch.from_numpy(look.before[rows])

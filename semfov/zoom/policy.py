@@ -162,13 +162,13 @@ def jointly(
     if count == 1:
         choice = choose(done)
         return [] if choice is None else [choice]
-    left, taken, chosen = belief.left.clone(), set(done), []
+    left, visited, chosen = belief.left.clone(), set(done), []
     for _ in range(count):
-        choice = choose(taken)
+        choice = choose(visited)
         if choice is None:
             break
         chosen.append(choice)
-        taken.add(choice[0])
+        visited.add(choice[0])
         belief.discount(choice[0])
     belief.restore(left)
     return chosen

@@ -74,7 +74,7 @@ def find_everything(
     belief = ZoomBelief(glances.lattice, evidence, target or 0)
 
     def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
-        chosen = jointly(lambda taken: best_find(belief, taken, belief.foresight), belief, done, batch)
+        chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
     yield from look_by_look(glances, best, belief, hints=False, forgetting=forgetting)

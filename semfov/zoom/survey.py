@@ -71,14 +71,14 @@ class Survey(nn.Module):
         """
         hints, best = features(look.scores), features(look.best)
         # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
-        found = look.found.to(best).amax(-1)
+        detections = look.found.to(best).amax(-1)
         mix = self.mix.weight
         kinds = torch.addmm(-_LOWEST * mix.sum(1, keepdim=True), mix, hints.flatten(0, 1).mT).unflatten(1, best.shape)
-        around = torch.cat([kinds, best[None], found[None]])
+        around = torch.cat([kinds, best[None], detections[None]])
         surroundings = [neighbourhood_mean(around, side) for side in _WIDE]
         crowd = surroundings[_WIDE.index(CROWD)][_CHANNELS]
-        parts = [*hint_maps(best[None], best, found[None], look.size, crowd), *memory_maps(best[None], before)]
-        maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, _NEAR), *surroundings])
+        best_maps = [*hint_maps(best[None], best, detections[None], look.size, crowd), *memory_maps(best[None], before)]
+        maps = torch.cat([*best_maps, kinds, neighbourhood_mean(kinds, _NEAR), *surroundings])
         value = through(self.rate, maps.movedim(0, -1)) - 6
         return value.clamp(max=3).movedim(-1, 0)[None]
 

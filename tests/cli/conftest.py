@@ -18,7 +18,7 @@ def run(agent, monkeypatch, capsys):
     """Runs the command in this process; returns its exit code and what it printed."""
     for module in (search, live):
         monkeypatch.setattr(module, "make_agent", lambda options: agent)
-        monkeypatch.setattr(module, "known_classes", lambda options: None)
+        monkeypatch.setattr(module, "detector_classes", lambda options: None)
 
     def run_command(*arguments):
         code = main.main(list(map(str, arguments)))

@@ -7,7 +7,7 @@ from torch import nn
 
 from semfov import ActivePerception
 from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.load import check_detector, known_name, load_detector
+from semfov.detection.load import check_detector, detector_name, load_detector
 from semfov.detection.onnx_twin import RUNTIMES
 from semfov.detection.placement import resize
 from semfov.errors import DataError, InputError
@@ -148,10 +148,10 @@ def test_a_detector_is_returned_as_it_is(small_cfg, write_weights):
 
 
 def test_names_are_the_same_in_upper_and_lower_case():
-    assert known_name("YOLOv3-Tiny") == "yolov3-tiny"
-    assert known_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
-    assert known_name("HF:Owner/Name") == "hf:Owner/Name"
-    assert known_name("Folder/Net.cfg") == "Folder/Net.cfg"
+    assert detector_name("YOLOv3-Tiny") == "yolov3-tiny"
+    assert detector_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
+    assert detector_name("HF:Owner/Name") == "hf:Owner/Name"
+    assert detector_name("Folder/Net.cfg") == "Folder/Net.cfg"
 
 
 @pytest.mark.parametrize("load", [load_detector, check_detector])

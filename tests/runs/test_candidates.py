@@ -22,7 +22,7 @@ from semfov.gaze.acquisition import (
 from semfov.runs import candidates
 from semfov.runs.candidates import Candidate, Models, belief_settings, load_models, make_strategy, needs_observation
 from semfov.runs.config import BeliefConfig, PolicyConfig
-from semfov.runs.presets import known_policies, presets, resolve
+from semfov.runs.presets import presets, resolve, valid_policies
 from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (40, 30))
@@ -84,7 +84,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
     assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
     without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
-    for name in known_policies("exploration"):
+    for name in valid_policies("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
         assert needs_model(None, given, task="exploration") == (name not in without)

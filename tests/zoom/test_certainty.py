@@ -158,12 +158,12 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
 
 def test_what_no_look_has_shown_is_negative_binomial():
     certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0)
-    mean, variance = certainty.unseen(6.0, promised=10.0, shown=3.0)
+    mean, variance = certainty.unseen(6.0, promised=10.0, discoveries=3.0)
     shape, rate = 4 * 0.5 + 3, 4 + 10
     law = nbinom(shape, rate / (rate + 6))
     assert mean == pytest.approx(law.mean())
     assert variance == pytest.approx(law.var())
-    assert certainty.unseen(0.0, promised=10.0, shown=3.0) == (0.0, 0.0)
+    assert certainty.unseen(0.0, promised=10.0, discoveries=3.0) == (0.0, 0.0)
     assert Certainty.of(certainty.numbers) == certainty
     with pytest.raises(InputError, match="certainty: expected 2 or 17 numbers, got 3"):
         Certainty.of([1.0, 2.0, 3.0])

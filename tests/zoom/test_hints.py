@@ -10,7 +10,7 @@ from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.detector import FAINT
 from semfov.errors import InputError
 from semfov.zoom import WindowEye
-from semfov.zoom.gist import FOUND
+from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.hints import hints_of
 
@@ -76,7 +76,7 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, faint,
     torch.testing.assert_close(look.scores, strongest, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(look.size, size, rtol=0, atol=1e-4)
     torch.testing.assert_close(glance.show, strongest.amax((0, 1)), rtol=1e-5, atol=1e-7)
-    found = glance.detections.scores[0, :, 1:].amax(-1) >= FOUND
+    found = glance.detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
     assert 0 < int(look.found.sum()) <= int(found.sum()) <= 20
 
 

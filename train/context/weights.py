@@ -67,7 +67,7 @@ def make_cases(
     for prior, index in tqdm(work, desc=f"context with {kind}", unit="scene", dynamic_ncols=True):
         place = places[index]
         looks = slice(index * config.fixations, (index + 1) * config.fixations)
-        seen, fixations = samples.seen(looks), samples.fixations[looks]
+        seen, fixations = samples.detections_of(looks), samples.fixations[looks]
         presence, cells = presence_of(seen, place.grid), place.grid.cell_of(fixations)
         for target in place.targets:
             goal = place.occupied[:, target]

@@ -80,8 +80,8 @@ class AnyBelief(Belief):
         beliefs = self.inner if len(self.inner) > 1 else self.inner * len(self.weights)
         return [(belief, index, weight) for belief, (index, weight) in zip(beliefs, self.weights.items(), strict=True)]
 
-    def _any(self, told: Callable[[Belief, int], Tensor]) -> Tensor:
-        missing = [1 - weight * told(belief, index) for belief, index, weight in self._each()]
+    def _any(self, probability: Callable[[Belief, int], Tensor]) -> Tensor:
+        missing = [1 - weight * probability(belief, index) for belief, index, weight in self._each()]
         return 1 - torch.stack(missing).prod(0)
 
 
@@ -111,7 +111,7 @@ class AnyOf(Observer):
             check_number(weight, "weights", 0, 1)
         self.observer = observer
         self.weights = {index: float(weight) for index, weight in weights.items() if weight > 0}
-        self._asked: list[int | None] = list(self.weights) if observer.by_target else [None]
+        self._targets: list[int | None] = list(self.weights) if observer.by_target else [None]
 
     @property
     def thresholds(self) -> Thresholds | None:
@@ -120,24 +120,24 @@ class AnyOf(Observer):
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> AnyBelief:
         """The first belief of the inner observer, for each class."""
-        inner = tuple(self.observer.start(batch, grid, like) for _ in self._asked)
+        inner = tuple(self.observer.start(batch, grid, like) for _ in self._targets)
         return AnyBelief(inner, self.weights, inner[0].closest)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> AnyLook:
         """Evidence for each class; `target` is ignored."""
-        return AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._asked))
+        return AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> AnyBelief:
         """Fade the beliefs of the inner observer."""
-        known, said = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
-        pairs = zip(known.inner, said.inner, strict=True)
-        return _with(known, tuple(self.observer.fade(each, of, keep, visited) for each, of in pairs))
+        belief, look = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
+        pairs = zip(belief.inner, look.inner, strict=True)
+        return _with(belief, tuple(self.observer.fade(each, of, keep, visited) for each, of in pairs))
 
     def update(self, belief: Belief, look: Look) -> AnyBelief:
         """Update the beliefs of the inner observer."""
-        known, said = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
-        pairs = zip(known.inner, said.inner, strict=True)
-        return _with(known, tuple(self.observer.update(each, of) for each, of in pairs))
+        belief, look = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
+        pairs = zip(belief.inner, look.inner, strict=True)
+        return _with(belief, tuple(self.observer.update(each, of) for each, of in pairs))
 
 
 def _with(belief: AnyBelief, inner: tuple[Belief, ...]) -> AnyBelief:
@@ -171,9 +171,9 @@ def weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes:
         InputError: a class is unknown or given twice, or no class is given.
     """
     check(len(target) > 0, "target", "a class, or several classes with weights", "none")
-    found: dict[int, float] = {}
+    weights: dict[int, float] = {}
     for name, weight in target.items():
         index = class_index(name, classes, "target")
-        check(index not in found, "target", "each class once", f"{classes[index - 1]!r} twice")
-        found[index] = weight
-    return found
+        check(index not in weights, "target", "each class once", f"{classes[index - 1]!r} twice")
+        weights[index] = weight
+    return weights

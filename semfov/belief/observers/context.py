@@ -122,27 +122,28 @@ class Context(Observer):
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         inner = self.observer.weigh(detections, fixation, grid, target)
-        wanted = torch.full((len(fixation),), target, device=fixation.device)
-        return ContextLook(inner, presence_of(detections, grid), wanted, grid)
+        targets = torch.full((len(fixation),), target, device=fixation.device)
+        return ContextLook(inner, presence_of(detections, grid), targets, grid)
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> ContextBelief:
         """Fade the belief of the inner observer and the scores of the shown classes."""
-        known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
-        inner = self.observer.fade(known.inner, said.inner, keep, visited)
-        return replace(known, inner=inner, closest=inner.closest, scores=keep * known.scores)
+        belief, look = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
+        inner = self.observer.fade(belief.inner, look.inner, keep, visited)
+        return replace(belief, inner=inner, closest=inner.closest, scores=keep * belief.scores)
 
     def update(self, belief: Belief, look: Look) -> ContextBelief:
         """Update the inner belief and the shown classes, and add the context."""
-        known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
-        inner = self.observer.update(known.inner, said.inner)
-        presence = torch.maximum(known.scores, said.presence)
+        belief, look = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
+        grid, targets = look.grid, look.target
+        inner = self.observer.update(belief.inner, look.inner)
+        presence = torch.maximum(belief.scores, look.presence)
 
-        def in_context(alone: Tensor, shown: Tensor, target: Tensor) -> Tensor:
-            return (log_odds(alone) + self.prior(shown, said.grid, target, self.weights)).sigmoid()
+        def in_context(alone: Tensor, scores: Tensor, target: Tensor) -> Tensor:
+            return (log_odds(alone) + self.prior(scores, grid, target, self.weights)).sigmoid()
 
         present, following = (
-            one_by_one(in_context, alone, presence, said.target)
-            for alone in (inner.probability(said.target), inner.chance(said.target))
+            one_by_one(in_context, alone, presence, targets)
+            for alone in (inner.probability(targets), inner.chance(targets))
         )
         return ContextBelief(present, following, inner.closest, inner, presence)
 

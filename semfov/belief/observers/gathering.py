@@ -102,12 +102,12 @@ class Gatherer(Observer):
             "visited": cells.bool(),
         }
 
-    def gather(self, known: GatheredBelief, said: EvidenceLook) -> dict[str, Tensor]:
+    def gather(self, belief: GatheredBelief, look: EvidenceLook) -> dict[str, Tensor]:
         """Gather the evidence of one more look in each episode.
 
         Args:
-            known: the belief so far.
-            said: the evidence of the look.
+            belief: the belief so far.
+            look: the evidence of the look.
 
         Returns:
             The attributes of `GatheredBelief`.
@@ -115,18 +115,18 @@ class Gatherer(Observer):
 
         def by_cell(values: Tensor) -> Tensor:
             """`(B, X·Y)`, the same for all classes."""
-            return values if said.evidence.ndim == values.ndim else values[:, None]
+            return values if look.evidence.ndim == values.ndim else values[:, None]
 
-        near = self.each(nearness, said.distance)
+        near = self.each(nearness, look.distance)
         return {
-            "closest": torch.minimum(said.distance, known.closest),
-            "nearest": torch.where(by_cell(said.distance < known.closest), said.evidence, known.nearest),
-            "best": torch.maximum(said.evidence, known.best),
-            "total": known.total + by_cell(near) * said.evidence,
-            "weight": known.weight + near,
-            "score": torch.maximum(said.score, known.score),
-            "looks": known.looks + 1,
-            "visited": known.visited.scatter(-1, said.fixated[:, None], True),
+            "closest": torch.minimum(look.distance, belief.closest),
+            "nearest": torch.where(by_cell(look.distance < belief.closest), look.evidence, belief.nearest),
+            "best": torch.maximum(look.evidence, belief.best),
+            "total": belief.total + by_cell(near) * look.evidence,
+            "weight": belief.weight + near,
+            "score": torch.maximum(look.score, belief.score),
+            "looks": belief.looks + 1,
+            "visited": belief.visited.scatter(-1, look.fixated[:, None], True),
         }
 
     def read(self, gathered: dict[str, Tensor]) -> list[Tensor]:
@@ -148,11 +148,11 @@ class Gatherer(Observer):
         """
         if keep == 1:
             return belief
-        known: dict[str, Tensor] = vars(belief)
+        fields: dict[str, Tensor] = vars(belief)
         unseen = self.model.unseen(belief.closest)
-        faded: dict[str, Any] = {name: unseen + keep * (known[name] - unseen) for name in ("nearest", "best")}
-        faded |= {name: keep * known[name] for name in ("total", "weight", "score", "looks")}
-        return replace(belief, **faded, closest=known["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
+        faded: dict[str, Any] = {name: unseen + keep * (fields[name] - unseen) for name in ("nearest", "best")}
+        faded |= {name: keep * fields[name] for name in ("total", "weight", "score", "looks")}
+        return replace(belief, **faded, closest=fields["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
 
     def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
         """Apply a function to the rows of tensors `(B, ...)`: one by one (`one_by_one`), or all at once."""

@@ -121,11 +121,11 @@ class Landing(Observer):
                 strongest = torch.maximum(strongest, place[..., None] * score[..., None, :])
             return strongest
 
-        said = one_by_one(evidence, detections.boxes, detections.scores, detections.mask)
-        return LandingLook(said, grid.distance(fixation))
+        by_class = one_by_one(evidence, detections.boxes, detections.scores, detections.mask)
+        return LandingLook(by_class, grid.distance(fixation))
 
     def update(self, belief: Belief, look: Look) -> LandingBelief:
         """Keep the strongest evidence of each cell."""
-        known, said = own(belief, LandingBelief, "belief"), own(look, LandingLook, "look")
-        closest = torch.minimum(said.distance, known.closest)
-        return LandingBelief(torch.maximum(said.evidence, known.evidence), closest)
+        belief, look = own(belief, LandingBelief, "belief"), own(look, LandingLook, "look")
+        closest = torch.minimum(look.distance, belief.closest)
+        return LandingBelief(torch.maximum(look.evidence, belief.evidence), closest)

@@ -104,17 +104,18 @@ class LearnedMap(Gatherer):
             return self.model(Detections(boxes, scores, mask), point, grid, targets)
 
         rows = detections.boxes, detections.scores, detections.mask, fixation
-        said = self.each(evidence, *rows)
+        by_class = self.each(evidence, *rows)
         every = targets.expand(len(fixation), -1)
         where = grid.distance(fixation), highest_score(detections, targets), grid.cell_of(fixation)
-        return MapLook(said, *where, every, grid.columns, torch.ones_like(every))
+        return MapLook(by_class, *where, every, grid.columns, torch.ones_like(every))
 
     def update(self, belief: Belief, look: Look) -> MapBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        known, said = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
-        all_looks = self.gather(known, said)
-        gathered = *self.read(all_looks), said.target, said.stands_for
-        probabilities = self.each(lambda *rows: self._read(*rows, columns=said.columns), *gathered)
+        belief, look = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
+        columns = look.columns
+        all_looks = self.gather(belief, look)
+        gathered = *self.read(all_looks), look.target, look.stands_for
+        probabilities = self.each(lambda *rows: self._read(*rows, columns=columns), *gathered)
         return MapBelief(**all_looks, probabilities=probabilities)
 
     def _read(

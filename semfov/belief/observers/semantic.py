@@ -136,13 +136,13 @@ class Semantic(Observer):
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
-        known, said = dirichlet_belief(belief), own(look, SemanticLook, "look")
-        closest = torch.minimum(known.closest, said.distance)
+        belief, look = dirichlet_belief(belief), own(look, SemanticLook, "look")
+        closest = torch.minimum(belief.closest, look.distance)
         if self.memory == "all":
-            return DirichletBelief(self._fuse(known.beta, said), closest)
-        fresh = self._fuse(torch.full_like(known.beta, self.prior), said)
-        closer = said.distance < known.closest
-        return DirichletBelief(torch.where(closer[..., None], fresh, known.beta), closest)
+            return DirichletBelief(self._fuse(belief.beta, look), closest)
+        fresh = self._fuse(torch.full_like(belief.beta, self.prior), look)
+        closer = look.distance < belief.closest
+        return DirichletBelief(torch.where(closer[..., None], fresh, belief.beta), closest)
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
         r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
@@ -152,10 +152,10 @@ class Semantic(Observer):
         Returns:
             The faded belief.
         """
-        known = dirichlet_belief(belief)
+        belief = dirichlet_belief(belief)
         if keep == 1:
-            return known
-        return DirichletBelief(self.prior + keep * (known.beta - self.prior), known.closest + farther(keep))
+            return belief
+        return DirichletBelief(self.prior + keep * (belief.beta - self.prior), belief.closest + farther(keep))
 
     def _fuse(self, beta: Tensor, look: SemanticLook) -> Tensor:
         fused = fuse_scaled(beta, look.likelihood.to(beta.dtype), look.footprint, self.fusion)

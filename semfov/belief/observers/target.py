@@ -104,21 +104,22 @@ class Target(Gatherer):
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
         score = highest_score(detections, target)
-        wanted = torch.full((len(fixation),), target, device=fixation.device)
-        return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), wanted, grid.columns)
+        targets = torch.full((len(fixation),), target, device=fixation.device)
+        return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), targets, grid.columns)
 
     def update(self, belief: Belief, look: Look) -> TargetBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        known, said = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
-        all_looks = self.gather(known, said)
+        belief, look = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
+        columns = look.columns
+        all_looks = self.gather(belief, look)
 
         def probabilities(*gathered: Tensor) -> Tensor:
             what = Gathered(*gathered)
-            cells = self.model.log_odds(what, said.columns)
+            cells = self.model.log_odds(what, columns)
             image = self.model.presence(cells, what)[:, None]
-            return torch.cat([cells, self.model.chance(what, said.columns), image], -1).sigmoid()
+            return torch.cat([cells, self.model.chance(what, columns), image], -1).sigmoid()
 
-        told = self.each(probabilities, *self.read(all_looks), said.target)
+        values = self.each(probabilities, *self.read(all_looks), look.target)
         number = all_looks["closest"].shape[-1]
-        present, following, anywhere = told[:, :number], told[:, number:-1], told[:, -1]
+        present, following, anywhere = values[:, :number], values[:, number:-1], values[:, -1]
         return TargetBelief(**all_looks, present=present, following=following, anywhere=anywhere)

@@ -58,7 +58,7 @@ def read_cocosearch(
     >>> scanpath.target, scanpath.points.tolist()
     ('cup', [[840.0, 525.0], [700.5, 300.0]])
     """
-    path, found = Path(path), []
+    path, scanpaths = Path(path), []
     for number, trial in enumerate(read_json(path, _FILE)):
         name = f"[{number}] ({trial['name']})"
         points = points_of(path, name, trial["X"], trial["Y"])
@@ -73,10 +73,10 @@ def read_cocosearch(
             found=_flag(trial.get("fixOnTarget")),
         )
         if sizes is None:
-            found.append(record)
+            scanpaths.append(record)
         elif record.picture in sizes:
-            found.append(record.in_picture(sizes[record.picture]))
-    return warn_outside(path, found)
+            scanpaths.append(record.in_picture(sizes[record.picture]))
+    return warn_outside(path, scanpaths)
 
 
 def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

@@ -41,14 +41,14 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
     >>> scanpath.picture, scanpath.subject, scanpath.durations.tolist()
     ('1001.jpg', '1', [210.0, 180.0])
     """
-    path, found = Path(path), []
+    path, scanpaths = Path(path), []
     for picture, people in read_json(path, _FILE).items():
         for number, person in enumerate(people):
             name = f"{picture}[{number}]"
             points = points_of(path, name, person["x"], person["y"])
             times = durations_of(path, f"{name}.duration_ms", person.get("duration_ms"), len(points))
-            found.append(Fixations(picture, str(number + 1), points, size, times))
-    return warn_outside(path, found)
+            scanpaths.append(Fixations(picture, str(number + 1), points, size, times))
+    return warn_outside(path, scanpaths)
 
 
 def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

@@ -65,13 +65,13 @@ def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tu
 
         fixations = from_pysaliency(trains, ["1001.jpg", "1002.jpg"], {"1001.jpg": (800, 600), "1002.jpg": (800, 600)})
     """
-    found = []
+    scanpaths = []
     columns = (trains.train_xs, trains.train_ys, trains.train_ns, trains.train_subjects)
     for xs, ys, n, subject in zip(*columns, strict=True):
         points = np.stack([np.asarray(xs, dtype=np.float64), np.asarray(ys, dtype=np.float64)], axis=1) - 0.5
         picture = pictures[int(n)]
-        found.append(Fixations(picture, str(subject), points[np.isfinite(points).all(1)], sizes[picture]))
-    return found
+        scanpaths.append(Fixations(picture, str(subject), points[np.isfinite(points).all(1)], sizes[picture]))
+    return scanpaths
 
 
 def _onsets(fixations: Fixations) -> Any:

@@ -69,7 +69,7 @@ def read_ruarte(
     >>> scanpath.target, scanpath.points.tolist()
     ('cup', [[24.5, 24.5], [424.5, 624.5]])
     """
-    path, found = Path(path), []
+    path, scanpaths = Path(path), []
     for name, trial in read_json(path, _FILE).items():
         points = points_of(path, name, trial["X"], trial["Y"])
         size = (int(trial["image_width"]), int(trial["image_height"]))
@@ -93,8 +93,8 @@ def read_ruarte(
             if name not in sizes:
                 continue
             record = record.in_picture(sizes[name])
-        found.append(record)
-    return warn_outside(path, found)
+        scanpaths.append(record)
+    return warn_outside(path, scanpaths)
 
 
 def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

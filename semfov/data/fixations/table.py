@@ -104,14 +104,14 @@ def _record(path: Path, group: list[tuple[int, Mapping[str, str]]]) -> Fixations
     found = (line.get("found") or "").lower()
     if found not in words:
         raise DataError(f"{path}: line {first}, found: expected true, false or nothing, got {found!r}")
-    known = None not in times
+    timed = None not in times
     try:
         return Fixations(
             picture=line["picture"],
             subject=line["subject"],
             points=points,
             size=(int(_number(path, first, line, "width")), int(_number(path, first, line, "height"))),
-            durations=np.array(times, dtype=np.float64) if known else None,
+            durations=np.array(times, dtype=np.float64) if timed else None,
             target=line.get("target") or None,
             box=box,
             found=words[found],

@@ -93,14 +93,14 @@ class PartInputs:
     @cached_property
     def samples(self) -> Samples:
         """Labelled detections from a few random cells of each photograph."""
-        parts, run = [], self.run
+        samples, run = [], self.run
         for index in range(len(run.scenes)):
             grid = run.grid(index)
             generator = generator_for("cells", self.config.seed, run.scenes.ids[index])
             cells = torch.randperm(len(grid), generator=generator)[: self.config.fixations]
-            seen, annotation = run.detections(index)[cells], run.scenes.annotation(index)
-            parts.append(Samples.of(seen, grid.centres[cells], annotation, index, self.config.observation.iou))
-        return Samples.join(parts)
+            detections, annotation = run.detections(index)[cells], run.scenes.annotation(index)
+            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, self.config.observation.iou))
+        return Samples.join(samples)
 
 
 class PartFit(ABC):

@@ -56,17 +56,17 @@ class FolderFit:
     def fit(self, name: str) -> PartResult:
         """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""
         key = digest_of([self.inputs.run.key, self._settings(name)])
-        kept = self._kept(name, key)
-        if kept is None:
+        result = self._read_result(name, key)
+        if result is None:
             try:
-                kept = self.fits[name].fit()
+                result = self.fits[name].fit()
             except (DataError, InputError) as error:
-                kept = PartResult(
+                result = PartResult(
                     Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
                 )
-            write_text(self._record(name), json.dumps({"key": key, **asdict(kept)}))
-        self.parts[name] = kept
-        return kept
+            write_text(self._record(name), json.dumps({"key": key, **asdict(result)}))
+        self.parts[name] = result
+        return result
 
     def _settings(self, name: str) -> list[Any]:
         """List everything except the looks that a part and its evaluation depend on."""
@@ -77,7 +77,7 @@ class FolderFit:
     def _record(self, name: str) -> Path:
         return self.config.out / "progress" / f"{name}.json"
 
-    def _kept(self, name: str, key: str) -> PartResult | None:
+    def _read_result(self, name: str, key: str) -> PartResult | None:
         try:
             record = json.loads(self._record(name).read_text(encoding="utf-8"))
             part = Part(**record["part"])

@@ -57,7 +57,7 @@ class VerificationFit(PartFit):
         if not isinstance(evidence, TargetEvidence):
             why = "not fitted, since the agent does not use the target evidence"
             return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
-        seen = open_photographs(
+        photographs = open_photographs(
             run.eye,
             run.scenes,
             judged,
@@ -69,16 +69,16 @@ class VerificationFit(PartFit):
             spare=min(20, ABSENT // len(judged)),
             everywhere=run.detections,
         )
-        if len(seen) < 2:
+        if len(photographs) < 2:
             raise DataError(
-                f"data: expected at least 2 held-out photographs with a class to search for, got {len(seen)}; give "
-                "more photographs"
+                "data: expected at least 2 held-out photographs with a class to search for, got "
+                f"{len(photographs)}; give more photographs"
             )
         assert evidence.thresholds is not None
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
-        config = replace(config, folds=min(config.folds, len(seen)), give_up=give_up)
-        fitted = fit_in_folds(seen, evidence, config, shipped_mean(), SUREST_OF_FEW)
+        config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
+        fitted = fit_in_folds(photographs, evidence, config, shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
@@ -97,7 +97,7 @@ class VerificationFit(PartFit):
         )
         return PartResult(
             self.write(fitted.model, gain.better, why),
-            text + verification_report(fitted, f"{len(seen)} photographs")[0],
+            text + verification_report(fitted, f"{len(photographs)} photographs")[0],
         )
 
 
@@ -111,8 +111,8 @@ def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> Flo
     Returns:
         `(P,)`, the mean score of each photograph.
     """
-    known: dict[int, dict[bool, list[int]]] = {}
+    by_picture: dict[int, dict[bool, list[int]]] = {}
     for each, (right, _) in zip(searches, ends, strict=True):
         score = 0 if right is None else 1 if right else -1
-        known.setdefault(each.picture, {}).setdefault(each.present, []).append(score)
-    return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in known.values()])
+        by_picture.setdefault(each.picture, {}).setdefault(each.present, []).append(score)
+    return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in by_picture.values()])

@@ -188,19 +188,19 @@ def photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: W
     Returns:
         `(P, 16)`, the share of its objects that were found, for each photograph with objects in any mosaic.
     """
-    found, there = np.zeros((len(mosaics.scenes), RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
+    hits, there = np.zeros((len(mosaics.scenes), RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
         photograph = np.repeat(
             [tile.index for tile in tiles], [len(mosaics.scenes.annotation(tile.index).boxes) for tile in tiles]
         )
         np.add.at(there, photograph, 1)
-        seen: list[Glance] = []
+        history: list[Glance] = []
         turns = way(glances)
         for number in range(RECALL_PASSES[-1]):
             turn = next(turns, None)
             if turn is not None:
-                seen.append(turn.glance)
-            np.add.at(found[:, number], photograph, found_in(seen, annotation).numpy())
+                history.append(turn.glance)
+            np.add.at(hits[:, number], photograph, found_in(history, annotation).numpy())
         glances.save()
-    return found[there > 0] / there[there > 0, None]
+    return hits[there > 0] / there[there > 0, None]

@@ -8,7 +8,7 @@ from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.lookahead import seen_from
+from semfov.gaze.acquisition.lookahead import at_levels
 
 
 class SightedModel(Protocol):
@@ -73,10 +73,10 @@ class ExpectedAccuracy(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(..., X·Y)`, in cells, for a belief `(..., X·Y, K+1)`."""
-        known = dirichlet_belief(belief)
-        check_shape(known.beta, "beta", self.levels.shape[-1], None)
-        objects = known.probabilities[..., 1:]
-        seen = objects @ self.named.to(objects)
+        belief = dirichlet_belief(belief)
+        check_shape(belief.beta, "beta", self.levels.shape[-1], None)
+        objects = belief.probabilities[..., 1:]
+        detected = objects @ self.named.to(objects)
         missed = (objects[..., None] * self.miss.to(objects)).amax(-2)
-        gain = (seen + missed - objects.amax(-1, keepdim=True)).clamp(min=0)
-        return seen_from(gain, self.levels).sum(-2)
+        gain = (detected + missed - objects.amax(-1, keepdim=True)).clamp(min=0)
+        return at_levels(gain, self.levels).sum(-2)

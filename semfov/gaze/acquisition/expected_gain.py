@@ -40,8 +40,8 @@ class ExpectedGain(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
-        known = own(belief, MapBelief, "belief")
-        return one_by_one(self._values, known.probabilities, known.closest, known.looks)
+        belief = own(belief, MapBelief, "belief")
+        return one_by_one(self._values, belief.probabilities, belief.closest, belief.looks)
 
     def _values(self, probabilities: Tensor, closest: Tensor, looks: Tensor) -> Tensor:
         return self.model.gain(probabilities, closest, looks, self.distance.to(closest)).sum(-1)

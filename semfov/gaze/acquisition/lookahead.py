@@ -181,11 +181,11 @@ class Lookahead(AcquisitionFunction):
 
         def values(maps: Tensor, visited: Tensor) -> Tensor:
             if expected is not None:
-                seen = self.cell_values(look_ahead(maps, expected))
+                cells = self.cell_values(look_ahead(maps, expected))
             else:
                 assert drawn is not None
-                seen = mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
-            return self.pool(seen_from(seen, self.levels))
+                cells = mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
+            return self.pool(at_levels(cells, self.levels))
 
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta, visited)
@@ -202,7 +202,7 @@ class Lookahead(AcquisitionFunction):
         return values.sum(-2)
 
 
-def seen_from(values: Tensor, levels: Tensor) -> Tensor:
+def at_levels(values: Tensor, levels: Tensor) -> Tensor:
     """Select the value of every cell at its level of distance from each fixation.
 
     Args:

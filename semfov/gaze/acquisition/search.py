@@ -9,7 +9,7 @@ from semfov.belief.belief import Belief, dirichlet_belief, pick
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.lookahead import LevelledModel, look_ahead, look_ahead_by_samples, seen_from
+from semfov.gaze.acquisition.lookahead import LevelledModel, at_levels, look_ahead, look_ahead_by_samples
 
 
 class ExpectingModel(Protocol):
@@ -144,5 +144,5 @@ class NeighbourhoodPosterior(AcquisitionFunction):
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         outlook = look_ahead(beta, self.model.expected_scores())
-        predicted = seen_from(pick(outlook.next_mean, self.target), self.levels)
+        predicted = at_levels(pick(outlook.next_mean, self.target), self.levels)
         return (predicted * self.kernel.to(predicted)).sum(-2)

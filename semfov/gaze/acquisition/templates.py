@@ -45,18 +45,18 @@ class TemplateAttention(AcquisitionFunction):
         super().__init__()
         check(fovea > 0, "fovea", "a positive number", fovea)
         check_shape(attention, "attention", len(grid), None, len(grid))
-        wanted = torch.as_tensor(target)
-        inside = bool(((wanted >= 1) & (wanted <= attention.shape[1])).all())
-        check(inside, "target", f"classes from 1 to {attention.shape[1]}", wanted.tolist())
-        self.register_buffer("target", wanted)
+        targets = torch.as_tensor(target)
+        inside = bool(((targets >= 1) & (targets <= attention.shape[1])).all())
+        check(inside, "target", f"classes from 1 to {attention.shape[1]}", targets.tolist())
+        self.register_buffer("target", targets)
         self.register_buffer("attention", attention)
         self.register_buffer("weight", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)`; they do not depend on the belief."""
-        seen = self.attention.transpose(0, 1)[(self.target - 1).expand(len(visited))]
-        return one_by_one(self._values, seen, visited.to(seen))
+        attention = self.attention.transpose(0, 1)[(self.target - 1).expand(len(visited))]
+        return one_by_one(self._values, attention, visited.to(attention))
 
-    def _values(self, seen: Tensor, visited: Tensor) -> Tensor:
-        weight = visited[..., None] * self.weight.to(seen)
-        return (weight * seen).sum(-2) / weight.sum(-2).clamp(min=torch.finfo(seen.dtype).tiny)
+    def _values(self, attention: Tensor, visited: Tensor) -> Tensor:
+        weight = visited[..., None] * self.weight.to(attention)
+        return (weight * attention).sum(-2) / weight.sum(-2).clamp(min=torch.finfo(attention.dtype).tiny)

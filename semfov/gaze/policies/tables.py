@@ -52,7 +52,7 @@ class SaliencyMaximum(TablePolicy):
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
     ) -> AcquisitionFunction:
         """The saliency of all cells, seen from the fixated one."""
-        return Static(salient_from(given(table, self), cell))
+        return Static(salient_from(required_table(table, self), cell))
 
 
 class TemplateSearch(TablePolicy):
@@ -84,10 +84,10 @@ class TemplateSearch(TablePolicy):
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
     ) -> AcquisitionFunction:
         """The attention to the target, accumulated over the fixated cells."""
-        return TemplateAttention(required_target(target, self.name), given(table, self), grid, self.fovea)
+        return TemplateAttention(required_target(target, self.name), required_table(table, self), grid, self.fovea)
 
 
-def given(table: Tensor | None, policy: Policy) -> Tensor:
+def required_table(table: Tensor | None, policy: Policy) -> Tensor:
     """Return the table that a policy needs, or raise an error where there is none."""
     if table is None:
         raise InputError(f"policy {policy.name!r}: expected the {policy.table} of the scene, got none")

@@ -183,8 +183,8 @@ def conspicuity(image: Tensor) -> Tensor:
         # Across-scale addition happens at the coarsest centre.
         total = total + dyadic_pyramid(maps, max(CENTRES) - centre)[-1]
     intensity, colour, orientation = total.split([1, 2, len(ORIENTATIONS)], 1)
-    parts = [intensity, colour.sum(1, keepdim=True), promote(orientation).sum(1, keepdim=True)]
-    return torch.cat(parts, 1)
+    channels = [intensity, colour.sum(1, keepdim=True), promote(orientation).sum(1, keepdim=True)]
+    return torch.cat(channels, 1)
 
 
 def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:

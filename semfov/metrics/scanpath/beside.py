@@ -86,11 +86,11 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixation
     records = [each.resized(size) for each in (ours, *people)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]
-    found = ScanpathComparison()
+    comparison = ScanpathComparison()
     for name, measure in _measures(size).items():
         among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
-        found[name] = BesidePeople(measure(mine, theirs), _mean(among))
-    return found
+        comparison[name] = BesidePeople(measure(mine, theirs), _mean(among))
+    return comparison
 
 
 def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
@@ -145,5 +145,5 @@ def _density(points: FixationValues, size: tuple[int, int]) -> tuple[NDArray[np.
 
 
 def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else float("nan")

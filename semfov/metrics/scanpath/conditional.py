@@ -67,8 +67,8 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     """
     values, at = looked_up(maps, x, y)
     flat = np.sort(values.reshape(-1, values.shape[-1] * values.shape[-2]), axis=-1)
-    found = at.reshape(len(flat), -1)
-    return np.reshape([share_below(row, each) for row, each in zip(flat, found, strict=True)], at.shape)
+    scores = at.reshape(len(flat), -1)
+    return np.reshape([share_below(row, each) for row, each in zip(flat, scores, strict=True)], at.shape)
 
 
 def share_below(ordered: _Array, values: _Array) -> _Array:
