@@ -123,11 +123,7 @@ KNOWN = {
         f"probability {LIKELY} on": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
-        "75 MB": "a sixteenth, a sixty-fourth and so on of what the sentence gives",
         "134 MB": "of copies with at most 2 to the 25th pixels, three bytes each, and a third more",
-        "64 MB": "given to GDAL",
-        "900 MB": "three bytes for each pixel of the sentence",
-        "by 4, 8, 16": "a series",
         f"opset {OPSET}": "code",
     },
     "docs/head.md": {
@@ -163,8 +159,6 @@ KNOWN = {
     "docs/sensors.md": {
         "δ (1 + r / a)": "a formula",
         f"has {_RINGS} rings of {_WEDGES} receptors, which is {_RINGS * _WEDGES:,} receptors for 307,200": "code",
-        "79 s of processor time, and 220 s by the clock": "a measurement of which the sentence has the machine",
-        "a load of 9, PyTorch 2.15": "its machine",
     },
     "docs/pan-tilt.md": {
         "from -1 to 1": "a range",
@@ -175,7 +169,6 @@ KNOWN = {
     "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code"},
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
     "docs/guides/environments.md": {
-        "version 1.0": "of Gymnasium",
         "is 0.05 in searches and 0.01 in explorations, and is 1": "signatures in the reference",
         "is 1 once": "a rule",
         "whole picture (0) to native pixels (1)": "a range",
@@ -223,7 +216,6 @@ SHARES = {
         "One in five photographs is held out": "a rule",
         "one in three if there are fewer": "a rule",
     },
-    "docs/words.md": {"a tenth of the gain": ("0.023", "0.217")},
     "docs/decisions/closer_looks.md": {
         "a third of the photograph": "a setting",
         "a third of the window": "it follows from the setting",
