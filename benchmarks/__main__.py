@@ -61,8 +61,8 @@ def main() -> None:
         measured.append(measure(make(), options.seconds, clock))
         for row in comparison_rows(measured[-1]):
             print(" | ".join(row), flush=True)
-    grown, found = grow(options.seconds / 2, clock), limits(bandwidth, options.seconds / 2, clock)
-    text = report(about, bandwidth, measured, grown, found)
+    grown, paths = grow(options.seconds / 2, clock), limits(bandwidth, options.seconds / 2, clock)
+    text = report(about, bandwidth, measured, grown, paths)
     figures = {
         "machine": about,
         "copy_bandwidth": bandwidth,
@@ -73,7 +73,7 @@ def main() -> None:
         },
         "limits": {
             name: {"bytes": path.bytes, "ms": asdict(ms), "share_of_bandwidth": share}
-            for name, (path, ms, share) in found.items()
+            for name, (path, ms, share) in paths.items()
         },
     }
     write(options.out, options.name, text, figures)
@@ -84,7 +84,7 @@ def report(
     bandwidth: float,
     measured: list[Measured],
     grown: dict[str, tuple[dict[int, Spread], float]],
-    found: dict[str, tuple[HotPath, Spread, float]],
+    paths: dict[str, tuple[HotPath, Spread, float]],
 ) -> str:
     """The report with all tables, as Markdown."""
     rows = [row for each in measured for row in comparison_rows(each)]
@@ -94,9 +94,9 @@ def report(
     ]
     hot = [
         [name, f"{path.bytes / 1e6:.2f}", path.what, spread(ms), f"{100 * share:.1f}"]
-        for name, (path, ms, share) in found.items()
+        for name, (path, ms, share) in paths.items()
     ]
-    slowest = min(found, key=lambda name: found[name][2])
+    slowest = min(paths, key=lambda name: paths[name][2])
     return "\n".join(
         [
             "# Benchmarks",
@@ -128,7 +128,7 @@ def report(
             "",
             *(
                 f"- {name}{' (the slowest)' if name == slowest else ''}: {path.stops}"
-                for name, (path, *_) in found.items()
+                for name, (path, *_) in paths.items()
             ),
             "",
         ]

@@ -51,33 +51,33 @@ def contrasts(sensor: Sensor, wavelength: float) -> list[float]:
     wave = torch.stack([phase.cos(), phase.sin(), phase.cos()])[:, None].expand(-1, len(place), -1)
     # Vertical and horizontal gratings. The third channel only serves to make an RGB image for the sensor.
     both = torch.stack([wave, wave.mT])
-    shown = torch.cat(
+    views = torch.cat(
         [sensor.look(sensor.open(one[None], torch.ones(2)), torch.full((1, 2), EDGES[-1])) for one in both]
     )
     # A grating that is only weakened keeps its phase, so the products of the two quadratures with the view give its
     # contrast.
-    kept = (shown * both)[:, :2].sum(1).mean(0)
+    contrast = (views * both)[:, :2].sum(1).mean(0)
     distance = torch.hypot(place[:, None], place)
-    return [float(kept[(distance >= low) & (distance < high)].mean()) for low, high in pairwise(EDGES)]
+    return [float(contrast[(distance >= low) & (distance < high)].mean()) for low, high in pairwise(EDGES)]
 
 
 def finest(sensor: Sensor) -> list[str]:
     """Shortest wavelength from which on all gratings keep half of their contrast, between neighbouring `EDGES`."""
-    kept = [contrasts(sensor, wavelength) for wavelength in WAVELENGTHS]
-    found = []
+    by_wavelength = [contrasts(sensor, wavelength) for wavelength in WAVELENGTHS]
+    texts = []
     for place in range(len(EDGES) - 1):
-        lost = [n for n in range(len(WAVELENGTHS)) if kept[n][place] < 0.5]
+        lost = [n for n in range(len(WAVELENGTHS)) if by_wavelength[n][place] < 0.5]
         if not lost:
-            found.append(f"≤ {WAVELENGTHS[0]:.0f}")
+            texts.append(f"≤ {WAVELENGTHS[0]:.0f}")
             continue
         above = lost[-1] + 1
         if above == len(WAVELENGTHS):
-            found.append(f"> {WAVELENGTHS[-1]:.0f}")
+            texts.append(f"> {WAVELENGTHS[-1]:.0f}")
             continue
-        low, high = kept[above - 1][place], kept[above][place]
+        low, high = by_wavelength[above - 1][place], by_wavelength[above][place]
         share = (0.5 - low) / (high - low)
-        found.append(f"{WAVELENGTHS[above - 1] * (WAVELENGTHS[above] / WAVELENGTHS[above - 1]) ** share:.1f}")
-    return found
+        texts.append(f"{WAVELENGTHS[above - 1] * (WAVELENGTHS[above] / WAVELENGTHS[above - 1]) ** share:.1f}")
+    return texts
 
 
 def looks(scenes: Scenes, count: int, fixations: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
@@ -90,7 +90,7 @@ def looks(scenes: Scenes, count: int, fixations: int) -> Iterator[tuple[Tensor, 
         yield scene.image[None], points, scene.boxes, scene.labels
 
 
-class Tally:
+class AcuityCounts:
     """Errors and found objects by distance from the fixation.
 
     Attributes:
@@ -127,10 +127,10 @@ class Tally:
             near = where < EDGES[-1]
             self.error.index_add_(0, place[near], change[near].double())
             self.pixels.index_add_(0, place[near], torch.ones_like(change[near], dtype=torch.float64))
-            seen = eye.detect(view, point[None], canvas)
-            hits = box_iou(boxes, seen.boxes[0]) >= OVERLAP
-            hits &= seen.scores[0][:, labels].mT >= SCORE
-            hits &= (seen.labels[0] == labels[:, None]) & seen.mask[0]
+            detections = eye.detect(view, point[None], canvas)
+            hits = box_iou(boxes, detections.boxes[0]) >= OVERLAP
+            hits &= detections.scores[0][:, labels].mT >= SCORE
+            hits &= (detections.labels[0] == labels[:, None]) & detections.mask[0]
             away = torch.hypot(*(middle - point).unbind(-1)) * scale
             place, near = torch.bucketize(away, edges, right=True), away < EDGES[-1]
             self.found.index_add_(0, place[near], hits.any(-1)[near].double())
@@ -141,22 +141,22 @@ def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count:
     """The report with all tables, as Markdown."""
     bins = [f"{low}–{high}" for low, high in pairwise(EDGES)]
     acuity = [[name, *finest(sensor)] for name, sensor in chosen.items() if name != "none"]
-    tallies = {name: Tally() for name in chosen}
+    by_sensor = {name: AcuityCounts() for name in chosen}
     eyes = {name: Eye(sensor, detector).eval().requires_grad_(False) for name, sensor in chosen.items()}
     for image, points, boxes, labels in looks(scenes, count, fixations):
         for name, eye in eyes.items():
-            tallies[name].add(eye, image, points, boxes, labels)
+            by_sensor[name].add(eye, image, points, boxes, labels)
     noise = [
-        [name, *(f"{-10 * math.log10(value):.1f}" for value in (tally.error / tally.pixels).tolist())]
-        for name, tally in tallies.items()
+        [name, *(f"{-10 * math.log10(value):.1f}" for value in (counts.error / counts.pixels).tolist())]
+        for name, counts in by_sensor.items()
         if name != "none"
     ]
     recall = []
-    for name, tally in tallies.items():
-        shares = [f"{value:.2f}" for value in (tally.found / tally.objects).tolist()]
-        every, cost = float(tally.found.sum() / tally.objects.sum()), 1e3 * tally.seconds / tally.looks
+    for name, counts in by_sensor.items():
+        shares = [f"{value:.2f}" for value in (counts.found / counts.objects).tolist()]
+        every, cost = float(counts.found.sum() / counts.objects.sum()), 1e3 * counts.seconds / counts.looks
         recall.append([name, *shares, f"{every:.3f}", f"{cost:.1f}"])
-    objects = next(iter(tallies.values())).objects.long().tolist()
+    objects = next(iter(by_sensor.values())).objects.long().tolist()
     return "\n\n".join(
         [
             "Wavelength of the finest grating that keeps half of its contrast, by distance from the fixation:",

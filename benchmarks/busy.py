@@ -49,19 +49,19 @@ def large_search() -> Run:
     agent = ZoomAgent.recommended("yolov3-tiny")
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     picture = to_bytes(Mosaics(scenes, 6, 6, tile=(640, 480), count=1)[0].image)
-    detector, seen = agent.eye.detector, list[Candidates]()
+    detector, candidates = agent.eye.detector, list[Candidates]()
     propose = detector.propose_bytes
 
     def remembered(canvases: Tensor) -> Candidates:
-        seen.append(propose(canvases))
-        return seen[-1]
+        candidates.append(propose(canvases))
+        return candidates[-1]
 
     def search() -> ZoomPath:
         return agent.search(picture, "person", passes=16, confirm=1.0, give_up=0.0, closer=0)
 
     vars(detector)["propose_bytes"] = remembered
     search()
-    again = cycle(seen)
+    again = cycle(candidates)
     vars(detector)["propose_bytes"] = lambda canvases: next(again)
     return search
 
@@ -106,14 +106,14 @@ def times(seconds: float) -> dict[str, dict[str, Spread]]:
         for label, threads in (("one thread", 1), ("all threads", cores))
     }
     named = {f"{name}|{label}": run for (name, label), run in runs.items()}
-    found: dict[str, dict[str, Spread]] = {}
+    spreads: dict[str, dict[str, Spread]] = {}
     for machine, busy in (("quiet", False), ("busy", True)):
         with beside(busy):
             for key, values in interleaved(named, seconds, times=10).items():
                 name, label = key.split("|")
-                found.setdefault(name, {})[f"{machine}, {label}"] = Spread.of(values)
+                spreads.setdefault(name, {})[f"{machine}, {label}"] = Spread.of(values)
     torch.set_num_threads(cores)
-    return found
+    return spreads
 
 
 @torch.inference_mode()
@@ -123,18 +123,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration of each half")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args()
-    found = times(options.seconds)
-    columns = list(next(iter(found.values())))
+    spreads = times(options.seconds)
+    columns = list(next(iter(spreads.values())))
     rows = [
         [
             name,
             *(spread(own[column]) for column in columns),
             number(own["busy, all threads"].middle / own["quiet, one thread"].middle),
         ]
-        for name, own in found.items()
+        for name, own in spreads.items()
     ]
     text = table(["milliseconds", *columns, "busy, all threads / quiet, one thread"], rows)
-    figures = {name: {column: asdict(value) for column, value in own.items()} for name, own in found.items()}
+    figures = {name: {column: asdict(value) for column, value in own.items()} for name, own in spreads.items()}
     write(options.out, "busy", f"# Beside a program that takes a core\n\n{text}", {"about": describe(), **figures})
     print(text)
 

@@ -108,11 +108,11 @@ def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], 
 
 def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) -> dict[str, Run]:
     """Programs of the steps that update a belief with one look of 30 detections."""
-    observer, seen, fixation = observers.Semantic(CLASSES + 1), make_seen(LOOKS), torch.tensor([GAZE])
-    look, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
+    observer, detections, fixation = observers.Semantic(CLASSES + 1), make_seen(LOOKS), torch.tensor([GAZE])
+    look, distance = observer.weigh(detections, fixation, grid), grid.box_distance(detections.boxes, fixation)
     return {
-        f"cells and distances of {DETECTIONS} detections": lambda: observer.weigh(seen, fixation, grid),
-        f"calibration of {DETECTIONS} detections": lambda: model.calibrate(seen.scores, distance),
+        f"cells and distances of {DETECTIONS} detections": lambda: observer.weigh(detections, fixation, grid),
+        f"calibration of {DETECTIONS} detections": lambda: model.calibrate(detections.scores, distance),
         f"Kaplan's rule for {DETECTIONS} detections": lambda: observer.update(belief, look),
     }
 
@@ -130,11 +130,11 @@ def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
 
         return run
 
-    parts = {
+    preparations = {
         "pyramid of the photograph, once for all decisions": lambda: sensor.pyramid(image),
         "foveated view, in every decision by saliency": lambda: sensor(bands, gaze),
     }
-    return {"VOCUS2": decide_by(saliency.VOCUS2()), "Itti-Koch": decide_by(saliency.IttiKoch())}, parts
+    return {"VOCUS2": decide_by(saliency.VOCUS2()), "Itti-Koch": decide_by(saliency.IttiKoch())}, preparations
 
 
 def main() -> None:
@@ -172,12 +172,12 @@ def measure_all(
         "calibrated": believe(observers.Semantic(CLASSES + 1, model), grid),
     }
     decisions, changes = on_the_map(model, maps, grid), updates(model, maps["raw"], grid)
-    views, parts = on_the_view(grid)
-    found = interleaved(decisions | changes, seconds, clock, times=TIMES)
-    found |= interleaved(views | parts, seconds, clock)
+    views, preparations = on_the_view(grid)
+    durations = interleaved(decisions | changes, seconds, clock, times=TIMES)
+    durations |= interleaved(views | preparations, seconds, clock)
     brute = replace(exploration("KL divergence", maps["raw"]), name=KL, ours=decisions[KL])
-    spreads = {name: Spread.of(values) for name, values in found.items()}
-    return spreads, [*changes, *parts], measure(brute, seconds, clock, TIMES)
+    spreads = {name: Spread.of(values) for name, values in durations.items()}
+    return spreads, [*changes, *preparations], measure(brute, seconds, clock, TIMES)
 
 
 def report(about: dict[str, str], spreads: dict[str, Spread], others: list[str], peers: Measured) -> str:

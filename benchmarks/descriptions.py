@@ -38,14 +38,14 @@ def main() -> None:
         "--embeddings", type=Path, required=True, help="file of word vectors in the text format of GloVe or word2vec"
     )
     path = parser.parse_args().embeddings
-    asked = cases()
-    vectors = WordVectors.read(path, [*COCO_CLASSES, *(other for other, _ in asked)])
-    known = [(other, place) for other, place in asked if vectors.knows(other)]
-    near = vectors.similarity([other for other, _ in known], COCO_CLASSES).nan_to_num(-1)
-    right = torch.tensor([place for _, place in known])
+    pairs = cases()
+    vectors = WordVectors.read(path, [*COCO_CLASSES, *(other for other, _ in pairs)])
+    comparable = [(other, place) for other, place in pairs if vectors.knows(other)]
+    near = vectors.similarity([other for other, _ in comparable], COCO_CLASSES).nan_to_num(-1)
+    right = torch.tensor([place for _, place in comparable])
     rank = (near >= near.gather(1, right[:, None])).sum(1)
     missing = ", ".join(vectors.missing) or "none"
-    print(f"{len(known)} other names of COCO's classes, {path.name}; words without a vector: {missing}\n")
+    print(f"{len(comparable)} other names of COCO's classes, {path.name}; words without a vector: {missing}\n")
     shares = [f"{100 * float((rank <= count).double().mean()):.1f}" for count in NEAREST]
     print(table(["", *(f"among the nearest {count}, %" for count in NEAREST)], [["right class", *shares]]))
     chances = [(near / t).log_softmax(-1).gather(1, right[:, None]).mean() for t in TEMPERATURES]

@@ -90,8 +90,8 @@ def average_precision(
     results: list[list[dict[str, Any]]] = [[] for _ in selections]
     for image_id in tqdm(sorted(truth.imgs), desc=detector.name, unit="image"):
         image = read_image(root / truth.imgs[image_id]["file_name"])
-        found = detect(detector, image, selections, multilabel=multilabel)
-        for result, (boxes, scores, labels) in zip(results, found, strict=True):
+        by_selection = detect(detector, image, selections, multilabel=multilabel)
+        for result, (boxes, scores, labels) in zip(results, by_selection, strict=True):
             sizes = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1)
             for box, score, label in zip(sizes.tolist(), scores.tolist(), ids[labels].tolist(), strict=True):
                 result.append({"image_id": image_id, "category_id": label, "bbox": box, "score": score})

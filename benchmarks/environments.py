@@ -83,7 +83,7 @@ def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tup
     # Restart in the same step, so that the time of restarts is included and every step counts.
     restarts = AutoresetMode.SAME_STEP
     wide: Callable[..., Any] = partial(GazeVectorEnv, task, scenery=scenery, autoreset_mode=restarts)
-    found: dict[str, tuple[Run, int]] = {
+    every: dict[str, tuple[Run, int]] = {
         "one, `gymnasium.make`": (alone(kind(scenery), 0), 1),
         f"{sizes[0]}, one after another (`SyncVectorEnv`)": (
             steps(SyncVectorEnv([lambda: kind(scenery)] * sizes[0], autoreset_mode=restarts), 0),
@@ -91,12 +91,12 @@ def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tup
         ),
     }
     for size in sizes:
-        found[f"{size}, `gymnasium.make_vec`"] = steps(wide(size), 0), size
-    found[f"{sizes[-1]}, with the belief shown, no detections"] = (
+        every[f"{size}, `gymnasium.make_vec`"] = steps(wide(size), 0), size
+    every[f"{sizes[-1]}, with the belief shown, no detections"] = (
         steps(wide(sizes[-1], belief=True, detections=False), 0),
         sizes[-1],
     )
-    return found
+    return every
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -121,9 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         todo = programs(task, scenery, sizes)
         if policy == "recommended":
             todo["one that looks itself"] = looking(task, scenery), 1
-        found = interleaved({program: run for program, (run, _) in todo.items()}, options.seconds, clock)
+        durations = interleaved({program: run for program, (run, _) in todo.items()}, options.seconds, clock)
         for program, (_, size) in todo.items():
-            rates = Spread.of([1e3 * STEPS * size / each for each in found[program]])
+            rates = Spread.of([1e3 * STEPS * size / each for each in durations[program]])
             rows.append([name, program, *(number(value) for value in (rates.middle, rates.low, rates.high))])
             figures[f"{name}: {program}"] = asdict(rates)
             print(" | ".join(rows[-1]), flush=True)

@@ -162,9 +162,9 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
             left += still_there(children)
             if process.exitcode == -signal.SIGKILL:
                 files = [file for file in here.rglob("*") if file.is_file()]
-                parts = sum(file.suffix == ".part" for file in files)
-                progress.append(len(files) - parts)
-                remains.append(parts)
+                unfinished = sum(file.suffix == ".part" for file in files)
+                progress.append(len(files) - unfinished)
+                remains.append(unfinished)
                 finish(fork.Process(target=command.run, args=(here,)))
                 identical += command.digest(here) == expected
             else:
@@ -175,12 +175,12 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
 
 def descendants(number: int) -> list[int]:
     """All descendants of a process (on Linux; empty on other systems)."""
-    found: list[int] = []
+    numbers: list[int] = []
     for path in Path("/proc").glob(f"{number}/task/*/children"):
         with suppress(OSError):
             for child in map(int, path.read_text().split()):
-                found += [child, *descendants(child)]
-    return found
+                numbers += [child, *descendants(child)]
+    return numbers
 
 
 def still_there(numbers: list[int], seconds: float = 10.0) -> int:

@@ -32,8 +32,10 @@ def dirichlets(samples: int = 100) -> Comparison:
         return -value, -alpha * (digamma(alpha.sum()) - digamma(alpha) + logs)
 
     def with_scipy() -> np.ndarray:
-        found = minimize(lost, np.zeros(len(logs)), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8})
-        return np.exp(found.x)
+        solution = minimize(
+            lost, np.zeros(len(logs)), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8}
+        )
+        return np.exp(solution.x)
 
     def ours() -> Tensor:
         return mle(scores.log().mean(1))

@@ -43,7 +43,7 @@ from semfov.strategy import Strategy
 
 COLUMNS, ROWS, TARGET = 10, 10, 1
 EDGES = [50 * level / 640 for level in range(1, 8)]
-PARTS = ("sensor", "detector", "belief", "policy")
+STAGES = ("sensor", "detector", "belief", "policy")
 
 
 def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
@@ -108,13 +108,13 @@ def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
 def scanpath(
     eye: Eye, view: View, grid: semfov.Grid, strategy: Strategy, fixations: int, seed: int, clock: Clock
 ) -> list[float]:
-    """Milliseconds per fixation of each of `PARTS`, over one scanpath."""
+    """Milliseconds per fixation of each of `STAGES`, over one scanpath."""
     generator = torch.Generator().manual_seed(seed)
     acquisition = strategy.policy(TARGET, grid)
     visited = torch.zeros(1, len(grid), dtype=torch.bool)
     belief = strategy.observer.start(1, grid, torch.zeros(()))
     cell = torch.randint(len(grid), (1,), generator=generator)
-    totals = torch.zeros(len(PARTS), dtype=torch.float64)
+    totals = torch.zeros(len(STAGES), dtype=torch.float64)
     for _ in range(fixations):
         fixation = grid.centres[cell]
         stamps = [clock()]
@@ -134,8 +134,8 @@ def scanpath(
 
 def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
     """Median and quartiles, as text."""
-    found = Spread.of([scale * value for value in values])
-    return f"{found.middle:.{digits}f} ({found.low:.{digits}f}-{found.high:.{digits}f})"
+    quartiles = Spread.of([scale * value for value in values])
+    return f"{quartiles.middle:.{digits}f} ({quartiles.low:.{digits}f}-{quartiles.high:.{digits}f})"
 
 
 def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
@@ -156,7 +156,7 @@ def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: 
             print(f"| {threads} | {'on' if spinning else 'off'} | {cells} | {spread(ratios)} |")
 
 
-def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
+def report_stages(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
     """Print the times of the parts of a fixation."""
     grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
     opened: dict[int, float] = {}
@@ -179,12 +179,12 @@ def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: 
                     rows[name].append(row)
         for name, measured in rows.items():
             cells = " | ".join(f"{statistics.median(column):.2f}" for column in zip(*measured, strict=True))
-            shares = [1 - row[PARTS.index("detector")] / sum(row) for row in measured]
+            shares = [1 - row[STAGES.index("detector")] / sum(row) for row in measured]
             print(f"| {threads} | {name} | {cells} | {spread(shares, 100, 1)} |")
         opened[threads] = statistics.median(opening)
 
-    known = ", ".join(f"{time:.2f} ({threads})" for threads, time in opened.items())
-    print(f"\nletterbox and pyramid, once per image, ms (threads): {known}")
+    openings = ", ".join(f"{time:.2f} ({threads})" for threads, time in opened.items())
+    print(f"\nletterbox and pyramid, once per image, ms (threads): {openings}")
 
 
 def main() -> None:
@@ -213,7 +213,7 @@ def main() -> None:
             export_onnx(load_yolo("yolov3-tiny"), path)
         print(path.name)
         report_turns(path, image, options, clock)
-        report_parts(path, image, options, clock)
+        report_stages(path, image, options, clock)
 
 
 if __name__ == "__main__":

@@ -46,11 +46,11 @@ def paths() -> dict[str, Path]:
     vocus = VOCUS2()
     logs = draw(100, seed=0).log().mean(1)
     episodes = 40
-    seen, run = searches(episodes)
-    scene = sum(t.numel() * t.element_size() for t in (seen.boxes, seen.scores, seen.mask))
+    detections, run = searches(episodes)
+    scene = sum(t.numel() * t.element_size() for t in (detections.boxes, detections.scores, detections.mask))
     # Every look reads and writes an episode's map, and reads the detections from one of the scene's cells.
     looks = episodes * (SHIFTS + 1)
-    moved = looks * (4 * 2 * beta[0].numel() + scene // len(seen.boxes))
+    moved = looks * (4 * 2 * beta[0].numel() + scene // len(detections.boxes))
     blurs = "the bands of the pyramid are written and read again, each time in newly allocated memory"
     newton = (
         "limited by computation: Newton's steps, each with digamma and trigamma of every parameter in double precision"
@@ -94,8 +94,8 @@ def paths() -> dict[str, Path]:
 
 def limits(bandwidth: float, seconds: float, clock: Clock) -> dict[str, tuple[Path, Spread, float]]:
     """For each path, its milliseconds, and the share of the copy bandwidth that it reaches."""
-    found = {}
+    reached = {}
     for name, path in paths().items():
         spread = Spread.of(interleaved({name: path.run}, seconds, clock)[name])
-        found[name] = path, spread, path.bytes / (spread.middle / 1e3) / bandwidth
-    return found
+        reached[name] = path, spread, path.bytes / (spread.middle / 1e3) / bandwidth
+    return reached

@@ -27,16 +27,16 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     corner = torch.rand(100, 12, 2, generator=generator) * torch.tensor([560.0, 400.0])
     boxes = torch.cat([corner, corner + 20 + 60 * torch.rand(100, 12, 2, generator=generator)], -1)
     scores = (3 * torch.randn(100, 12, CLASSES + 1, generator=generator)).softmax(-1)
-    seen = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
+    detections = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
     todo = [episode(n) for n in range(episodes)]
     noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
     candidate = Candidate(Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive()))
 
     def run(count: int, batch: int) -> object:
-        looks = looks_of(todo[:count], seen, grid)
+        looks = looks_of(todo[:count], detections, grid)
         return run_episodes(todo[:count], candidate, looks, noise[:count], shifts=SHIFTS, batch=batch)
 
-    return seen, run
+    return detections, run
 
 
 def rollouts(episodes: int = 40) -> Comparison:

@@ -84,15 +84,15 @@ class Slicing(DetectionModel):
         shift_amount_list: list[list[int | float]] | None = None,
         full_shape_list: list[list[int | float]] | None = None,
     ) -> None:
-        seen: Any = self._original_predictions
+        predictions: Any = self._original_predictions
         # For a single image, SAHI may pass the values without the list around them.
         shift, shape = (
-            given[0] if given and isinstance(given[0], list) else given
-            for given in (shift_amount_list, full_shape_list)
+            values[0] if values and isinstance(values[0], list) else values
+            for values in (shift_amount_list, full_shape_list)
         )
-        labels = seen.labels[0] if self.target is None else torch.full_like(seen.labels[0], self.target)
-        scores = seen.confidence[0] if self.target is None else seen.scores[0, :, self.target]
-        names = self.category_mapping or {}
+        labels = predictions.labels[0] if self.target is None else torch.full_like(predictions.labels[0], self.target)
+        scores = predictions.confidence[0] if self.target is None else predictions.scores[0, :, self.target]
+        boxes, names = predictions.boxes[0], self.category_mapping or {}
         self._object_prediction_list_per_image = [
             [
                 ObjectPrediction(
@@ -103,7 +103,7 @@ class Slicing(DetectionModel):
                     shift_amount=shift or [0, 0],
                     full_shape=shape,
                 )
-                for box, label, score in zip(seen.boxes[0].tolist(), labels.tolist(), scores.tolist(), strict=True)
+                for box, label, score in zip(boxes.tolist(), labels.tolist(), scores.tolist(), strict=True)
                 if score >= self.confidence_threshold
             ]
         ]
@@ -165,25 +165,25 @@ def sliced(run: ZoomRun, pixels: NDArray[np.uint8], **merging: str) -> tuple[Obj
         verbose=0,
         **merging,
     )
-    kept = result.object_prediction_list
-    boxes = torch.tensor([each.bbox.to_xyxy() for each in kept], dtype=torch.float32).view(-1, 4)
-    labels = torch.tensor([each.category.id for each in kept], dtype=torch.long)
-    scores = torch.tensor([each.score.value for each in kept], dtype=torch.float32)
+    predictions = result.object_prediction_list
+    boxes = torch.tensor([each.bbox.to_xyxy() for each in predictions], dtype=torch.float32).view(-1, 4)
+    labels = torch.tensor([each.category.id for each in predictions], dtype=torch.long)
+    scores = torch.tensor([each.score.value for each in predictions], dtype=torch.float32)
     return Objects(boxes, scores, labels, torch.zeros_like(labels)), model.passes
 
 
 def ordered(run: ZoomRun, pixels: NDArray[np.uint8], order: Callable[[Lattice], Order]) -> tuple[Objects, int]:
     """Objects that an order of windows shows in a picture, and its passes."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
-    seen = [turn.glance for turn in islice(look_by_look(glances, order(glances.lattice), None), run.config.passes)]
-    return merge(seen, run.target, score=DETECTION_SCORE), len(seen)
+    looks = [turn.glance for turn in islice(look_by_look(glances, order(glances.lattice), None), run.config.passes)]
+    return merge(looks, run.target, score=DETECTION_SCORE), len(looks)
 
 
 def chosen(run: ZoomRun, pixels: NDArray[np.uint8], passes: int) -> tuple[Objects, int]:
     """Objects in the windows that semfov chooses, and its passes."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
-    seen = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
-    return merge(seen, run.target, score=DETECTION_SCORE), len(seen)
+    looks = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
+    return merge(looks, run.target, score=DETECTION_SCORE), len(looks)
 
 
 def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects, int]]]:

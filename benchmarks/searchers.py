@@ -66,10 +66,10 @@ def main() -> None:
     rows, figures = [], {}
     for side in options.sides:
         every = searchers(side)
-        found = interleaved({name: decide(value, side**2) for name, value in every.items()}, options.seconds, clock)
+        durations = interleaved({name: decide(value, side**2) for name, value in every.items()}, options.seconds, clock)
         best = choices(every["ideal observer"], side**2, options.episodes)
         for name, value in every.items():
-            milliseconds = Spread.of(found[name])
+            milliseconds = Spread.of(durations[name])
             same = float((choices(value, side**2, options.episodes) == best).double().mean())
             rows.append([f"{side} x {side}", name, spread(milliseconds), f"{100 * same:.0f} %"])
             figures[f"{name}, {side} x {side}"] = asdict(milliseconds) | {"same_choice": same}

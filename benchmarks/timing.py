@@ -83,7 +83,7 @@ def interleaved(
     Returns:
         Milliseconds of every program in every repetition.
     """
-    found: dict[str, list[float]] = {name: [] for name in runs}
+    durations: dict[str, list[float]] = {name: [] for name in runs}
     names, began, repetition = list(runs), time.perf_counter(), 0
     while repetition <= least or time.perf_counter() - began < seconds:
         first = repetition % len(names)
@@ -92,20 +92,20 @@ def interleaved(
             for _ in range(times):
                 runs[name]()
             if repetition:
-                found[name].append(1e3 * (clock() - start) / times)
+                durations[name].append(1e3 * (clock() - start) / times)
         repetition += 1
-    return found
+    return durations
 
 
 def measure(comparison: Comparison, seconds: float, clock: Clock, times: int = 1) -> Measured:
     """Check that the programs of a comparison agree, and time them (`interleaved`)."""
     comparison.agree()
-    found = interleaved({"semfov": comparison.ours, **comparison.peers}, seconds, clock, times=times)
+    durations = interleaved({"semfov": comparison.ours, **comparison.peers}, seconds, clock, times=times)
     for name, share in comparison.share.items():
-        found[name] = [value / share for value in found[name]]
-    ours = found["semfov"]
+        durations[name] = [value / share for value in durations[name]]
+    ours = durations["semfov"]
     ratios = {
-        name: Spread.of([theirs / mine for theirs, mine in zip(found[name], ours, strict=True)])
+        name: Spread.of([theirs / mine for theirs, mine in zip(durations[name], ours, strict=True)])
         for name in comparison.peers
     }
-    return Measured(comparison.name, {name: Spread.of(values) for name, values in found.items()}, ratios)
+    return Measured(comparison.name, {name: Spread.of(values) for name, values in durations.items()}, ratios)

@@ -60,9 +60,9 @@ def programs(agent: ZoomAgent, side: int, height: int) -> dict[str, tuple[Run, R
 
 def cost(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
     """Milliseconds of a task and of the detector alone, and their ratio."""
-    found = interleaved({"task": task, "detector": detector}, seconds, clock)
-    ratios = [ours / theirs for ours, theirs in zip(found["task"], found["detector"], strict=True)]
-    return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(ratios)
+    durations = interleaved({"task": task, "detector": detector}, seconds, clock)
+    ratios = [ours / theirs for ours, theirs in zip(durations["task"], durations["detector"], strict=True)]
+    return Spread.of(durations["task"]), Spread.of(durations["detector"]), Spread.of(ratios)
 
 
 @torch.inference_mode()

@@ -159,12 +159,12 @@ def search_example(config: FiguresConfig) -> Example:
 @styled
 def foveal_reconstruction(example: Example) -> Figure:
     """The photograph, and its foveal images with the wider and the narrower fovea."""
-    shown = {"photograph": example.image}
+    images = {"photograph": example.image}
     foveae: dict[str, SensorName] = {"fov100": "published", "fov50": "published-narrow"}
     for name, sensor in foveae.items():
-        shown[name] = example.foveated(sensor, example.fixation)
+        images[name] = example.foveated(sensor, example.fixation)
     figure, axes = example.pictures(1, 3, 3.2)
-    for panel, (title, image) in zip(axes, shown.items(), strict=True):
+    for panel, (title, image) in zip(axes, images.items(), strict=True):
         draw_image(panel, image, example.grid)
         panel.set_title(title)
     return figure
@@ -181,10 +181,10 @@ def detection_example(example: Example) -> Figure:
         panel.set_title(title)
     draw_cross(axes[1], example.fixation)
     lay_out(figure)
-    for panel, seen in zip(axes, looks, strict=True):
+    for panel, look in zip(axes, looks, strict=True):
         draw_look(
             panel,
-            confident_detections(seen, MOST),
+            confident_detections(look, MOST),
             example.scanpath.classes,
             example.frame,
             target=example.scanpath.target,
@@ -197,8 +197,8 @@ def foveal_scene(example: Example) -> Figure:
     """The foveal image, and the distance from the fovea to the centre of each box, as a share of the longer side."""
     figure, (axes,) = example.pictures(1, 1, 5.4)
     draw_image(axes, example.foveated("published", example.fixation), example.grid)
-    seen = confident_detections(example.scanpath.detections[0], MOST)
-    boxes = seen.boxes[0]
+    detections = confident_detections(example.scanpath.detections[0], MOST)
+    boxes = detections.boxes[0]
     middles = (boxes[:, :2] + boxes[:, 2:]) / 2
     x, y = (example.fixation + 0.5).tolist()
     for middle in middles.tolist():
@@ -208,7 +208,7 @@ def foveal_scene(example: Example) -> Figure:
     draw_boxes(axes, boxes, OTHER)
     lay_out(figure)
     distances = example.grid.box_distance(boxes, example.fixation).tolist()
-    names = [example.scanpath.classes[label] for label in seen.labels[0].tolist()]
+    names = [example.scanpath.classes[label] for label in detections.labels[0].tolist()]
     tags = [
         Tag((x1, y1, x2, y2), f"{name}, d = {distance:.2f}", OTHER)
         for (x1, y1, x2, y2), name, distance in zip(boxes.tolist(), names, distances, strict=True)
@@ -221,12 +221,12 @@ def ambiguities(example: Example) -> Figure | None:
     """An object whose class changes when it is seen from afar; None if there is none."""
     sharp = confident_detections(example.eye.detector(example.image[None]), MOST)
     everywhere = look_everywhere(example.eye, lambda: example.image[None], example.grid, None, str)
-    found = ambiguous(
+    pair = ambiguous(
         sharp, [confident_detections(everywhere[cell : cell + 1], MOST) for cell in range(len(example.grid))]
     )
-    if found is None:
+    if pair is None:
         return None
-    before, cell, after = found
+    before, cell, after = pair
     return ambiguity(example, before, after, example.grid.centres[cell])
 
 
@@ -240,7 +240,7 @@ def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detection
     Returns:
         The detection in the photograph, the number of the look, and its detection; None if no class changes.
     """
-    best, found = 0.0, None
+    best, pair = 0.0, None
     for number, look in enumerate(looks):
         same = box_iou(sharp.boxes[0], look.boxes[0]) >= SAME_OBJECT
         other = sharp.labels[0][:, None] != look.labels[0][None]
@@ -248,8 +248,8 @@ def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detection
         if sure.numel() and float(sure.max()) > best:
             best = float(sure.max())
             first, second = divmod(int(sure.argmax()), sure.shape[1])
-            found = _only(sharp, first), number, _only(look, second)
-    return found
+            pair = _only(sharp, first), number, _only(look, second)
+    return pair
 
 
 @styled
@@ -262,15 +262,15 @@ def ambiguity(example: Example, before: Detections, after: Detections, fixation:
     draw_cross(axes[1], fixation)
     axes[1].set_title("foveated")
     lay_out(figure)
-    for panel, seen in zip(axes, (before, after), strict=True):
-        draw_look(panel, seen, example.scanpath.classes, example.frame)
+    for panel, detections in zip(axes, (before, after), strict=True):
+        draw_look(panel, detections, example.scanpath.classes, example.frame)
     return figure
 
 
-def _only(seen: Detections, number: int) -> Detections:
+def _only(detections: Detections, number: int) -> Detections:
     """One detection of a look."""
     here = slice(number, number + 1)
-    return Detections(seen.boxes[:, here], seen.scores[:, here], seen.mask[:, here])
+    return Detections(detections.boxes[:, here], detections.scores[:, here], detections.mask[:, here])
 
 
 @styled
@@ -279,9 +279,9 @@ def grid_example(example: Example) -> Figure:
     from matplotlib.colors import ListedColormap
 
     figure, (axes,) = example.pictures(1, 1, 5.4)
-    grid, seen = example.grid, confident_detections(example.scanpath.detections[0], MOST)
+    grid, detections = example.grid, confident_detections(example.scanpath.detections[0], MOST)
     draw_image(axes, example.foveated("published", example.fixation), grid)
-    updated = grid.footprint(seen.boxes[0]).any(0)
+    updated = grid.footprint(detections.boxes[0]).any(0)
     draw_cells(axes, grid, updated.float().masked_fill(~updated, torch.nan), cmap=ListedColormap([GAZE]), alpha=0.45)
     draw_boxes(axes, grid.edges, "red", width=0.6)
     draw_boxes(axes, grid.edges[example.scanpath.cells[:1]], FOUND, width=3)
@@ -302,9 +302,9 @@ def saliency_example(example: Example) -> Figure:
         cells.append(int(select_fixation(values, visited, torch.zeros_like(values))))
     height, width = saliency.shape[-2:]
     pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(-1).float()
-    seen = visited[0, Grid(grid.columns, grid.rows, (width, height)).cell_of(pixels)].reshape(height, width)
+    visited_pixels = visited[0, Grid(grid.columns, grid.rows, (width, height)).cell_of(pixels)].reshape(height, width)
     figure, axes = example.pictures(1, 2, 4.2)
-    plot_saliency(saliency[0].masked_fill(seen, 0), view[0], title=f"VOCUS2 after {LOOKS} looks", axes=axes)
+    plot_saliency(saliency[0].masked_fill(visited_pixels, 0), view[0], title=f"VOCUS2 after {LOOKS} looks", axes=axes)
     axes[0].set_title("foveal image")
     lay_out(figure)
     fixations = grid.centres[cells[:LOOKS]]

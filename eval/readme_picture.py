@@ -30,9 +30,9 @@ def make_picture(path: Path) -> None:
     with torch.inference_mode():
         scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
     assert isinstance(scanpath, Scanpath)
-    seen = plot_foveated_strip(scanpath, most=3)
-    believed = plot_belief_strip(scanpath, most=3)
-    write_picture(stacked(render([seen, believed], dpi=105)), path)
+    views = plot_foveated_strip(scanpath, most=3)
+    beliefs = plot_belief_strip(scanpath, most=3)
+    write_picture(stacked(render([views, beliefs], dpi=105)), path)
 
 
 def make_zoom_picture(path: Path, weights: str | None) -> None:

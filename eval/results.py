@@ -36,13 +36,13 @@ from eval.page.tables import (
     agreement,
     beside_paper,
     by_samples,
+    markdown_table,
     paired,
     paired_maps,
     photographs,
     published,
     readings,
     study_table,
-    told_table,
 )
 from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
 from eval.search import search
@@ -68,18 +68,18 @@ def results(config: ResultsConfig) -> None:
             HANDLERS[type(runs[name])](runs[name])
     pages = (config.page, config.tables)
     texts = [read_page(page) for page in pages]
-    kept: list[str] = []
+    stale: list[str] = []
     for page, text in zip(pages, texts, strict=True):
         filled, others = fill_page(text, runs)
         write_text(page, filled)
-        kept += others
+        stale += others
     drawn = draw_figures(config.pictures, runs)
-    renewed = [found["name"] for text in texts for found in PLACE.finditer(text) if found["name"] not in kept]
-    kept += [
+    renewed = [match["name"] for text in texts for match in PLACE.finditer(text) if match["name"] not in stale]
+    stale += [
         f"{name}.png" for name in (*PAGE_FIGURES, THRESHOLD_FIGURE) if config.pictures / f"{name}.png" not in drawn
     ]
     print(f"\nrenewed: {', '.join([*renewed, *(path.name for path in drawn)]) or 'nothing'}")
-    print(f"kept, because experiments have not run: {', '.join(kept) or 'nothing'}")
+    print(f"kept, because experiments have not run: {', '.join(stale) or 'nothing'}")
     for path in [*pages, *drawn]:
         print(f"written: {path}")
 
@@ -118,17 +118,17 @@ def fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
     Raises:
         InputError: a comment names no table.
     """
-    kept = []
+    stale = []
 
-    def fill(found: re.Match[str]) -> str:
-        made = page_table(found["name"], runs)
+    def fill(match: re.Match[str]) -> str:
+        made = page_table(match["name"], runs)
         if missing(made.made_of, runs):
-            kept.append(found["name"])
-            return found[0]
+            stale.append(match["name"])
+            return match[0]
         source = origin(runs[name].out for name in made.made_of)
-        return "\n\n".join((f"<!-- table {found['name']} -- {source} -->", "\n".join(made.make(runs)), END))
+        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), END))
 
-    return PLACE.sub(fill, text), kept
+    return PLACE.sub(fill, text), stale
 
 
 def page_table(line: str, runs: Runs) -> PageTable:
@@ -172,19 +172,19 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
 """Functions that run an experiment, by the class of its settings."""
 
 TABLES: dict[str, Callable[[Path], list[str]]] = {
-    "search": partial(told_table, "summary.md", 0, columns=SEARCHED),
-    "explore": partial(told_table, "summary.md", 0, columns=EXPLORED),
-    "explore-objects": partial(told_table, "summary.md", 1, columns=EXPLORED),
-    "explore-cells": partial(told_table, "summary.md", 2, columns=EXPLORED),
+    "search": partial(markdown_table, "summary.md", 0, columns=SEARCHED),
+    "explore": partial(markdown_table, "summary.md", 0, columns=EXPLORED),
+    "explore-objects": partial(markdown_table, "summary.md", 1, columns=EXPLORED),
+    "explore-cells": partial(markdown_table, "summary.md", 2, columns=EXPLORED),
     "agreement": agreement,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
     "paired-by-hand": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 15, 30)),
-    "presence": partial(told_table, "decisions.md", 0),
-    "decisions": partial(told_table, "decisions.md", 1),
-    "differences": partial(told_table, "decisions.md", 2),
-    "landings": partial(told_table, "decisions.md", 3),
-    "by-looks": partial(told_table, "beliefs.md", 0, columns=BELIEVED),
-    "by-distance": partial(told_table, "beliefs.md", 1, columns=BELIEVED),
+    "presence": partial(markdown_table, "decisions.md", 0),
+    "decisions": partial(markdown_table, "decisions.md", 1),
+    "differences": partial(markdown_table, "decisions.md", 2),
+    "landings": partial(markdown_table, "decisions.md", 3),
+    "by-looks": partial(markdown_table, "beliefs.md", 0, columns=BELIEVED),
+    "by-distance": partial(markdown_table, "beliefs.md", 1, columns=BELIEVED),
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
     "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),
     "samples-objects": partial(by_samples, shifts=(1, 2, 5, 10, 20), field=OBJECTS),

@@ -64,9 +64,9 @@ def search_as_semba(config: SembaConfig) -> None:
     results: list[Tensor] = []
     scenes: list[int] = []
     for index in track(range(len(run.scenes)), "searching", "scene"):
-        found = search_scene(config, run, index)
-        results += found
-        scenes += [index] * len(found)
+        outcomes = search_scene(config, run, index)
+        results += outcomes
+        scenes += [index] * len(outcomes)
     if not results:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     figures = torch.stack(results)  # (searches, rules, figures)
@@ -76,10 +76,10 @@ def search_as_semba(config: SembaConfig) -> None:
         stopped, right = chosen[..., -2].mean(0), chosen[..., -1].sum(0) / chosen[..., -2].sum(0)
         return torch.cat([chosen[..., :-2].mean(0), torch.stack([stopped, right], -1)], -1)
 
-    told = Bootstrap.of(measure, scenes)
+    bootstrap = Bootstrap.of(measure, scenes)
     head = ["rule", *(f"CP@{n}" for n in _SHIFTS), "stopped", "right of those"]
     rows = [
-        [rule, *(percent(float(v), float(e)) for v, e in zip(told.value[n], told.error[n], strict=True))]
+        [rule, *(percent(float(v), float(e)) for v, e in zip(bootstrap.value[n], bootstrap.error[n], strict=True))]
         for n, rule in enumerate(_RULES)
     ]
     text = "\n".join([f"{len(results)} searches in {len(set(scenes))} photographs", "", *table([head, *rows]), ""])

@@ -152,20 +152,20 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
     common = {"data": config.data, "protocol": config.protocol, "store": config.store, **shared}
     common["belief"] = belief
     search = SearchRun(SearchConfig(policies=searchers, out=folder / "search", **common))
-    found = _curves(
+    performances = _curves(
         search, name, lambda records: performance(records, searchers, config.protocol.shifts, "all targets")
     )
     explore = ExploreRun(ExploreConfig(policies=(mapping,), out=folder / "explore", **common))
-    known = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
+    map_curves = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
     five = five_looks(search, model, config.classes)
     pixels, seconds = cost(search.eye, search.scenes[0].image)
     return [
         name,
         f"{pixels:,}",
         f"{1e3 * seconds:.0f}",
-        *(percent(*_at(found[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
+        *(percent(*_at(performances[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
         *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(five.value, five.error, strict=True)),
-        *(percent(*_at(known[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
+        *(percent(*_at(map_curves[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
     ]
 
 
@@ -242,17 +242,17 @@ def five_looks(run: SearchRun, model: FovealObservationModel | None, classes: in
         grid, annotation = run.grid(index), run.scenes.annotation(index)
         places = grid.extent * torch.tensor([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
         cells = grid.cell_of(places)
-        seen = run.detections(index)[cells]
+        detections = run.detections(index)[cells]
         boxes, labels = annotation.boxes[~annotation.crowd], annotation.labels[~annotation.crowd]
-        overlap = torch.stack([box_iou(boxes, each) for each in seen.boxes])
-        hits = (overlap >= _OVERLAP) & (seen.labels[:, None] == labels[:, None])
-        hits = (hits & (seen.confidence >= _SCORE)[:, None]).any(-1)
+        overlap = torch.stack([box_iou(boxes, each) for each in detections.boxes])
+        hits = (overlap >= _OVERLAP) & (detections.labels[:, None] == labels[:, None])
+        hits = (hits & (detections.confidence >= _SCORE)[:, None]).any(-1)
         objects[index] = torch.stack([hits[0].sum(), hits.any(0).sum(), torch.tensor(len(boxes))])
         chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
         if model is not None:
-            distance = grid.box_distance(seen.boxes, grid.centres[cells])
-            seen = replace(seen, scores=model.calibrate(seen.scores, distance))
-        highest = highest_score(seen, torch.tensor(chosen, dtype=torch.int64))
+            distance = grid.box_distance(detections.boxes, grid.centres[cells])
+            detections = replace(detections, scores=model.calibrate(detections.scores, distance))
+        highest = highest_score(detections, torch.tensor(chosen, dtype=torch.int64))
         scores.append(torch.stack([highest[0], highest.amax(0)], -1))
         there.append(present)
         groups.append(torch.full((len(chosen),), index))
@@ -261,11 +261,11 @@ def five_looks(run: SearchRun, model: FovealObservationModel | None, classes: in
 
     def measure(drawn: Tensor) -> Tensor:
         cases = torch.cat([of_scene[index] for index in drawn.tolist()])
-        told, found = label[cases], objects[drawn].sum(0)
+        truth, counts = label[cases], objects[drawn].sum(0)
         areas = torch.full((2,), torch.nan)
-        if told.any() and not told.all():
-            areas = torch.tensor([area_under_roc(score[cases, looks], told) for looks in range(2)])
-        return torch.cat([areas, found[:2] / found[2]])
+        if truth.any() and not truth.all():
+            areas = torch.tensor([area_under_roc(score[cases, looks], truth) for looks in range(2)])
+        return torch.cat([areas, counts[:2] / counts[2]])
 
     return Bootstrap.of(measure, range(len(run.scenes)), samples=200)
 

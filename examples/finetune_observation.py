@@ -45,9 +45,9 @@ def looks_at(scenes: semfov.EmbeddedScenes, eye: semfov.Eye, starts: int) -> lis
 
 def chance_of_hit(model: semfov.FovealObservationModel, looks: Looks, sharpness: float) -> Tensor:
     """Compute the probability that the next fixation, drawn from a softmax over the posterior, lands on the target."""
-    grid, cells, seen = looks.grid, looks.cells, looks.detections
+    grid, cells, detections = looks.grid, looks.cells, looks.detections
     observer = semfov.observers.Semantic(len(model.classes) + 1, model)
-    belief = observer(observer.start(len(cells), grid, seen.scores), seen, grid.centres[cells], grid)
+    belief = observer(observer.start(len(cells), grid, detections.scores), detections, grid.centres[cells], grid)
     here = torch.nn.functional.one_hot(cells, len(grid)).bool()
     hits = []
     for target, goal in looks.goals.items():

@@ -70,7 +70,7 @@ class Searches:
 
 def searches_in(scenes: semfov.EmbeddedScenes, eye: semfov.Eye) -> list[Searches]:
     """Look at every scene from all cells, and list its searches."""
-    found = []
+    searches = []
     for index in range(len(scenes)):
         scene = scenes[index]
         grid = semfov.Grid(COLUMNS, ROWS, scene.size)
@@ -79,8 +79,8 @@ def searches_in(scenes: semfov.EmbeddedScenes, eye: semfov.Eye) -> list[Searches
         classes, covered = torch.tensor(scenes.targets(index)), grid.footprint(scene.boxes)
         goals = torch.stack([covered[scene.labels == target].any(0) for target in classes])
         number, start = (~goals).nonzero(as_tuple=True)
-        found.append(Searches(StoredLooks(detections, grid, classes[number]), classes[number], start, goals[number]))
-    return found
+        searches.append(Searches(StoredLooks(detections, grid, classes[number]), classes[number], start, goals[number]))
+    return searches
 
 
 def run(searches: Searches, observer: semfov.observers.Observer, make: Maker, choice: Choice) -> tuple[Tensor, Tensor]:
@@ -96,7 +96,7 @@ def run(searches: Searches, observer: semfov.observers.Observer, make: Maker, ch
         The gaze shift that found each target, `(B,)`, with `SHIFTS + 1` for none; and the logarithm of the probability
         of all choices in a search if they are drawn from a softmax over the values, `(B,)`.
     """
-    found, logarithm = torch.full_like(searches.start, SHIFTS + 1), torch.zeros(len(searches.start))
+    shifts, logarithm = torch.full_like(searches.start, SHIFTS + 1), torch.zeros(len(searches.start))
     steps = semfov.rollout(
         searches.looks,
         observer,
@@ -107,10 +107,10 @@ def run(searches: Searches, observer: semfov.observers.Observer, make: Maker, ch
         ends=lambda step: searches.goal[step.episodes, step.next_cell],
     )
     for step in steps:
-        found[step.episodes[searches.goal[step.episodes, step.next_cell]]] = step.shift + 1
+        shifts[step.episodes[searches.goal[step.episodes, step.next_cell]]] = step.shift + 1
         shares = step.values.masked_fill(step.visited, -torch.inf).log_softmax(-1)
         logarithm = logarithm.index_add(0, step.episodes, shares.gather(-1, step.next_cell[:, None])[:, 0])
-    return found, logarithm
+    return shifts, logarithm
 
 
 def main() -> None:
@@ -134,8 +134,8 @@ def main() -> None:
     optimiser = torch.optim.Adam(network.parameters(), lr=0.01)
     for step in range(arguments.steps):
         searches = train[step % len(train)]
-        found, logarithm = run(searches, observer, lambda target: LearnedValue(network, target), Softmax(noise, 1.0))
-        value = torch.where(found <= SHIFTS, DISCOUNT**found, 0.0)
+        shifts, logarithm = run(searches, observer, lambda target: LearnedValue(network, target), Softmax(noise, 1.0))
+        value = torch.where(shifts <= SHIFTS, DISCOUNT**shifts, 0.0)
         optimiser.zero_grad()
         (-(value - value.mean()) * logarithm).mean().backward()
         optimiser.step()
@@ -148,9 +148,9 @@ def main() -> None:
     }
     for name, make in policies.items():
         with torch.no_grad():
-            found = torch.cat([run(searches, observer, make, Greedy(noise))[0] for searches in test])
-        shares = ", ".join(f"{100 * float((found <= n).float().mean()):.0f} % within {n}" for n in (1, 3, SHIFTS))
-        print(f"{name}: of {len(found)} targets in other scenes, gaze shifts find {shares}")
+            shifts = torch.cat([run(searches, observer, make, Greedy(noise))[0] for searches in test])
+        shares = ", ".join(f"{100 * float((shifts <= n).float().mean()):.0f} % within {n}" for n in (1, 3, SHIFTS))
+        print(f"{name}: of {len(shifts)} targets in other scenes, gaze shifts find {shares}")
 
 
 if __name__ == "__main__":

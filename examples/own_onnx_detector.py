@@ -26,11 +26,11 @@ def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> l
         scene = scenes[index]
         grid = semfov.Grid(10, 10, scene.size)
         for fixation in grid.centres[torch.randperm(len(grid), generator=generator)[:looks]]:
-            seen = eye(scene.image[None], fixation[None])[0]
-            scores.append(seen.scores)
-            distances.append(grid.box_distance(seen.boxes, fixation))
-            labels.append(match(seen.boxes, scene.boxes, scene.labels))
-    return [torch.cat(parts) for parts in (scores, distances, labels)]
+            detections = eye(scene.image[None], fixation[None])[0]
+            scores.append(detections.scores)
+            distances.append(grid.box_distance(detections.boxes, fixation))
+            labels.append(match(detections.boxes, scene.boxes, scene.labels))
+    return [torch.cat(column) for column in (scores, distances, labels)]
 
 
 def main() -> None:

@@ -63,10 +63,10 @@ def main() -> None:
         named = objects = 0
         for scene in (mosaics[index] for index in range(len(mosaics))):
             fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5
-            seen = eye.look(eye.open(scene.image[None]), fixations)
+            detections = eye.look(eye.open(scene.image[None]), fixations)
             for look, label in enumerate(scene.labels.tolist()):
-                here = box_iou(seen.boxes[look], scene.boxes[look, None])[:, 0] >= 0.5
-                named += bool((here & seen.mask[look] & (seen.scores[look, :, label] >= 0.5)).any())
+                here = box_iou(detections.boxes[look], scene.boxes[look, None])[:, 0] >= 0.5
+                named += bool((here & detections.mask[look] & (detections.scores[look, :, label] >= 0.5)).any())
             objects += len(scene.labels)
         print(f"{name}: {named} of {objects} objects are recognised when they are fixated")
 

@@ -57,10 +57,10 @@ class SimulatedCamera(PanTiltCamera):
         if direction != self._sent:
             self._send(direction)
         self.clock += self.interval
-        taken = self.where(self.clock - self.delay)
+        pan_tilt = self.where(self.clock - self.delay)
         # What `cv2.VideoCapture.read` returns: bytes (H, W, 3), blue first.
-        pixels = self.panorama.look_at(taken, field).mul(255).byte().permute(1, 2, 0).flip(-1).numpy()
-        return CameraFrame(pixels, taken) if self.reports else pixels
+        pixels = self.panorama.look_at(pan_tilt, field).mul(255).byte().permute(1, 2, 0).flip(-1).numpy()
+        return CameraFrame(pixels, pan_tilt) if self.reports else pixels
 
     def _send(self, direction: tuple[float, float]) -> None:
         here = self.where(self.clock)

@@ -22,8 +22,8 @@ class GazeNode(Node):
         detector = self.declare_parameter("detector", "yolov3-tiny").value
         self.agent = semfov.ActivePerception.recommended(detector)
         self.target, self.live = target, self.agent.live(target)
-        self.seen = self.create_publisher(Detection2DArray, "detections", 1)
-        self.found = self.create_publisher(Detection2DArray, "found", 1)
+        self.detections = self.create_publisher(Detection2DArray, "detections", 1)
+        self.decision = self.create_publisher(Detection2DArray, "found", 1)
         self.gaze = self.create_publisher(PointStamped, "gaze", 1)
         self.create_subscription(Image, "image", self.look, 1)
 
@@ -31,10 +31,10 @@ class GazeNode(Node):
         """Look at an image, and publish the detections, the box of a found target and the next gaze point."""
         moment = self.live.step(ros.picture(message))
         of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
-        found = ros.detection_array(moment.seen, self.agent.classes[1:], **of)
-        self.seen.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
-        found = ros.found_array(moment.decision, self.target, **of)
-        self.found.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
+        array = ros.detection_array(moment.seen, self.agent.classes[1:], **of)
+        self.detections.publish(ros.fill(Detection2DArray(), array, Detection2D, ObjectHypothesisWithPose))
+        array = ros.found_array(moment.decision, self.target, **of)
+        self.decision.publish(ros.fill(Detection2DArray(), array, Detection2D, ObjectHypothesisWithPose))
         self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(moment.next_point, **of)))
 
 

@@ -45,8 +45,8 @@ class CellFeatures(BaseFeaturesExtractor):
 
     def forward(self, observations: Tensor) -> Tensor:
         """Map belief planes `(B, C, Y, X)` to one number per cell, `(B, X·Y)`."""
-        found: Tensor = self.layers(observations)
-        return found
+        numbers: Tensor = self.layers(observations)
+        return numbers
 
 
 class CellPolicy(MaskableActorCriticPolicy):
@@ -59,9 +59,9 @@ class CellPolicy(MaskableActorCriticPolicy):
         options: keyword arguments of `MaskableActorCriticPolicy`.
     """
 
-    def __init__(self, *given: Any, **options: Any) -> None:
+    def __init__(self, *arguments: Any, **options: Any) -> None:
         layers = {"net_arch": {"pi": [], "vf": [64]}, "share_features_extractor": False}
-        super().__init__(*given, **{**options, "features_extractor_class": CellFeatures, **layers})
+        super().__init__(*arguments, **{**options, "features_extractor_class": CellFeatures, **layers})
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -131,9 +131,9 @@ def main() -> None:
         "trained": TrainedAgent(model),
     }
     for name, agent in agents.items():
-        found = np.array([each.found_at for each in run_agent(judged, agent, episodes)])
-        shares = ", ".join(f"{100 * ((found > 0) & (found <= n)).mean():.0f} % within {n}" for n in (1, 3, 10))
-        print(f"{name}: of {len(found)} targets in other scenes, gaze shifts find {shares}")
+        shifts = np.array([each.found_at for each in run_agent(judged, agent, episodes)])
+        shares = ", ".join(f"{100 * ((shifts > 0) & (shifts <= n)).mean():.0f} % within {n}" for n in (1, 3, 10))
+        print(f"{name}: of {len(shifts)} targets in other scenes, gaze shifts find {shares}")
 
 
 if __name__ == "__main__":

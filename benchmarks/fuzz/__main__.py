@@ -43,8 +43,8 @@ def main() -> None:
         total += outcomes
         cells = [sum(outcomes.values()), *(outcomes[kind] for kind in ("right", "refused by name", "else"))]
         print(f"| {name} | {' | '.join(map(str, cells))} | {seconds:.0f} |", flush=True)
-    told = ", ".join(f"{total[kind]} {kind}" for kind in ("right", "refused by name", "else"))
-    print(f"\n{sum(total.values())} cases: {told}")
+    counts = ", ".join(f"{total[kind]} {kind}" for kind in ("right", "refused by name", "else"))
+    print(f"\n{sum(total.values())} cases: {counts}")
     sys.exit(1 if total["else"] else 0)
 
 

@@ -58,7 +58,7 @@ def annotation_files(data: st.DataObject) -> str:
         assert failed(result) or not outside, "a file outside of the root was taken"
     if failed(result):
         if damage == "none":
-            assert not expected(document, **options) or not known_categories(document), result
+            assert not expected(document, **options) or not has_common_category(document), result
         return outcome(result)
     assert isinstance(result, CocoScenes)
     for index, annotation in enumerate(map(result.annotation, range(len(result)))):
@@ -69,13 +69,13 @@ def annotation_files(data: st.DataObject) -> str:
         assert bool(((annotation.labels >= 1) & (annotation.labels <= len(CLASSES))).all())
         assert result.targets(index) == sorted(set(annotation.labels.tolist()))
     if damage == "none":
-        kept = expected(document, **options)
-        assert result.ids == list(kept)
-        for index, image in enumerate(kept):
-            found = result.annotation(index)
-            rows = [[*box, label] for box, label in zip(found.boxes.tolist(), found.labels.tolist(), strict=True)]
+        rows_by_image = expected(document, **options)
+        assert result.ids == list(rows_by_image)
+        for index, image in enumerate(rows_by_image):
+            objects = result.annotation(index)
+            rows = [[*box, label] for box, label in zip(objects.boxes.tolist(), objects.labels.tolist(), strict=True)]
             np.testing.assert_allclose(
-                np.reshape(rows, (-1, 5)), np.reshape(kept[image], (-1, 5)), rtol=1e-6, atol=1e-6
+                np.reshape(rows, (-1, 5)), np.reshape(rows_by_image[image], (-1, 5)), rtol=1e-6, atol=1e-6
             )
     return "result"
 
@@ -109,14 +109,14 @@ def draw_document(data: st.DataObject) -> dict[str, Any]:
 
 def places(document: dict[str, Any]) -> list[tuple[Any, Any]]:
     """All values that matter, each as its container and its key."""
-    found: list[tuple[Any, Any]] = [(document, key) for key in document]
+    values: list[tuple[Any, Any]] = [(document, key) for key in document]
     for table in document.values():
-        found += [(table, index) for index in range(len(table))]
-        found += [(entry, key) for entry in table for key in entry if key != "area"]
-    return found
+        values += [(table, index) for index in range(len(table))]
+        values += [(entry, key) for entry in table for key in entry if key != "area"]
+    return values
 
 
-def known_categories(document: dict[str, Any]) -> bool:
+def has_common_category(document: dict[str, Any]) -> bool:
     """Whether the detector knows any of the categories."""
     return any(category["name"] in LABELS for category in document["categories"])
 
@@ -126,7 +126,7 @@ def expected(
 ) -> dict[int, list[list[float]]]:
     """Rows `[x1, y1, x2, y2, label]` of every image that should be kept, by a plain loop."""
     names = {category["id"]: category["name"] for category in document["categories"]}
-    kept = {}
+    rows_by_image = {}
     for image in sorted(entry["id"] for entry in document["images"]):
         instances, rows = 0, []
         for entry in document["annotations"]:
@@ -141,5 +141,5 @@ def expected(
             if names[entry["category_id"]] in LABELS:
                 rows.append([*box, float(LABELS[names[entry["category_id"]]])])
         if instances >= min_instances:
-            kept[image] = rows
-    return kept
+            rows_by_image[image] = rows
+    return rows_by_image

@@ -39,7 +39,7 @@ def agent_arguments(data: st.DataObject) -> str:
     rng = draw_rng(data)
     kind = choose(data, PICTURES, "image")
     image = picture(kind, rng)
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     wrong = set() if kind in ("ordinary", "bytes", "float64", "half") else {"picture"}
     ranges = {"shifts": (0, 10_000), "seed": (0, 2**63 - 1), "start": (0, 11)}
     for name, (low, high) in ranges.items():
@@ -48,21 +48,21 @@ def agent_arguments(data: st.DataObject) -> str:
         value = choose(data, NUMBERS, name)
         if name in ("start", "shifts") and value is None:
             continue
-        given[name] = value
+        arguments[name] = value
         if not (isinstance(value, int) and not isinstance(value, bool) and low <= value <= high):
             wrong.add(name)
     observer = observers.Semantic(3)
     eye = Eye(Foveation(10.0), Plain(), reference=64.0)
     agent = ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
     seek = data.draw(st.booleans(), label="search")
-    result = attempt(lambda: agent.search(image, "cup", **given) if seek else agent.explore(image, **given))
+    result = attempt(lambda: agent.search(image, "cup", **arguments) if seek else agent.explore(image, **arguments))
     if failed(result):
         name = str(result).partition(":")[0]
         assert name in wrong, result
         return outcome(result)
-    assert not wrong, f"{wrong} let through: {given}"
+    assert not wrong, f"{wrong} let through: {arguments}"
     assert isinstance(result, Scanpath)
-    assert 1 <= len(result.cells) <= min(given.get("shifts", 30 if seek else 20), 11) + 1
+    assert 1 <= len(result.cells) <= min(arguments.get("shifts", 30 if seek else 20), 11) + 1
     assert bool(((result.cells >= 0) & (result.cells < 12)).all())
     return "result"
 
@@ -92,8 +92,8 @@ def settings_values(data: st.DataObject) -> str:
     edges = [e for bound in (allowed.low, allowed.high, allowed.above) if math.isfinite(bound)
              for e in (bound - 1, bound, bound + 1, bound + 0.5)]  # fmt: skip
     value = choose(data, [*NUMBERS, *edges, *([None] if optional else [])], "value")
-    given = {"policy": "random", name: value} if kind is settings.PolicyConfig else {name: value}
-    result = attempt(lambda: kind(**given))
+    values = {"policy": "random", name: value} if kind is settings.PolicyConfig else {name: value}
+    result = attempt(lambda: kind(**values))
     number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     fits = number and (base is float or isinstance(value, int))
     fits = fits and max(allowed.low, -math.inf) <= value <= allowed.high and value > allowed.above
@@ -109,10 +109,10 @@ def settings_values(data: st.DataObject) -> str:
 
 def fields_of(kind: type[Any]) -> list[tuple[str, type, Range, bool]]:
     """Name, type and range of every number among the settings, and whether it may be None."""
-    found = []
+    ranges = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         for option in (hint, *get_args(hint)):
             if get_origin(option) is Annotated and isinstance(get_args(option)[1], Range):
                 base, allowed = get_args(option)[:2]
-                found.append((name, base, allowed, option is not hint))
-    return found
+                ranges.append((name, base, allowed, option is not hint))
+    return ranges

@@ -63,8 +63,8 @@ def check(path: object, selection: Selection, size: tuple[int, int], cells: int)
     visited = path.cells.tolist()
     assert len(set(visited)) == len(visited) == min(4, cells)
     assert all(0 <= cell < cells for cell in visited)
-    for seen in path.detections:
-        boxes, scores = seen.boxes[seen.mask], seen.scores[seen.mask]
+    for look in path.detections:
+        boxes, scores = look.boxes[look.mask], look.scores[look.mask]
         assert len(boxes) <= selection.limit
         assert bool(((boxes >= 0) & (boxes <= torch.tensor([size] * 2).flatten())).all())
         assert bool((boxes[:, 2:] > boxes[:, :2]).all())

@@ -64,8 +64,8 @@ def model_fields(data: st.DataObject) -> str:
     for name, tensor in result._tensors().items():
         assert torch.equal(tensor, tensors[name]), name
         assert bool(tensor.isfinite().all())
-    told = json.loads(json.dumps({**result._record(), "metadata": result.metadata}))
-    assert all(told[key] == record[key] for key in told if key in record), damage
+    restored = json.loads(json.dumps({**result._record(), "metadata": result.metadata}))
+    assert all(restored[key] == record[key] for key in restored if key in record), damage
     if isinstance(result, FovealObservationModel):
         assert 0 < float(result.tempering) <= 100
         assert result.miss_rate is None or bool(((result.miss_rate >= 0) & (result.miss_rate <= 1)).all())

@@ -71,10 +71,10 @@ def onnx_files(data: st.DataObject) -> str:
         assert faults, result
         return outcome(result)
     assert isinstance(result, tuple)
-    detector, found = result
-    assert bool(found.boxes.isfinite().all())
-    assert found.scores.shape[-1] == len(detector.classes) + 1
-    assert bool(((found.scores.sum(-1) - 1).abs() < 1e-3)[found.mask].all())
+    detector, detections = result
+    assert bool(detections.boxes.isfinite().all())
+    assert detections.scores.shape[-1] == len(detector.classes) + 1
+    assert bool(((detections.scores.sum(-1) - 1).abs() < 1e-3)[detections.mask].all())
     return "result"
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from eval.comparison.run import Run
-from eval.decide.run import landing, seen_on_landing
+from eval.decide.run import detected_on_landing, landing
 from eval.search.config import SearchConfig
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.episode import Step, Stopwatch, rollout
@@ -146,7 +146,7 @@ class BeliefCalibrationRun(Run):
             steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
             judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
             beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
-        return {"seen": seen_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
+        return {"seen": detected_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
 
 
 def judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:

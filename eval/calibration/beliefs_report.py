@@ -12,7 +12,7 @@ from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
-from eval.decide.run import LANDINGS, LANDINGS_TOLD, landing_cells
+from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
@@ -58,8 +58,8 @@ def add_up(records: Iterable[ResultRecord]) -> Sums:
     """Add up the sums of all searches."""
     sums: Sums = defaultdict(BinarySums.nothing)
     for record in records:
-        for belief, told in record["beliefs"].items():
-            for looks, groups in told["looks"].items():
+        for belief, measures in record["beliefs"].items():
+            for looks, groups in measures["looks"].items():
                 for group, values in groups.items():
                     sums[belief, int(looks), group] += BinarySums.from_record(values)
     return dict(sums)
@@ -83,8 +83,8 @@ def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCali
     last = judged_after(sums)[-1]
     by_distance = [["distance", "belief", "cells", *_HEAD]]
     for group in CELL_GROUPS:
-        told = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
-        by_distance += [[group, belief, str(each.count), *measures_row(each)] for belief, each in told]
+        pairs = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
+        by_distance += [[group, belief, str(each.count), *measures_row(each)] for belief, each in pairs]
     notes = [
         f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
     ]
@@ -109,7 +109,7 @@ def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCali
             "",
             *table(by_distance),
             "",
-            LANDINGS_TOLD,
+            LANDINGS_TEXT,
             "",
             *table([["belief", *LANDINGS], *landing_table(records)]),
             "",
@@ -150,11 +150,11 @@ def beliefs_csv(sums: Sums) -> str:
 
 def beliefs_json(sums: Sums) -> str:
     """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
-    told = [
+    entries = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
         for belief, looks, group, each in sums_by_name(sums)
     ]
-    return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": told}) + "\n"
+    return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
 
 
 def sums_by_name(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:

@@ -35,13 +35,13 @@ def with_models(config: _Config) -> _Config:
         return config
     folder = ModelFolder(config.models)
     for name in ("model", "target_model", "map_model"):
-        given = getattr(config.belief, name)
-        check(given is None, f"belief.{name}", "null, since models defines it", given)
+        value = getattr(config.belief, name)
+        check(value is None, f"belief.{name}", "null, since models defines it", value)
     files = {part: folder.file(part) for part in ("observation", "evidence", "map")}
     names = {"model": "observation", "target_model": "evidence", "map_model": "map"}
     columns, rows = folder.manifest.grid
-    told: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
-    belief = replace(config.belief, columns=columns, rows=rows, **told)  # type: ignore[arg-type]
+    models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
+    belief = replace(config.belief, columns=columns, rows=rows, **models)  # type: ignore[arg-type]
     detector = detector_of(folder, config.detector)
     named = type(config)().policies != config.policies
     policies = tuple(recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
@@ -59,12 +59,12 @@ def with_models(config: _Config) -> _Config:
     return config.complete(folder)
 
 
-def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
-    """The settings of a folder's detector; name and weights in `given` are the new locations of its files."""
-    moved = None if given.name == DetectorConfig().name else given.name
-    source, options = folder.detector_source(moved, given.weights)
-    known = {field.name for field in fields(DetectorConfig)}
-    options = {name: value for name, value in options.items() if name in known}
+def detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig:
+    """The settings of a folder's detector; name and weights in `settings` are the new locations of its files."""
+    moved = None if settings.name == DetectorConfig().name else settings.name
+    source, options = folder.detector_source(moved, settings.weights)
+    names = {field.name for field in fields(DetectorConfig)}
+    options = {name: value for name, value in options.items() if name in names}
     if options.get("classes") is not None:
         options["classes"] = tuple(options["classes"])
     if "weights" in options:

@@ -66,8 +66,8 @@ def write_run_report(
         title = escape(titles[average])
         sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
         sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
-    told = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
-    settings = escape(yaml.safe_dump(told, sort_keys=False))
+    values = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
+    settings = escape(yaml.safe_dump(values, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
     data = _episodes(run, choose_episodes(records, list(run.policies), episodes))
     title = f"semfov: {run.task} with {run.eye.detector.name}"

@@ -50,13 +50,13 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
     Returns:
         The mean curve with its standard errors.
     """
-    told = [(record["scene"], record["repetition"], measure(record)) for record in records]
-    means = np.stack([*by_scene((scene, curve) for scene, _, curve in told).values()])
+    rows = [(record["scene"], record["repetition"], measure(record)) for record in records]
+    means = np.stack([*by_scene((scene, curve) for scene, _, curve in rows).values()])
     repetitions = defaultdict(list)
-    for scene, repetition, curve in told:
+    for scene, repetition, curve in rows:
         repetitions[repetition].append((scene, curve))
     over_repetitions = np.stack([np.mean([*by_scene(group).values()], axis=0) for group in repetitions.values()])
-    return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(told))
+    return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(rows))
 
 
 def collect_records(run: Run) -> tuple[list[ResultRecord], dict[str, float]]:
@@ -164,7 +164,7 @@ MANIFEST = "manifest.json"
 
 def manifest(run: Run, program: str, seconds: dict[str, float]) -> str:
     """Provenance of the results as JSON: commit, day, versions, checksums, seed, and the time of each stage."""
-    told = {
+    record = {
         "command": ["python", "-m", program, *sys.argv[1:]],
         "commit": commit(),
         "date": datetime.now(UTC).date().isoformat(),
@@ -186,7 +186,7 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> str:
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
     }
-    return json.dumps(told, indent=2) + "\n"
+    return json.dumps(record, indent=2) + "\n"
 
 
 def sensing(run: Run) -> str:

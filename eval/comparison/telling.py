@@ -22,7 +22,7 @@ TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]
 CALIBRATED = ["ECE", "by chance"]
 """Column headings of `calibrated`."""
 
-ERRORS_TOLD = (
+ERRORS_TEXT = (
     "± is the standard error, and two numbers in brackets are a 95 % interval, both by bootstrap over scenes, since "
     "the searches of a scene are not independent. `by chance`: the ECE that perfectly calibrated probabilities would "
     "have in as many searches, its mean and the limit below which 95 % of them are."
@@ -45,7 +45,7 @@ class Telling:
     """Scores of the same searches by several ways to search, with the places that these report.
 
     Args:
-        told: scores `(M,)` of the searches, by name of the way.
+        by_name: scores `(M,)` of the searches, by name of the way.
         there: `(M,)` boolean, whether the target is present.
         scenes: the scene of each search.
         right: by name of the way, `(M,)`: 1 where it reports the right place, 0 for a wrong one, NaN for none. Ways
@@ -58,16 +58,16 @@ class Telling:
 
     def __init__(
         self,
-        told: Mapping[str, Tensor],
+        by_name: Mapping[str, Tensor],
         there: Tensor,
         scenes: Sequence[Hashable],
         right: Mapping[str, Tensor] | None = None,
     ) -> None:
-        self.names = list(told)
+        self.names = list(by_name)
         self.places = right or {}
-        scores = [score.double() for score in told.values()]
+        scores = [score.double() for score in by_name.values()]
         nowhere = torch.full((len(there),), torch.nan, dtype=torch.float64)
-        places = torch.stack([self.places.get(name, nowhere).double() for name in told])
+        places = torch.stack([self.places.get(name, nowhere).double() for name in by_name])
 
         def measure(index: Tensor) -> Tensor:
             figures = torch.tensor([tells(score[index], there[index]) for score in scores], dtype=torch.float64)

@@ -73,11 +73,11 @@ class ThresholdEyes:
         """Look from one fixation `(1, 2)`; returns detections at each threshold, batches of one without padding."""
         canvas = self._eye.foveated(view, fixation)
         candidates = self._eye.detector.propose(canvas)
-        found = []
+        looks = []
         for detector, eye in zip(self._proposed, self._eyes, strict=True):
             detector.candidates = candidates
-            found.append(tight(eye.detect(view, fixation, canvas)))
-        return found
+            looks.append(tight(eye.detect(view, fixation, canvas)))
+        return looks
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,9 @@ class ThresholdLooking(Looking):
                 view, centres = self.eyes.open(image), grid.centres.to(image)
                 looks = [self.eyes.look(view, centre[None]) for centre in centres]
             for number in missing:
-                self.stores[number].save(digest, {cell: seen[number] for cell, seen in enumerate(looks)})
+                self.stores[number].save(
+                    digest, {cell: by_threshold[number] for cell, by_threshold in enumerate(looks)}
+                )
         return [], {}
 
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from eval.comparison.telling import CALIBRATED, ERRORS_TOLD, FREQUENCY, TELLING, Telling, calibrated
-from eval.decide.run import AGENT, LANDINGS, LANDINGS_TOLD, UNVERIFIED, landing_cells
+from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
+from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, UNVERIFIED, landing_cells
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 
@@ -19,25 +19,25 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     first = groups[names[0]]
-    told = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
-    told[SHARP] = torch.tensor([record["sharp"] for record in first])
-    told["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
-    told[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
-    return told, torch.tensor([record["present"] for record in first])
+    scores = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
+    scores[SHARP] = torch.tensor([record["sharp"] for record in first])
+    scores["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+    scores[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
+    return scores, torch.tensor([record["present"] for record in first])
 
 
 def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     """The tables, as Markdown."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
-    told, there = probabilities(records)
+    scores, there = probabilities(records)
     first = groups[names[0]]
     places = {name: torch.tensor([reported(record) for record in group]) for name, group in groups.items()}
-    telling = Telling(told, there, [record["scene"] for record in first], {**places, SHARP: sharp_places(first)})
+    telling = Telling(scores, there, [record["scene"] for record in first], {**places, SHARP: sharp_places(first)})
     rows = [["", *TELLING, *CALIBRATED]]
     # The references give scores, not probabilities.
-    errors = [calibrated(told[name], there) if name in groups else ["-", "-"] for name in told]
-    rows += [[name, *figures, *error] for name, figures, error in zip(told, telling.rows(), errors, strict=True)]
+    errors = [calibrated(scores[name], there) if name in groups else ["-", "-"] for name in scores]
+    rows += [[name, *figures, *error] for name, figures, error in zip(scores, telling.rows(), errors, strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
                 "expected", "IoU"]]  # fmt: skip
     for name, group in groups.items():
@@ -67,7 +67,7 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
         [
             f"Is the target present? {len(there)} searches ({sensed}), {int(there.sum())} of them for a present class. "
             "Hit rates in % at the given false alarm rates, and the expected calibration error (ECE) of the final "
-            f"probability. {ERRORS_TOLD} `{FREQUENCY}`: the share of the other scenes that hold the class; absent "
+            f"probability. {ERRORS_TEXT} `{FREQUENCY}`: the share of the other scenes that hold the class; absent "
             "classes are drawn with equal probability.",
             "",
             *table(rows),
@@ -85,7 +85,7 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
             "",
             *telling.differences(names[0]),
             "",
-            LANDINGS_TOLD,
+            LANDINGS_TEXT,
             "",
             *table([["", *LANDINGS], *landing_rows(groups)]),
             "",
@@ -108,19 +108,19 @@ def sharp_finds(records: Sequence[ResultRecord]) -> list[bool]:
 
 def sharp_places(records: Sequence[ResultRecord]) -> Tensor:
     """The same as `reported` for one sharp look, `(M,)`."""
-    told = zip(records, sharp_finds(records), strict=True)
-    return torch.tensor([float(record["sharp_place"]["right"]) if found else torch.nan for record, found in told])
+    pairs = zip(records, sharp_finds(records), strict=True)
+    return torch.tensor([float(record["sharp_place"]["right"]) if found else torch.nan for record, found in pairs])
 
 
 def sharp_decisions(records: Sequence[ResultRecord], place: str) -> list[str]:
     """Row of one sharp look (`sharp_finds`), whose share of right places is `place`."""
-    told = [record for record, found in zip(records, sharp_finds(records), strict=True) if found]
-    there = [record["sharp_place"]["overlap"] for record in told if record["present"]]
+    finds = [record for record, found in zip(records, sharp_finds(records), strict=True) if found]
+    there = [record["sharp_place"]["overlap"] for record in finds if record["present"]]
     present = sum(record["present"] for record in records)
     return [
         "one sharp look",
         share(len(there), present),
-        share(len(told) - len(there), len(records) - present),
+        share(len(finds) - len(there), len(records) - present),
         "-",
         "1.0",
         "1.0",

@@ -44,7 +44,7 @@ PUBLISHED, CALIBRATED = "published belief", "calibrated belief"
 """Beliefs by Kaplan's rule from calibrated scores: with an observation model of the paper's, fitted by maximum
 likelihood, or with one that is trained for the posterior of the class."""
 
-SEEN_FROM = 0.5
+GAZE_SCORE = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
 
 
@@ -126,8 +126,8 @@ class DecisionRun(Run):
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
-        given = [config.confirm, config.give_up, config.place, config.closer]
-        return {**super().depends_on(), "decisions": given, "verification": self.verification}
+        thresholds = [config.confirm, config.give_up, config.place, config.closer]
+        return {**super().depends_on(), "decisions": thresholds, "verification": self.verification}
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
@@ -159,7 +159,7 @@ class DecisionRun(Run):
                 "present": bool(goal.any()),
                 "sharp": float(highest_score(sharp, target)),
                 "frequency": float(self.frequencies[index][target]),
-                "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
+                "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)),
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
             looks = StoredLooks(detections, grid, torch.tensor([target]))
@@ -171,14 +171,14 @@ class DecisionRun(Run):
                 verifier = self._verifier(closer, grid, target) if name in self.verified else None
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
-                    last, seen = steps[-1], torch.cat([step.cell for step in steps])
+                    last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
                         decision = verifier.conclude()
                     else:
                         # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                         place = int(last.cell) if judge is at_the_gaze else None
-                        shown = [detections[cell] for cell in seen.split(1)]
-                        decision = conclude(int(rule(last)), last.belief, shown, grid, target, place)
+                        visited = [detections[cell] for cell in path.split(1)]
+                        decision = conclude(int(rule(last)), last.belief, visited, grid, target, place)
                 closely = 0 if verifier is None else len(verifier.looks)
                 records.append(
                     {
@@ -191,8 +191,8 @@ class DecisionRun(Run):
                         "closer": closely,
                         "right_place": None if decision.cell is None else bool(goal[decision.cell]),
                         "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
-                        "landing": landing([step.belief for step in steps], seen, goal, target),
-                        "landing_seen": seen_on_landing(steps, seen, goal, target, grid),
+                        "landing": landing([step.belief for step in steps], path, goal, target),
+                        "landing_seen": detected_on_landing(steps, path, goal, target, grid),
                     }
                 )
         watch.lap("search")
@@ -200,15 +200,15 @@ class DecisionRun(Run):
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
-    """The rule that ends a search when a detection at the gaze shows the target with a score of `SEEN_FROM` or more."""
-    return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
+    """The rule that ends a search when a detection at the gaze shows the target with at least the `GAZE_SCORE`."""
+    return confirms(step.detections, grid, step.cell, target, GAZE_SCORE).long()
 
 
-def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> ResultRecord | None:
+def sharp_place(detections: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> ResultRecord | None:
     """Whether the centre of the target's most confident detection lies on the target, and how well its box fits.
 
     Args:
-        seen: detections of one look, a batch of one.
+        detections: detections of one look, a batch of one.
         grid: the grid over the image.
         target: the target's class, 1..K.
         goal: `(X·Y,)` boolean, the cells that the target overlaps.
@@ -217,10 +217,10 @@ def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: 
     Returns:
         A record with `right` and `overlap`; None if no detection has a score for the target.
     """
-    score = seen.scores[0, :, target] * seen.mask[0]
+    score = detections.scores[0, :, target] * detections.mask[0]
     if not bool((score > 0).any()):
         return None
-    box = seen.boxes[0, int(score.argmax())]
+    box = detections.boxes[0, int(score.argmax())]
     cell = int(grid.footprint(box[None], "soft")[0].argmax())
     return {"right": bool(goal[cell]), "overlap": overlap(box, boxes)}
 
@@ -258,7 +258,7 @@ def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> 
     return [float(belief.probability(target)[0, cells[hits[0]]]) for belief in pair]
 
 
-def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
+def detected_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
     """Whether the first look that lands on the target sees it.
 
     The look sees the target if the target is the best class of a detection over the fixated cell.
@@ -283,7 +283,7 @@ def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, 
 LANDINGS = ["landings", "p", "seen", "p, seen", "not seen", "p, not seen"]
 """Column headings of `landing_cells`."""
 
-LANDINGS_TOLD = (
+LANDINGS_TEXT = (
     "Probability of the target in the first fixated cell that overlaps it (the landing), before and after that look. "
     "The target counts as seen where it is the best class of a detection over that cell."
 )

@@ -52,8 +52,8 @@ class ExploreRun(Run):
             records += [self._record(name, answers, *pair) for pair in zip(episodes, outcomes, strict=True)]
         with torch.inference_mode():
             sharp = self.eye.detector(self.scenes[index].image[None])
-            for name, known in sharp_maps(sharp, grid).items():
-                counts = [tuple(each.tolist()) * (protocol.shifts + 1) for each in counts_of(known, answers)]
+            for name, probabilities in sharp_maps(sharp, grid).items():
+                counts = [tuple(each.tolist()) * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
                 records += [self._record(name, answers, episode, Progress((), *counts)) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds

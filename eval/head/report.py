@@ -130,12 +130,12 @@ def _curves(records: list[ResultRecord], config: HeadConfig):  # type: ignore[no
     from matplotlib.figure import Figure
 
     seconds = np.linspace(0, config.seconds, 101)
-    wanted: dict[str, tuple[str, Callable[..., float]]] = {
+    measures: dict[str, tuple[str, Callable[..., float]]] = {
         "search": ("share of targets found", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
         "exploration": ("share of cells named right", lambda r, s: value_by(r, s, "success")),
     }
     written = []
-    for task, (title, measure) in wanted.items():
+    for task, (title, measure) in measures.items():
         ways = [*dict.fromkeys(record["way"] for record in records if record["task"] == task)]
         if not ways:
             continue

@@ -204,14 +204,14 @@ class HeadRun(SceneRun):
         gain = SearchGain(views, config.foresight)
         observer = SceneObserver(Target(self.target_evidence), views, prior=config.prior)
         for target in self.targets(index):
-            wanted, start = places[labels == target], self.start(index, views, target)
-            if bool(rests_on(views, start, wanted).any()):
+            target_places, start = places[labels == target], self.start(index, views, target)
+            if bool(rests_on(views, start, target_places).any()):
                 continue  # no search starts on its target
             for name, acquire in self.ways(gain, start).items():
                 steps, found = list[HeadStep](), False
                 for step in self._steps(views, looks, observer, acquire, start, target, index):
                     steps.append(step)
-                    found = bool(rests_on(views, step.action, wanted).any())
+                    found = bool(rests_on(views, step.action, target_places).any())
                     if found:
                         break
                 records.append(
@@ -250,9 +250,9 @@ class HeadRun(SceneRun):
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
             for step in self._steps(views, looks, observer, acquire, start, None, index):
                 # A cell that was never seen gets no answer, even if the prior favours a class.
-                told = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
-                right = (right_cells(told, answers)[0] * area).sum() / area.sum()
-                besides = (right_cells(told[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
+                probabilities = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
+                right = (right_cells(probabilities, answers)[0] * area).sum() / area.sum()
+                besides = (right_cells(probabilities[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
                 seconds.append(step.seconds)
                 success.append(float(right))
                 objects.append(float(besides))

@@ -43,14 +43,14 @@ JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or given[0] not in JOBS:
+    command_line = list(sys.argv[1:] if arguments is None else arguments)
+    if not command_line or command_line[0] not in JOBS:
         print(__doc__)
-        got = repr(given[0]) if given else "nothing"
+        got = repr(command_line[0]) if command_line else "nothing"
         print(
             f"expected {' or '.join(JOBS)} as the first argument, got {got}; add --help to see its settings",
             file=sys.stderr,
         )
-        return 0 if given in (["--help"], ["-h"]) else 2
-    job, config = JOBS[given[0]]
-    return run_command(job, config, __doc__, given[1:])
+        return 0 if command_line in (["--help"], ["-h"]) else 2
+    job, config = JOBS[command_line[0]]
+    return run_command(job, config, __doc__, command_line[1:])

@@ -111,9 +111,9 @@ def corrected_signs(mean: FloatArray, error: FloatArray, *, alpha: float = 0.05)
         scaled = np.nan_to_num(np.abs(mean) / error, nan=0.0, posinf=np.inf)
     chance = np.array([math.erfc(each / math.sqrt(2)) for each in scaled])
     order = np.argsort(chance)
-    told = np.cumprod(chance[order] <= alpha / np.arange(len(order), 0, -1))
+    significant = np.cumprod(chance[order] <= alpha / np.arange(len(order), 0, -1))
     signs = np.zeros(len(mean))
-    signs[order] = told * np.sign(mean)[order]
+    signs[order] = significant * np.sign(mean)[order]
     return signs
 
 
@@ -129,10 +129,10 @@ def spans(numbers: list[int]) -> str:
     >>> spans([1, 2, 3, 7, 9, 10])
     '1 to 3, 7, 9 to 10'
     """
-    parts: list[list[int]] = []
+    runs: list[list[int]] = []
     for number in numbers:
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1].append(number)
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
         else:
-            parts.append([number])
-    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in parts)
+            runs.append([number])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)

@@ -262,10 +262,10 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
         if name == "nano":
             # One start: an expectation takes ten times as long as the published decision.
-            seen: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
-            yield "expected-search", SearchConfig(**seen, protocol=ProtocolConfig(1), policies=EXPECTED)
+            options: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
+            yield "expected-search", SearchConfig(**options, protocol=ProtocolConfig(1), policies=EXPECTED)
             once = ProtocolConfig(1, shifts=20)
-            yield "expected-explore", ExploreConfig(**seen, protocol=once, policies=EXPECTED_EXPLORATION)
+            yield "expected-explore", ExploreConfig(**options, protocol=once, policies=EXPECTED_EXPLORATION)
         yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
@@ -318,5 +318,5 @@ def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
         if study.model is not None:
             base = replace(base, belief=BeliefConfig(model=f"{nano.name}-{study.model}"))
         for label, changes in study.settings.items():
-            parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
-            yield f"{title} {label}", replace(base, **parts, policies=study.policies)
+            sections = {section: replace(getattr(base, section), **values) for section, values in changes.items()}
+            yield f"{title} {label}", replace(base, **sections, policies=study.policies)

@@ -55,14 +55,14 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
 
     written = []
     if not missing(AT_THRESHOLDS, runs):
-        shown = {
+        tested = {
             f"{title}\n{contrast.text}": (contrast, name)
             for contrast in CONTRASTS
             for name, title in DETECTORS.items()
             if contrast.finding in (TESTED[0], TESTED[7])
         }
         drawn = plot_curve_panels(
-            {title: threshold_panel(*chosen, runs) for title, chosen in shown.items()}, label="difference (points)"
+            {title: threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
         )
         written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
@@ -89,5 +89,8 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
 
 def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
-    told = {f"threshold {threshold:g}": contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS}
-    return {label: mean for label, (mean, _) in told.items()}, {label: error for label, (_, error) in told.items()}
+    means, errors = {}, {}
+    for threshold in SCORE_THRESHOLDS:
+        label = f"threshold {threshold:g}"
+        means[label], errors[label] = contrast.difference(threshold, name, runs)
+    return means, errors

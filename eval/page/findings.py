@@ -60,10 +60,10 @@ class Advantage:
     def answer(self, mean: FloatArray, error: FloatArray) -> Answer:
         """Sizes in percentage points, with standard errors, and the verdict."""
         chosen, errors = mean[list(self.shifts)], error[list(self.shifts)]
-        told = " / ".join(points(mean, error, self.shifts))
+        sizes = " / ".join(points(mean, error, self.shifts))
         within = bool((np.abs(chosen) <= 2 * errors).all())
         signs = {int(sign) for sign in corrected_signs(chosen, errors)}
-        return Answer(told, gain_verdict(signs, self.expected, within))
+        return Answer(sizes, gain_verdict(signs, self.expected, within))
 
     def published(self) -> str:
         """The paper's sizes, where it prints both policies."""
@@ -91,9 +91,9 @@ class Overtaken:
     def answer(self, mean: FloatArray, error: FloatArray) -> Answer:
         """Gaze shifts at which it is ahead and behind, and the verdict."""
         leads, trails = behind(-mean, error), behind(mean, error)
-        told = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
+        text = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
         within = bool((np.abs(mean) <= 2 * error).all())
-        return Answer(told, overtaken_verdict(leads, trails, within))
+        return Answer(text, overtaken_verdict(leads, trails, within))
 
     def published(self) -> str:
         """Until when it leads in the paper."""
@@ -107,13 +107,13 @@ class Finding:
     Attributes:
         text: the finding.
         kind: kind of the experiment that tests it.
-        shown: description of the sizes.
+        sizes: description of the sizes.
         test: the test.
     """
 
     text: str
     kind: str
-    shown: str
+    sizes: str
     test: Advantage | Overtaken
 
     def difference(self, folder: Path, measure: Measure) -> tuple[FloatArray, FloatArray]:
@@ -239,7 +239,7 @@ def findings(runs: Runs) -> list[str]:
         for heading, folder in folders[finding.kind].items():
             first = heading.startswith(next(iter(DETECTORS.values())))
             answers[heading] = str(finding.answer(folder, measure)) if first or finding.detects else "no detector"
-        rows.append([finding.text, finding.shown, finding.test.published(), *answers.values()])
+        rows.append([finding.text, finding.sizes, finding.test.published(), *answers.values()])
     return table(rows)
 
 

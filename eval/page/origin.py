@@ -15,10 +15,10 @@ def missing(names: Iterable[str], runs: Runs) -> list[str]:
 
 def origin(folders: Iterable[Path]) -> str:
     """Commits, days and numbers of photographs of runs, each only once, as the pages say them."""
-    told = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
-    commits = [_short(each["commit"]) for each in told]
-    days = [each["date"] for each in told]
-    counts = [f"{each['scenes']} photographs" for each in told]
+    manifests = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
+    commits = [_short(each["commit"]) for each in manifests]
+    days = [each["date"] for each in manifests]
+    counts = [f"{each['scenes']} photographs" for each in manifests]
     return ", ".join(" and ".join(dict.fromkeys(values)) for values in (commits, days, counts))
 
 

@@ -49,14 +49,14 @@ def beside_paper(runs: Runs) -> list[str]:
 
 def performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
-    found = averaged(records_of(folder, policy, commonest=True), shifts)
-    return percent(found.mean[shifts], found.over_images[shifts])
+    curve = averaged(records_of(folder, policy, commonest=True), shifts)
+    return percent(curve.mean[shifts], curve.over_images[shifts])
 
 
 def largest_error(folder: Path, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
-    found = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
-    return f"{100 * found.over_repetitions.max():.3f}"
+    curve = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
+    return f"{100 * curve.over_repetitions.max():.3f}"
 
 
 def readings(runs: Runs) -> list[str]:
@@ -70,8 +70,8 @@ def readings(runs: Runs) -> list[str]:
     for reading, less in first.items():
         rows.append([reading, *(f"{100 * curve[n - less]:.1f}" for n in paper.TABLE_SHIFTS)])
     larger = random_search(LARGER, max(paper.TABLE_SHIFTS))
-    told = f"n gaze shifts, if the target held {LARGER} cells of every image"
-    return table([*rows, [told, *(f"{100 * larger[n]:.1f}" for n in paper.TABLE_SHIFTS)]])
+    title = f"n gaze shifts, if the target held {LARGER} cells of every image"
+    return table([*rows, [title, *(f"{100 * larger[n]:.1f}" for n in paper.TABLE_SHIFTS)]])
 
 
 def study_table(title: str, runs: Runs) -> list[str]:
@@ -85,12 +85,12 @@ def study_table(title: str, runs: Runs) -> list[str]:
         for choice in study.policies:
             policy = name_of(choice, "exploration" if study.explores else "search")
             head = [label, *([policy] if several else [])]
-            found = averaged(records_of(folder, policy), max(study.shifts))
-            rows.append([*head, *(percent(found.mean[n], found.over_images[n]) for n in study.shifts)])
+            curve = averaged(records_of(folder, policy), max(study.shifts))
+            rows.append([*head, *(percent(curve.mean[n], curve.over_images[n]) for n in study.shifts)])
     return table(rows)
 
 
-def told_table(name: str, number: int, folder: Path, columns: Sequence[str] | None = None) -> list[str]:
+def markdown_table(name: str, number: int, folder: Path, columns: Sequence[str] | None = None) -> list[str]:
     """The table of this number in a Markdown file, without the text around it; with `columns`, only these of it."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
@@ -111,8 +111,8 @@ def with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     ['| a | c |', '|---|---|', '| 1 | 3 |']
     """
     heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
-    kept = [0, *(heads.index(column) for column in columns)]
-    return table([[row[place] for place in kept] for row in (heads, *rows)])
+    places = [0, *(heads.index(column) for column in columns)]
+    return table([[row[place] for place in places] for row in (heads, *rows)])
 
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
@@ -174,8 +174,8 @@ def agreement(folder: Path) -> list[str]:
         names = [f"{kind}-{mode}" for kind in ("non-predictive", "predictive")]
         pairs = list(zip(*(records_of(folder, name) for name in names), strict=True))
         first = [a["cells"][1] == b["cells"][1] for a, b in pairs]
-        found = [a["found_at"] == b["found_at"] for a, b in pairs]
-        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, found))])
+        lengths = [a["found_at"] == b["found_at"] for a, b in pairs]
+        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, lengths))])
     return table(rows)
 
 

@@ -17,7 +17,7 @@ def verdicts(runs: Runs) -> list[str]:
     for finding in TESTED:
         for number, measure in enumerate(COUNTED[finding.kind]):
             head = [finding.text, finding.test.published()] if number == 0 else ["", ""]
-            cells = (told_by_verdict(answers_at(finding, measure, name, runs)) for name in DETECTORS)
+            cells = (verdict_text(answers_at(finding, measure, name, runs)) for name in DETECTORS)
             rows.append([*head, measure.text, *cells])
     return table(rows)
 
@@ -27,7 +27,7 @@ def answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> dic
     return {t: finding.answer(runs[at_threshold(finding.kind, t, name)].out, measure) for t in SCORE_THRESHOLDS}
 
 
-def told_by_verdict(answers: dict[float, Answer]) -> str:
+def verdict_text(answers: dict[float, Answer]) -> str:
     """Verdicts, each with the thresholds at which it is reached.
 
     Args:
@@ -36,7 +36,7 @@ def told_by_verdict(answers: dict[float, Answer]) -> str:
     Returns:
         The text.
 
-    >>> told_by_verdict({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
+    >>> verdict_text({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
     'holds at 0.02, 0.1; level at 0.25'
     """
     verdicts = dict.fromkeys(answer.verdict for answer in answers.values())
@@ -89,7 +89,7 @@ def by_threshold(runs: Runs) -> list[str]:
     rows = [["detector", "difference", "shifts", *(f"{threshold:g}" for threshold in SCORE_THRESHOLDS)]]
     for name, title in DETECTORS.items():
         for contrast in CONTRASTS:
-            told = [contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS]
-            columns = [points(mean, error, contrast.shifts) for mean, error in told]
+            differences = [contrast.difference(threshold, name, runs) for threshold in SCORE_THRESHOLDS]
+            columns = [points(mean, error, contrast.shifts) for mean, error in differences]
             rows += [[title, contrast.text, *map(str, row)] for row in zip(contrast.shifts, *columns, strict=True)]
     return table(rows)

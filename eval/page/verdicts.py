@@ -11,15 +11,15 @@ class Answer:
     """The answer of a run to a finding.
 
     Attributes:
-        told: sizes, or gaze shifts.
+        sizes: sizes of the difference, or the gaze shifts at which it is found.
         verdict: one of `VERDICTS`.
     """
 
-    told: str
+    sizes: str
     verdict: str
 
     def __str__(self) -> str:
-        return f"{self.told}: {self.verdict}"
+        return f"{self.sizes}: {self.verdict}"
 
 
 VERDICTS = {

@@ -138,7 +138,7 @@ def draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
         views = foveated_views(run.eye, scene.image, scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
         # An id may be any text. Cleaned ids may coincide, so the scene's number is put before them.
-        told = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
-        path = inside(run.config.out, f"scanpath_{told}_{clean(record['target_name'])}.png")
+        scene_name = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
+        path = inside(run.config.out, f"scanpath_{scene_name}_{clean(record['target_name'])}.png")
         paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), path))
     return paths

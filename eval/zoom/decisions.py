@@ -7,7 +7,7 @@ from itertools import product
 
 import torch
 
-from eval.comparison.telling import CALIBRATED, ERRORS_TOLD, FREQUENCY, TELLING, Telling, calibrated
+from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
 from semfov.agents.limits import EpisodeLimits
 from semfov.agents.windows import search_windows
@@ -50,7 +50,7 @@ def decide_all(
         Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
         the overview and all slices. Evidence without fitted verification makes no closer looks.
     """
-    shown = torch.stack([glance.show for glance in glances.see(slices)])
+    slice_scores = torch.stack([glance.show for glance in glances.see(slices)])
     records: list[ResultRecord] = []
     ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
@@ -70,7 +70,7 @@ def decide_all(
                 "passes": path.passes,
                 "overlap": overlap(decision.box, there),
                 "overview": first,
-                "slices": max(first, float(shown[:, target - 1].max())),
+                "slices": max(first, float(slice_scores[:, target - 1].max())),
                 "count": len(slices) + 1,
             }
         )
@@ -88,17 +88,17 @@ def by_way(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
 def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
     ways = by_way(records)
-    told = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
+    by_name = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
     searches = next(iter(ways.values()))
     scores = {"the overview, highest score": "overview", "all slices, highest score": "slices", FREQUENCY: "frequency"}
     for name, key in scores.items():
-        told[name] = torch.tensor([record[key] for record in searches])
-    return told, torch.tensor([record["present"] for record in searches])
+        by_name[name] = torch.tensor([record[key] for record in searches])
+    return by_name, torch.tensor([record["present"] for record in searches])
 
 
 def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
-    told, there = presence_scores(records)
+    scores, there = presence_scores(records)
     ways = by_way(records)
     searches = next(iter(ways.values()))
     passes = {way: mean_or_dash([record["passes"] for record in of]) for way, of in ways.items()}
@@ -106,9 +106,9 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     passes["all slices, highest score"] = mean_or_dash([record["count"] for record in searches])
     passes[FREQUENCY] = "-"
     places = {way: torch.tensor([right_box(record) for record in of]) for way, of in ways.items()}
-    telling = Telling(told, there, [record["scene"] for record in searches], places)
+    telling = Telling(scores, there, [record["scene"] for record in searches], places)
     rows = [["", "passes", *TELLING, *CALIBRATED, "Brier"]]
-    for (name, score), figures in zip(told.items(), telling.rows(), strict=True):
+    for (name, score), figures in zip(scores.items(), telling.rows(), strict=True):
         brier = f"{BinarySums.of(score, there).brier:.3f}"
         rows.append([name, passes[name], *figures, *calibrated(score, there), brier])
     decided = [["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]]
@@ -125,7 +125,7 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
             decided.append([name, counts[0], right, *counts[1:], looks, chance])
     return [
         f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
-        f"in % at the given false alarm rates. `ours` is the probability at the end of a search. {ERRORS_TOLD} "
+        f"in % at the given false alarm rates. `ours` is the probability at the end of a search. {ERRORS_TEXT} "
         f"`{FREQUENCY}`: the share of the other pictures that hold the class.",
         "",
         *table(rows),

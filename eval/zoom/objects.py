@@ -29,7 +29,7 @@ _RECALLS = 101
 
 def object_record(
     way: str,
-    seen: Sequence[Glance],
+    looks: Sequence[Glance],
     lattice: Lattice,
     target: int | None,
     annotation: Annotation,
@@ -41,7 +41,7 @@ def object_record(
 
     Args:
         way: name of the way of looking.
-        seen: the looks.
+        looks: the looks.
         lattice: lattice of the picture.
         target: class whose objects are looked for, 1..K; None for all classes.
         annotation: the annotated objects.
@@ -60,11 +60,11 @@ def object_record(
         objects: Objects
         unseen: float | None = None
         if certainty is None:
-            objects = merge(seen[:number], target)
+            objects = merge(looks[:number], target)
         else:
-            remaining, promised = ahead[min(number, len(seen)) - 1] if ahead else (0.0, 0.0)
+            remaining, promised = ahead[min(number, len(looks)) - 1] if ahead else (0.0, 0.0)
             objects, (unseen, _) = probable_objects(
-                seen[:number], lattice, target, certainty, remaining=remaining, promised=promised
+                looks[:number], lattice, target, certainty, remaining=remaining, promised=promised
             )
         right = right_boxes(objects, annotation)
         counts = right >= 0
@@ -126,9 +126,9 @@ def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]
             line.append(average_precision(scores, right, total))
         sure = scores >= LIKELY
         hits = float(right[sure].sum())
-        told = [(torch.as_tensor(record["after"][number]["scores"]), record["objects"]) for record in chosen]
-        off = [float(((each >= LIKELY).sum() - count).abs()) for each, count in told]
-        apart = [float((each.sum() - count).abs()) for each, count in told]
+        pairs = [(torch.as_tensor(record["after"][number]["scores"]), record["objects"]) for record in chosen]
+        off = [float(((each >= LIKELY).sum() - count).abs()) for each, count in pairs]
+        apart = [float((each.sum() - count).abs()) for each, count in pairs]
         line += [hits / max(int(sure.sum()), 1), hits / max(total, 1), int(sure.sum()) / max(total, 1)]
         line += [sum(off) / len(off), sum(apart) / len(apart), BinarySums.of(scores, right).ece if len(scores) else 0]
         rows.append(line)
@@ -141,7 +141,8 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     for record in records:
         # The bootstrap reads the numbers many times.
         after = {
-            n: {name: torch.tensor(found[name]) for name in ("scores", "right")} for n, found in record["after"].items()
+            n: {name: torch.tensor(outcome[name]) for name in ("scores", "right")}
+            for n, outcome in record["after"].items()
         }
         groups.setdefault(record["way"], []).append(record | {"after": after})
     first = next(iter(groups.values()))
@@ -171,10 +172,12 @@ def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> lis
     expecting = [record for record in records if record["after"][numbers[0]].get("in all") is not None]
     if not expecting:
         return []
-    told = torch.tensor([[record["after"][n]["in all"] for n in numbers] for record in expecting], dtype=torch.float64)
+    expected = torch.tensor(
+        [[record["after"][n]["in all"] for n in numbers] for record in expecting], dtype=torch.float64
+    )
     true = torch.tensor([[record["objects"]] for record in expecting], dtype=torch.float64)
-    rows.append(["expected in all", *(f"{each:.1f}" for each in told.mean(0).tolist())])
-    rows.append(["off by", *(f"{each:.1f}" for each in (told - true).abs().mean(0).tolist())])
+    rows.append(["expected in all", *(f"{each:.1f}" for each in expected.mean(0).tolist())])
+    rows.append(["off by", *(f"{each:.1f}" for each in (expected - true).abs().mean(0).tolist())])
     return [
         f"The number of objects that ours expects in all after n passes, those that no look has shown included: the "
         f"mean over pictures, and the mean absolute error. There are {float(true.mean()):.1f} in the mean.",

@@ -50,13 +50,13 @@ class ObservedRates:
         octaves = self.lattice.octaves
         here = octaves[look.level]
         scores = look.scores / look.scores.sum(-1, keepdim=True).clamp(min=1)
-        seen = torch.cat([1 - scores.sum(-1, keepdim=True), scores], -1).clamp(min=0)
-        told = self.model.calibrate(seen, here.expand(seen.shape[:-1]))
+        vectors = torch.cat([1 - scores.sum(-1, keepdim=True), scores], -1).clamp(min=0)
+        calibrated = self.model.calibrate(vectors, here.expand(vectors.shape[:-1]))
         unseen = self.share * self.model.miss_likelihood(here)
-        held = torch.where((look.scores > 0).any(-1, keepdim=True), told, unseen / unseen.sum())[..., 1:]
+        held = torch.where((look.scores > 0).any(-1, keepdim=True), calibrated, unseen / unseen.sum())[..., 1:]
         # The gist marks the cell of an object's centre; the object also covers the cells around it.
-        known = F.max_pool2d(look.found.float().movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
-        held = held * (1 - known) * look.scale**2
+        detected = F.max_pool2d(look.found.float().movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
+        held = held * (1 - detected) * look.scale**2
         rates = torch.zeros(len(targets), STEPS, *look.scores.shape[:2])
         for step in range(min(STEPS, len(octaves) - 1 - look.level)):
             new = held * (1 - self.model.miss_likelihood(octaves[look.level + 1 + step])[1:])

@@ -29,13 +29,13 @@ def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> O
     Returns:
         The order.
     """
-    kept: list[Window] | None = None
+    chosen: list[Window] | None = None
 
     def order(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
-        nonlocal kept
-        if kept is None:
-            kept = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
-        return in_order(kept)(looks, done)
+        nonlocal chosen
+        if chosen is None:
+            chosen = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
+        return in_order(chosen)(looks, done)
 
     return order
 
@@ -59,11 +59,11 @@ def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
     """
     frontier: list[tuple[float, Window]] = []
     # Quarters at the right and bottom borders are moved inside the picture, where two of them may coincide.
-    known = set[Window]()
+    queued = set[Window]()
 
     def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
-        new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in known]
-        known.update(window for _, window in new)
+        new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in queued]
+        queued.update(window for _, window in new)
         frontier.extend(new)
         frontier.sort(key=lambda entry: (-entry[0], entry[1].level, entry[1].cells))
         return [frontier.pop(0)[::-1]] if frontier else []
@@ -89,29 +89,29 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
     return [(raw(glance, window, [] if target is None else [target], most=most), window) for window in windows]
 
 
-def oracle(glances: Glances, windows: Sequence[Window], found: Callable[[Glance], Tensor], most: int) -> Order:
+def oracle(glances: Glances, windows: Sequence[Window], finds: Callable[[Glance], Tensor], most: int) -> Order:
     """Repeatedly the window that shows most of the objects not seen before.
 
     Args:
         glances: the looks at the picture.
         windows: windows to look at.
-        found: which objects a look finds, `(M,)`.
+        finds: which objects a look finds, `(M,)`.
         most: largest number of looks, the overview included.
 
     Returns:
         The order.
     """
-    shown = torch.stack([found(glance) for glance in glances.see(windows)])
+    by_window = torch.stack([finds(glance) for glance in glances.see(windows)])
     seen: list[Tensor] = []
 
     def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
         if len(looks) >= min(most, len(windows)):
             return []
         if len(looks) == 1:
-            seen.append(found(looks[0]))
-        new = (shown & ~torch.stack(seen).any(0)).sum(-1)
+            seen.append(finds(looks[0]))
+        new = (by_window & ~torch.stack(seen).any(0)).sum(-1)
         best = int(new.argmax())
-        seen.append(shown[best])
+        seen.append(by_window[best])
         return [(windows[best], float(new[best]))]
 
     return order

@@ -30,8 +30,8 @@ def zoom(config: ZoomConfig) -> None:
     if "recall" in config.measures:
         written.append(_curves(records, run))
     if decided := [record for record in records if record["measure"] == "decision"]:
-        told, there = presence_scores(decided)
-        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in told.items()}
+        scores, there = presence_scores(decided)
+        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in scores.items()}
         written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
     announce(text, written)
 
@@ -80,14 +80,14 @@ def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
     figures = Bootstrap.of(partial(recall_and_precision, finding, at), range(len(run.scenes)))
     rows = [["", *map(str, at), "area under the curve", "boxes for each object", "boxes that are right"]]
     for (way, group), value, error in zip(finding.items(), figures.value, figures.error, strict=True):
-        found, right = recall_cells(value, error)
+        cells, right = recall_cells(value, error)
         boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
-        rows.append([way, *found, f"{mean(curve(group, passes)):.3f}", f"{boxes:.2f}", right])
+        rows.append([way, *cells, f"{mean(curve(group, passes)):.3f}", f"{boxes:.2f}", right])
     apart = figures.less(list(finding).index("ours"))
     less = [["difference to ours", *map(str, at), "boxes that are right"]]
     for way, value, error in zip(finding, apart.value, apart.error, strict=True):
-        found, right = recall_cells(value, error, "+")
-        less += [[way, *found, right]] if way != "ours" else []
+        cells, right = recall_cells(value, error, "+")
+        less += [[way, *cells, right]] if way != "ours" else []
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
     return [

@@ -122,16 +122,16 @@ class ZoomRun(WindowLooking, SceneRun):
         for name, turns in self._finding(index, glances) if {"objects", "recall"} & {*measures} else ():
             if "recall" not in measures and name not in _COMPARED:
                 continue
-            seen, ahead = looked(islice(turns, self.config.passes))
+            looks, ahead = looked(islice(turns, self.config.passes))
             if "objects" in measures:
-                records += self._objects(name, index, seen, ahead)
+                records += self._objects(name, index, looks, ahead)
             if "recall" not in measures:
                 if name == _COMPARED[-1]:  # the oracle is dear
                     break
                 continue
-            records.append(self._recall(name, index, seen))
+            records.append(self._recall(name, index, looks))
             if name in ("slices, raster", "ours"):
-                records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
+                records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)]))
         watch.lap("recall")
         if self.config.mosaics and "hit" in measures:
             records += self._first_hits(index, glances)
@@ -162,9 +162,9 @@ class ZoomRun(WindowLooking, SceneRun):
         if self.observation is not None:
             observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
             yield "by the observation model", find_everything(glances, observed, target)
-        found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
+        finds: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
         every = [*half_steps(lattice)][1:]
-        yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], found, self.config.passes), None)
+        yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], finds, self.config.passes), None)
 
     def _decisions(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Search for classes that are present and for classes that are absent."""
@@ -178,9 +178,9 @@ class ZoomRun(WindowLooking, SceneRun):
         cut = self.slices(index, glances.lattice)
         limits = {"passes": config.passes, "closer": config.closer}
         records = decide_all(glances, self.evidence, names, targets, annotation, cut, **limits)
-        known = self.frequencies[index]
+        frequencies = self.frequencies[index]
         return [
-            record | {"scene": self.scenes.ids[index], "frequency": float(known[names.index(record["target"])])}
+            record | {"scene": self.scenes.ids[index], "frequency": float(frequencies[names.index(record["target"])])}
             for record in records
         ]
 
@@ -194,27 +194,29 @@ class ZoomRun(WindowLooking, SceneRun):
         annotation = self.scenes.annotation(index)
         if self.target is None:
             return annotation
-        kept = annotation.labels == self.target
-        return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
+        of_target = annotation.labels == self.target
+        return Annotation(
+            annotation.boxes[of_target], annotation.labels[of_target], annotation.crowd[of_target], annotation.size
+        )
 
     def _objects(
-        self, name: str, index: int, seen: list[Glance], ahead: list[tuple[float, float]]
+        self, name: str, index: int, looks: list[Glance], ahead: list[tuple[float, float]]
     ) -> Iterator[ResultRecord]:
         """Compare the objects of ours, with probabilities and with scores, and of slices with the annotated ones."""
         if name not in _COMPARED:
             return
         lattice = Lattice.over(self.scenes.annotation(index).size, self.eye.detector.input_size, finest=self.eye.finest)
-        given = seen, lattice, self.target, self.annotation(index), self.config.passes
+        shared = looks, lattice, self.target, self.annotation(index), self.config.passes
         ways = (
             {name: None} if name != "ours" else {"ours": self.evidence.certainty, "ours, scores of the detector": None}
         )
         for way, certainty in ways.items():
-            yield object_record(way, *given, certainty, ahead) | {"scene": self.scenes.ids[index]}
+            yield object_record(way, *shared, certainty, ahead) | {"scene": self.scenes.ids[index]}
 
-    def _recall(self, name: str, index: int, seen: list[Glance]) -> ResultRecord:
+    def _recall(self, name: str, index: int, looks: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
-        counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
-        objects = merge(seen, self.target, score=DETECTION_SCORE)
+        counts = [int(found_in(looks[: n + 1], annotation, self.target).sum()) for n in range(len(looks))]
+        objects = merge(looks, self.target, score=DETECTION_SCORE)
         return {
             "measure": "recall",
             "way": name,
@@ -223,17 +225,17 @@ class ZoomRun(WindowLooking, SceneRun):
             "found": counts,
             "boxes": len(objects),
             "right": int((right_boxes(objects, annotation) > 0).sum()),
-            "windows": [list(glance.window.fixation) for glance in seen],
+            "windows": [list(glance.window.fixation) for glance in looks],
         }
 
     def _first_hits(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, glances.lattice)
-        shown = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST_CONFIDENCE
+        presence = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST_CONFIDENCE
         closest = min(window.level for window in cut)
         limit = len(cut) + 1
         records: list[ResultRecord] = []
-        for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
+        for target in (presence.any(0).nonzero()[:, 0] + 1).tolist():
             orders = {
                 "slices, raster": in_order(cut),
                 "slices, random": shuffled(cut, [self.config.seed, index, target]),
@@ -274,19 +276,19 @@ def looked(turns: Iterator[WindowStep[Any]]) -> tuple[list[Glance], list[tuple[f
     Returns:
         The looks; and pairs of numbers as for `semfov.zoom.objects.probable_objects`, none without a belief.
     """
-    seen: list[Glance] = []
+    looks: list[Glance] = []
     ahead: list[tuple[float, float]] = []
     promised = 0.0
     for turn in turns:
-        promised += turn.worth if seen else 0.0
-        seen.append(turn.glance)
+        promised += turn.worth if looks else 0.0
+        looks.append(turn.glance)
         if turn.belief is not None:
             ahead.append((turn.belief.remaining(), promised))
-    return seen, ahead
+    return looks, ahead
 
 
 def without_cut(glance: Glance) -> Glance:
     """A look without the boxes that are cut by the border of its window."""
-    seen, whole = glance.detections, ~glance.cut
-    detections = Detections(seen.boxes[:, whole], seen.scores[:, whole], seen.mask[:, whole])
+    every, whole = glance.detections, ~glance.cut
+    detections = Detections(every.boxes[:, whole], every.scores[:, whole], every.mask[:, whole])
     return replace(glance, detections=detections, cut=glance.cut[whole])

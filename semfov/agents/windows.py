@@ -443,7 +443,7 @@ class _Windows:
         return None if self.picture is None else reduced_copy(self.picture)
 
     def add(self, turn: WindowStep[Any], *, counting: bool = True) -> None:
-        """Keep a look; in a search its value is no number of objects, and none are counted that no look has shown."""
+        """Add a look; `counting` in an exploration, in which the value of a look is a number of expected objects."""
         if counting:
             self.promised += turn.worth if self.looks else 0.0
             self.belief = turn.belief

@@ -74,7 +74,7 @@ class PictureJob(ABC):
         """Look at a picture, with the arguments that all subcommands share, and return the record."""
 
     def outcome(self, number: int) -> PictureOutcome | SemfovError:
-        """Look at the picture of this number and make what is wanted of it, or return the error that prevents it."""
+        """Look at the picture of this number, and make its text, row and figures; an error is returned, not raised."""
         source, began = self.sources[number], time.perf_counter()
         try:
             with torch.inference_mode():
@@ -115,7 +115,7 @@ def _outcome(number: int) -> PictureOutcome | SemfovError:
 
 @dataclass
 class PictureFiles:
-    """What is written of the pictures.
+    """Files that a command writes about its pictures: results, figures and a page.
 
     Attributes:
         job: the job.
@@ -158,7 +158,7 @@ class PictureFiles:
         return {number: PictureOutcome(**each["records"][0]) for number, each in stored if each is not None}
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
-        """Write what is wanted of a picture, whose figures are there if it was finished before."""
+        """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""
         if self.results is not None and outcome.row is not None:
             self.results.add(number, outcome.row)
         if self.folder is not None:
@@ -188,7 +188,7 @@ class PictureFiles:
 
 
 def look_at_pictures(job: PictureJob) -> int:
-    """Look at all pictures, print what was found, and write what is wanted.
+    """Look at all pictures, print the outcomes, and write the files that the options name.
 
     A picture that cannot be read is reported and left out, unless it is the only one. With a file of results, a command
     that was stopped continues.

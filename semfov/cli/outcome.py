@@ -25,7 +25,7 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class PictureOutcome:
-    """What is kept of a look at a picture; everything but the figures are JSON values.
+    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), and figures.
 
     Attributes:
         ended: how it ended, for counting.
@@ -57,7 +57,7 @@ def drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
 def picture_outcome(
     record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
 ) -> PictureOutcome:
-    """Make what the options ask for of a record.
+    """Make the text, the row, the part of a page and the figures of a record, as the options say.
 
     Args:
         record: the record.

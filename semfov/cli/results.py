@@ -49,7 +49,7 @@ def kind_of(path: Path) -> str | None:
 def result_row(
     record: GazeRecord, name: str, seconds: float, kind: str | None, file: Path | None = None
 ) -> dict[str, Any]:
-    """Make what a file of results has of a picture.
+    """Make the entry of a picture in a file of results.
 
     Args:
         record: the record of the picture.
@@ -147,7 +147,7 @@ class ResultsFile:
 
 
 def _summary(name: str, record: GazeRecord, seconds: float) -> dict[str, Any]:
-    """What a file says about a picture as a whole."""
+    """Values of a picture as a whole: its size, the decision with its place, passes and seconds."""
     width, height = record.size
     row: dict[str, Any] = {"picture": name, "width": width, "height": height, "target": record.target_name}
     if record.decision is not None:

@@ -185,7 +185,7 @@ class Gazes(ABC):
         """Picture of the first episode, RGB `(H, W, 3)`."""
 
     def close(self) -> None:  # noqa: B027 (most kinds have nothing to release)
-        """Keep what would be lost."""
+        """Save looks that are not stored yet."""
 
     @abstractmethod
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:

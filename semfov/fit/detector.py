@@ -113,12 +113,12 @@ def fit_folder(config: FitDetectorConfig) -> None:
             with whole.stage(part):
                 folder.fit(part)
     path = manifest_of(config, run, folder).write(config.out)
-    text = detector_report(config, run, folder.parts, time.monotonic() - started)
+    text = detector_report(config, run, folder.results, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    figures = [figure for fitted in folder.parts.values() for figure in fitted.figures]
-    models = [fitted.part.file for fitted in folder.parts.values() if fitted.part.file]
+    figures = [figure for fitted in folder.results.values() for figure in fitted.figures]
+    models = [fitted.part.file for fitted in folder.results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
     print(f"\nnext:\n{next_commands(config, run)}")
 
@@ -170,7 +170,7 @@ def manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> M
         },
         sensor=config.sensor.record(),
         grid=(config.columns, config.rows),
-        parts={name: fitted.part for name, fitted in folder.parts.items()},
+        parts={name: fitted.part for name, fitted in folder.results.items()},
         training={
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),

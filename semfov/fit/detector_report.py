@@ -73,7 +73,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
     return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
 
 
-def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, PartResult], seconds: float) -> str:
+def detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, PartResult], seconds: float) -> str:
     """Write the report as Markdown."""
     photographs = len(run.scenes)
     holdout = config.observation.holdout
@@ -82,7 +82,7 @@ def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Pa
     rows = [["part", "used", "result on held-out photographs"]]
     rows += [
         [TITLES[name], "yes" if each.part.used else UNUSED.get(name, "no, raw"), each.part.why]
-        for name, each in parts.items()
+        for name, each in results.items()
     ]
     lines = [
         f"# Models of {run.eye.detector.name}",
@@ -102,7 +102,7 @@ def detector_report(config: FitDetectorConfig, run: Looking, parts: dict[str, Pa
     if len(held_out) < 10:
         number = "only 1 photograph" if len(held_out) == 1 else f"only {len(held_out)} photographs"
         lines += [f"The figures are rough, because {number} could be held out.", ""]
-    for name, fitted in parts.items():
+    for name, fitted in results.items():
         lines += [f"## {TITLES[name]}", "", fitted.report, ""]
         lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
     return "\n".join(lines)

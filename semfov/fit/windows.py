@@ -322,7 +322,7 @@ def fit_looks(
 
 
 def training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
-    """The looks to learn from what closer looks show."""
+    """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
     return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
 
 

@@ -136,7 +136,7 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
 
 
 def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> Certainty:
-    """Fit how many objects further looks show to what they showed, by maximum likelihood over a grid.
+    """Fit the number of objects that further looks show, by maximum likelihood over a grid of scale and strength.
 
     Args:
         certainty: the probability of objects.

@@ -77,7 +77,7 @@ class LookCounts:
 
 @dataclass(frozen=True)
 class SurveyExample:
-    """A mosaic: its overview and its closer looks, each with what looks inside it found.
+    """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found.
 
     Attributes:
         overview: the first look.

@@ -38,7 +38,7 @@ class LinearCache:
         self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
 
     def __call__(self, log_alpha: Tensor) -> tuple[Tensor, Tensor]:
-        """The map of this parameter, computed if it is not the one that is kept."""
+        """The linear map of this parameter, computed again only if the parameter has changed."""
         key = (log_alpha, log_alpha._version, log_alpha.data_ptr())
         if self._cache is None or self._cache[0] is not log_alpha or self._cache[1:3] != key[1:]:
             with torch.inference_mode(False), torch.no_grad():

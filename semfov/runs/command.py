@@ -52,7 +52,7 @@ def make_parser(
     from jsonargparse import ArgumentParser, set_parsing_settings
 
     class Parser(ArgumentParser):
-        """Say in one line what is wrong with the arguments."""
+        """A parser that reports wrong arguments in one line."""
 
         def error(self, message: str, ex: Exception | None = None) -> NoReturn:
             if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells

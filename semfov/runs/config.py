@@ -260,7 +260,7 @@ class ProtocolConfig(Settings):
 
 @dataclass(frozen=True)
 class OutcomeConfig(Settings):
-    """What every run and every fit with a detector has.
+    """Settings of every run and every fit with a detector.
 
     Args:
         detector: the detector.
@@ -275,7 +275,7 @@ class OutcomeConfig(Settings):
 
 @dataclass(frozen=True)
 class WorkConfig(OutcomeConfig):
-    """What runs and fits in several processes have.
+    """Settings of runs and fits in several processes.
 
     Args:
         workers: number of processes (None: one per CPU core).
@@ -358,5 +358,5 @@ class RunConfig(PoliciesConfig, ScenesConfig):
     models: Path | None = None
 
     def complete(self, folder: ModelFolder) -> Self:
-        """The settings with what they alone take from a folder of models."""
+        """The settings, completed by the values that this kind of run takes from a folder of models."""
         return self

@@ -88,11 +88,11 @@ class SceneRun(ABC):
         """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
 
     def stored(self, index: int) -> bytes | None:
-        """What a worker has stored of a scene and the run needs later; None if that is nothing."""
+        """Content of the file that a worker stored for a scene, if the run needs it later; None without such a file."""
         return None
 
     def keep(self, index: int, stored: bytes) -> None:
-        """Store what a worker has stored of a scene, if this process does not see it."""
+        """Store the content of a file that a worker stored for a scene, if this process does not see that file."""
         raise NotImplementedError(f"{type(self).__name__} stores nothing of a scene")
 
 

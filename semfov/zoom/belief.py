@@ -131,7 +131,7 @@ class ZoomBelief:
             self._mark((x1, y1, x2, y2))
 
     def _mark(self, changed: Box, *, left: bool = True) -> None:
-        """Have everything that is kept about windows computed anew where cells, or what is left of them, changed."""
+        """Mark stored values of windows as outdated where cells, or the share of them that is left, changed."""
         for sums in self._sums.values():
             sums.mark(changed)
         if left and self._odds is not None:

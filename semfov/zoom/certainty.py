@@ -138,7 +138,7 @@ def object_facts(
     *,
     latest: bool = False,
 ) -> Tensor:
-    """List what the looks tell about each object.
+    """Compute the facts about each object (`FACTS`) from all looks.
 
     A look shows an object with a box of its class that overlaps it by half, or that the border of the window cuts and
     of which four fifths lie in it. A look should show an object of 6 canvas pixels or more that lies in its window and

@@ -85,7 +85,7 @@ class _Recent(Generic[_Belief]):
         return min(zip(self._frames, self.looks, strict=True), key=lambda dated: dated[0])[1].window
 
     def _forgets(self, glance: Glance, frame: int) -> bool:
-        """Forget looks; tells whether there were any."""
+        """Forget the looks that no longer count; returns whether any were forgotten."""
         assert self.forgetting is not None
         first, span = self.looks[0].window, self.forgetting.span
         again = glance.window in self.windows

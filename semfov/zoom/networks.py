@@ -22,7 +22,7 @@ def features(scores: Tensor) -> Tensor:
 
 
 def hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
-    """List what a look shows about each cell.
+    """List the maps of one look: hints, detections and sizes of objects in and around each cell.
 
     Args:
         own: `(T, rows, columns)`, features of the strongest hint of each target.

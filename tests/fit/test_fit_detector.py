@@ -349,7 +349,7 @@ def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, m
     config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
     scenes = EmbeddedScenes(("cat", "cup"), count=8)
     inputs = PartInputs(config, SimpleNamespace(scenes=scenes))
-    inputs.parts["evidence"] = PartResult(Part("evidence.safetensors", "0", False, "not better"), "")
+    inputs.results["evidence"] = PartResult(Part("evidence.safetensors", "0", False, "not better"), "")
     forbid(monkeypatch, "verification")
     fitted = VerificationFit(inputs).fit()
     assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")

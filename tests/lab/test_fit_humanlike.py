@@ -46,10 +46,10 @@ def test_choices_equal_a_loop_over_fixations():
             age = [past[::-1].index(x) if x in past else math.inf for x in range(12)]
             expected.append((6, subject, row[number], row[number + 1], age))
     assert len(choices) == len(expected) == 6
-    columns = choices.picture, choices.subject, choices.cell, choices.taken, choices.age
+    columns = choices.picture, choices.subject, choices.cell, choices.next_cell, choices.age
     assert [tuple(each.tolist() for each in row) for row in zip(*columns, strict=True)] == expected
     some = choices[choices.subject == 2]
-    assert Choices.join([some, some]).taken.tolist() == [3, 3, 3, 3]
+    assert Choices.join([some, some]).next_cell.tolist() == [3, 3, 3, 3]
 
 
 def random_detections():

@@ -33,14 +33,14 @@ def test_errors_and_found_objects_are_counted_by_distance():
     image = torch.zeros(1, 3, 64, 640)
     image[0, 0, 20:40, 100:120] = 1
     boxes, labels = torch.tensor([[100.0, 20, 120, 40], [600, 20, 620, 40]]), torch.tensor([1, 1])
-    tally = acuity.Tally()
+    counts = acuity.AcuityCounts()
     detector = Coloured(("red",), (640, 64), score=0.75)
-    tally.add(Eye(Foveation(1e9), detector), image, torch.tensor([[109.5, 29.5], [300.0, 29.5]]), boxes, labels)
-    assert tally.looks == 2
-    assert tally.objects.tolist() == [1, 0, 0, 0, 1, 0, 1]  # at 0 and 500 px, and at 190 and 310 px
-    assert tally.found.tolist() == [1, 0, 0, 0, 1, 0, 0]
-    assert float(tally.error.max()) < 1e-6
-    assert float(tally.pixels.sum()) > 40_000
+    counts.add(Eye(Foveation(1e9), detector), image, torch.tensor([[109.5, 29.5], [300.0, 29.5]]), boxes, labels)
+    assert counts.looks == 2
+    assert counts.objects.tolist() == [1, 0, 0, 0, 1, 0, 1]  # at 0 and 500 px, and at 190 and 310 px
+    assert counts.found.tolist() == [1, 0, 0, 0, 1, 0, 0]
+    assert float(counts.error.max()) < 1e-6
+    assert float(counts.pixels.sum()) > 40_000
 
 
 def test_missing_sahi_is_named_with_the_remedy():

@@ -33,9 +33,9 @@ def fit_context(config: FitContextConfig) -> None:
     scenes = make_scenes(config.data, COCO_CLASSES) if scenes is None else scenes
     places = read_places(scenes, config)
     held_out = [index % config.holdout == 0 for index in range(len(places))]
-    known = [place for place, out in zip(places, held_out, strict=True) if not out]
-    given = table_prior(config, scenes.classes)
-    prior = count_context(known, scenes.classes, config) if given is None else given
+    training = [place for place, out in zip(places, held_out, strict=True) if not out]
+    from_table = table_prior(config, scenes.classes)
+    prior = count_context(training, scenes.classes, config) if from_table is None else from_table
     judged = judge_context(
         prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects
     )
@@ -43,7 +43,7 @@ def fit_context(config: FitContextConfig) -> None:
     metadata = training_of(config, scenes, "table", "source", "heights") | prior.metadata
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
-        folds = cross_fit(places, usable, scenes.classes, config, given)
+        folds = cross_fit(places, usable, scenes.classes, config, from_table)
         for kind in weights:
             weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
         metadata |= sampler.eye.settings()
@@ -52,7 +52,7 @@ def fit_context(config: FitContextConfig) -> None:
     )
     path = model_path(config, "context")
     model.save(path)
-    text = context_report(judged, weights, len(known), config)
+    text = context_report(judged, weights, len(training), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
 
@@ -90,7 +90,7 @@ def cross_fit(
     usable: Sequence[int],
     classes: Sequence[str],
     config: FitContextConfig,
-    given: ContextPrior | None = None,
+    fixed: ContextPrior | None = None,
 ) -> list[tuple[ContextPrior, list[int]]]:
     """Pair priors with photographs to fit their weights on, such that no prior was counted on its photographs.
 
@@ -99,7 +99,7 @@ def cross_fit(
         usable: indices of the photographs that are not held out.
         classes: names of the K classes.
         config: the settings.
-        given: a prior that was not counted on photographs; it is used in every fold.
+        fixed: a prior that was not counted on photographs; it is used in every fold.
 
     Returns:
         For each fold the prior, and the indices of the photographs to fit its weights on.
@@ -109,8 +109,8 @@ def cross_fit(
     folds = []
     for fold in range(config.folds):
         part = [index for position, index in enumerate(chosen) if position % config.folds == fold]
-        kept = set(usable).difference(part)
-        prior = count_context([places[index] for index in sorted(kept)], classes, config) if given is None else given
+        others = set(usable).difference(part)
+        prior = count_context([places[index] for index in sorted(others)], classes, config) if fixed is None else fixed
         folds.append((prior, part))
     return folds
 
@@ -264,7 +264,7 @@ def _landing(context: ContextPrior, place: ObjectPlaces, target: int, weights: t
 
 
 def context_report(
-    judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], known: int, config: FitContextConfig
+    judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], count: int, config: FitContextConfig
 ) -> str:
     """Report the fitted context and its evaluation on held-out photographs as Markdown."""
     rows = [
@@ -272,7 +272,7 @@ def context_report(
         for row in judged
     ]
     weighed = [[kind, f"{place:.2g}", f"{co_occurrence:.2g}"] for kind, (place, co_occurrence) in weights.items()]
-    counted = f"Counted on {known} photographs" if config.table is None else "From a table"
+    counted = f"Counted on {count} photographs" if config.table is None else "From a table"
     fitted = f"fitted on looks at {config.weigh} of" if config.weigh else "not fitted on looks at"
     return "\n".join(
         [

@@ -63,12 +63,12 @@ def make_cases(
     if kind == "evidence":
         observer = Target(TargetEvidence.from_pretrained(sampler.eye.detector.name).requires_grad_(False))
     work = [(prior, index) for prior, part in folds for index in part]
-    parts = []
+    rows = []
     for prior, index in tqdm(work, desc=f"context with {kind}", unit="scene", dynamic_ncols=True):
         place = places[index]
         looks = slice(index * config.fixations, (index + 1) * config.fixations)
-        seen, fixations = samples.detections_of(looks), samples.fixations[looks]
-        presence, cells = presence_of(seen, place.grid), place.grid.cell_of(fixations)
+        detections, fixations = samples.detections_of(looks), samples.fixations[looks]
+        presence, cells = presence_of(detections, place.grid), place.grid.cell_of(fixations)
         for target in place.targets:
             goal = place.occupied[:, target]
             free = (~goal[cells]).nonzero()[:, 0]
@@ -78,15 +78,15 @@ def make_cases(
             number = int(torch.randint(1, len(free) + 1, (1,), generator=generator))
             used = free[torch.randperm(len(free), generator=generator)[:number]]
             belief = observer.start(1, place.grid, presence)
-            evidence = observer.weigh(seen, fixations, place.grid, target)
+            evidence = observer.weigh(detections, fixations, place.grid, target)
             for look in used.split(1):
                 belief = observer.update(belief, evidence[look])
             present = belief.chance(target)[0]
-            shown = presence[used].amax(0, keepdim=True)
-            alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
+            scores = presence[used].amax(0, keepdim=True)
+            alone = [prior(scores, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
             visited = torch.zeros(len(place.grid), dtype=torch.bool).scatter(0, cells[used], True)
-            parts.append((log_odds(present), *alone, goal, visited))
-    return Cases(*(torch.stack(column) for column in zip(*parts, strict=True)))
+            rows.append((log_odds(present), *alone, goal, visited))
+    return Cases(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
 SIZES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)

@@ -103,10 +103,10 @@ def gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int]
     people = by_picture(read_osie(config.fixations))
     viewing = Viewing(config, list(people)[: config.limit])
     size = people[str(viewing.scenes.ids[0])][0].size
-    found = []
+    per_picture = []
     for number, name in enumerate(tqdm(viewing.scenes.ids, desc="looking as people did", unit="picture")):
-        found.append(viewing.choices(number, people[str(name)], size))
-    return Choices.join(found), size, viewing.eye
+        per_picture.append(viewing.choices(number, people[str(name)], size))
+    return Choices.join(per_picture), size, viewing.eye
 
 
 class Viewing(PolicyLooking):
@@ -151,13 +151,13 @@ class Viewing(PolicyLooking):
                 f"{self._fit.fixations}: expected all pictures to have {size[0]} × {size[1]} pixels, got another "
                 f"size for {records[0].picture}"
             )
-        seen, grid = self.detections(number), self.grid(number)
+        detections, grid = self.detections(number), self.grid(number)
         cells, count = fixated_cells(records, grid)
         values = {}
         for name in self.policies:
             candidate = self.candidate(name, number)
             acquire = partial(candidate.acquisition, None, grid)
             with torch.inference_mode():
-                values[name] = values_in(StoredLooks(seen, grid), candidate.observer, acquire, cells, count)
+                values[name] = values_in(StoredLooks(detections, grid), candidate.observer, acquire, cells, count)
         subject = torch.tensor([int(each.subject) for each in records])
         return replace(choices_in(cells, count, grid, number, subject), values=values)

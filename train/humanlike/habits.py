@@ -67,7 +67,7 @@ class Halves:
                 "fixations: expected at least two people and two pictures, as one half is fitted and the other half "
                 f"held out; got {len(fitted)} fixations to fit and {len(held_out)} to hold out"
             )
-        counts = torch.bincount(fitted.taken, minlength=len(grid)).double() + smoothing
+        counts = torch.bincount(fitted.next_cell, minlength=len(grid)).double() + smoothing
         return cls(fitted, held_out, (counts / counts.sum()).log(), grid)
 
     @property
@@ -116,7 +116,7 @@ def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTe
     """Add the terms one after another, the values of a policy first, and fit all of them again each time."""
     order = ORDER if policy is not None else ORDER[1:]
     base = _bits(halves, None, ("centre",), _fit(halves, None, ("centre",), ridge))[1]
-    found = []
+    fits = []
     for number in range(1, len(order) + 1):
         terms = order[:number]
         weights = _fit(halves, policy, terms, ridge)
@@ -125,8 +125,8 @@ def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTe
         error = float(standard_error(over.numpy()))
         even = float(mean_by_picture(held_out, halves.held_out.picture).mean())
         mean = float(mean_by_picture(fitted, halves.fitted.picture).mean())
-        found.append(FittedTerms(policy, terms, weights, mean, even, float(over.mean()), error))
-    return found
+        fits.append(FittedTerms(policy, terms, weights, mean, even, float(over.mean()), error))
+    return fits
 
 
 def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[Term, ...]) -> Tensor:
@@ -142,20 +142,20 @@ def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tup
         Features `(n, X·Y, F)`: one for the policy, one for the centre bias, and one for each bin of the other terms.
     """
     shape = len(choices), len(halves.grid)
-    parts = []
+    columns = []
     for term in terms:
         if term == "policy":
             assert policy is not None
-            parts.append(standardised(choices.values[policy])[..., None])
+            columns.append(standardised(choices.values[policy])[..., None])
         elif term == "centre":
-            parts.append(halves.place.float().expand(shape)[..., None])
+            columns.append(halves.place.float().expand(shape)[..., None])
         elif term == "steps":
             bins = step_bins(halves.grid, choices.cell, torch.tensor(EDGES))
-            parts.append(torch.nn.functional.one_hot(bins, len(EDGES) + 1).float())
+            columns.append(torch.nn.functional.one_hot(bins, len(EDGES) + 1).float())
         else:
             bins = age_bins(choices.age, torch.tensor(AGES))
-            parts.append(torch.nn.functional.one_hot(bins + 1, len(AGES) + 2)[..., 1:].float())
-    return torch.cat(parts, -1)
+            columns.append(torch.nn.functional.one_hot(bins + 1, len(AGES) + 2)[..., 1:].float())
+    return torch.cat(columns, -1)
 
 
 def habits_of(model: FittedTerms, halves: Halves) -> GazeHabits:
@@ -175,13 +175,13 @@ def mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
 
 
 def _fit(halves: Halves, policy: str | None, terms: tuple[Term, ...], ridge: float) -> Tensor:
-    return fit_log_linear(features_of(halves.fitted, halves, policy, terms), halves.fitted.taken, ridge=ridge)
+    return fit_log_linear(features_of(halves.fitted, halves, policy, terms), halves.fitted.next_cell, ridge=ridge)
 
 
 def _bits(halves: Halves, policy: str | None, terms: tuple[Term, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the information gain of every choice over a uniform one, in bits, for both halves."""
     bits = []
     for choices in (halves.fitted, halves.held_out):
-        log = log_probability(features_of(choices, halves, policy, terms), choices.taken, weights)
+        log = log_probability(features_of(choices, halves, policy, terms), choices.next_cell, weights)
         bits.append((log + math.log(len(halves.grid))) / math.log(2))
     return bits[0], bits[1]

@@ -24,7 +24,7 @@ class Choices:
         picture: `(n,)`, number of the picture.
         subject: `(n,)`, number of the person.
         cell: `(n,)`, the fixated cell.
-        taken: `(n,)`, the cell that was fixated next, possibly the same one.
+        next_cell: `(n,)`, the cell that was fixated next, possibly the same one.
         age: `(n, X·Y)`, number of fixations since each cell was last fixated; infinite if it never was.
         values: `(n, X·Y)` for each policy, its values of all cells.
     """
@@ -32,24 +32,24 @@ class Choices:
     picture: Tensor
     subject: Tensor
     cell: Tensor
-    taken: Tensor
+    next_cell: Tensor
     age: Tensor
     values: Mapping[str, Tensor]
 
     def __len__(self) -> int:
-        return len(self.taken)
+        return len(self.next_cell)
 
     def __getitem__(self, index: Tensor) -> Choices:
         """Select choices by index or mask."""
-        tensors = {name: getattr(self, name)[index] for name in ("picture", "subject", "cell", "taken", "age")}
+        tensors = {name: getattr(self, name)[index] for name in ("picture", "subject", "cell", "next_cell", "age")}
         return Choices(**tensors, values={name: values[index] for name, values in self.values.items()})
 
     @classmethod
-    def join(cls, parts: Sequence[Choices]) -> Choices:
+    def join(cls, several: Sequence[Choices]) -> Choices:
         """Join the choices of several pictures."""
-        names = ("picture", "subject", "cell", "taken", "age")
-        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        values = {name: torch.cat([part.values[name] for part in parts]) for name in parts[0].values}
+        names = ("picture", "subject", "cell", "next_cell", "age")
+        tensors = {name: torch.cat([getattr(some, name) for some in several]) for name in names}
+        values = {name: torch.cat([some.values[name] for some in several]) for name in several[0].values}
         return cls(**tensors, values=values)
 
 
@@ -87,13 +87,13 @@ def choices_in(cells: Tensor, count: Tensor, grid: Grid, picture: int, subject: 
     Returns:
         The choices.
     """
-    found = []
+    by_shift = []
     age = torch.full((len(cells), len(grid)), torch.inf)
     for shift in range(cells.shape[1] - 1):
         age = (age + 1).scatter(-1, cells[:, shift, None], 0.0)
-        found.append(age)
+        by_shift.append(age)
     going = torch.arange(cells.shape[1] - 1) < count[:, None] - 1
-    ages = torch.stack(found, 1)[going] if found else age[:0]
+    ages = torch.stack(by_shift, 1)[going] if by_shift else age[:0]
     people = subject[:, None].expand(going.shape)[going]
     return Choices(torch.full_like(people, picture), people, cells[:, :-1][going], cells[:, 1:][going], ages, {})
 

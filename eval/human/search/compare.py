@@ -40,9 +40,9 @@ def compare(config: PeopleSearchConfig) -> None:
     for name in stems:
         check(stems.count(name) == 1, "files", "files of different names", f"{name!r} {stems.count(name)} times")
     searchers = {path.stem: read_searches(path, screen, path.stem) for path in config.files}
-    known = {each.picture for each in people}
+    pictures = {each.picture for each in people}
     for name, searches in searchers.items():
-        if not known & {each.picture for each in searches}:
+        if not pictures & {each.picture for each in searches}:
             raise DataError(f"{name}: expected searches in pictures that people searched, got only other pictures")
     floors = {name: _floor(name, people, grid, config) for name in (RANDOM, CENTRE)}
     policies: dict[str, list[Fixations]] = {}
@@ -52,7 +52,7 @@ def compare(config: PeopleSearchConfig) -> None:
         finish(run, "searching")
         policies = run.searches(gather(run)[0])
     every = {"people": people, **searchers, **floors}
-    tables = {f"all {len(known)} pictures": _scored(every, people, grid, config)}
+    tables = {f"all {len(pictures)} pictures": _scored(every, people, grid, config)}
     if run is not None:
         here = set(run.scenes.ids)
         few = {name: [each for each in searches if each.picture in here] for name, searches in every.items()}

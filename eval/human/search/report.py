@@ -67,11 +67,11 @@ def _cells(each: Beside) -> list[tuple[float, float]]:
 
 
 def _table(rows: Rows) -> list[str]:
-    body = [[name, *(_shown(*cell) for cell in _cells(each))] for name, each in rows.items()]
+    body = [[name, *(_with_error(*cell) for cell in _cells(each))] for name, each in rows.items()]
     return table([["", *_HEAD], *body])
 
 
-def _shown(value: float, error: float) -> str:
+def _with_error(value: float, error: float) -> str:
     if math.isnan(value):
         return ""
     return f"{value:.3f} ± {error:.3f}" if not math.isnan(error) else f"{value:.3f}"

@@ -32,8 +32,8 @@ class PeopleSearchRun(Run):
         """The screens whose pictures are found."""
         config = self.config
         searches = read_searches(config.people, (config.screen.width, config.screen.height))
-        known = {each.picture: each for each in searches}
-        self.screens = Screens(config.pictures, known, self.eye.detector.classes)
+        by_screen = {each.picture: each for each in searches}
+        self.screens = Screens(config.pictures, by_screen, self.eye.detector.classes)
         return self.screens
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
@@ -58,20 +58,20 @@ class PeopleSearchRun(Run):
                     [episode], candidate, looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(policy)
-            found = {"cells": list(outcome.cells), "found_at": outcome.found_at}
-            records.append({"policy": policy, "scene": name, "target_name": search.target, **found})
+            path = {"cells": list(outcome.cells), "found_at": outcome.found_at}
+            records.append({"policy": policy, "scene": name, "target_name": search.target, **path})
         return records, watch.seconds
 
     def searches(self, records: list[ResultRecord]) -> dict[str, list[Fixations]]:
         """The policies' scanpaths in pixels of the screen, by policy."""
         screen = self.config.screen
         centres = Grid(self.config.belief.columns, self.config.belief.rows, (screen.width, screen.height)).centres
-        found: dict[str, list[Fixations]] = {name: [] for name in self.policies}
+        scanpaths: dict[str, list[Fixations]] = {name: [] for name in self.policies}
         for record in records:
-            known = self.screens.searches[record["scene"]]
+            search = self.screens.searches[record["scene"]]
             points = centres[record["cells"]].double().numpy()
-            more = {"target": known.target, "box": known.box, "found": record["found_at"] >= 0}
-            found[record["policy"]].append(
-                Fixations(record["scene"], record["policy"], points, known.size, None, **more)
+            more = {"target": search.target, "box": search.box, "found": record["found_at"] >= 0}
+            scanpaths[record["policy"]].append(
+                Fixations(record["scene"], record["policy"], points, search.size, None, **more)
             )
-        return found
+        return scanpaths

@@ -86,18 +86,18 @@ class People:
         self.points = {name: np.concatenate([each.points for each in people]) for name, people in self.pictures.items()}
         self.clusters: dict[str, Any] = {}
         self.words = {name: self._words(name, people) for name, people in self.pictures.items()}
-        found = [shift_found(each, longest) for each in self.searches]
-        self.curve = mean_performance(found, [each.target for each in self.searches], 6)
+        finds = [shift_found(each, longest) for each in self.searches]
+        self.curve = mean_performance(finds, [each.target for each in self.searches], 6)
 
     def score(self, searches: Sequence[Fixations]) -> Beside:
         """Score a searcher; each person is compared with all other people."""
-        found = np.array([shift_found(each, self.longest) for each in searches])
+        finds = np.array([shift_found(each, self.longest) for each in searches])
         shifts = self.longest - 1
-        curve = mean_performance(found.tolist(), [each.subject for each in searches], shifts)
+        curve = mean_performance(finds.tolist(), [each.subject for each in searches], shifts)
         areas = defaultdict(list)
-        for at, each in zip(found, searches, strict=True):
+        for at, each in zip(finds, searches, strict=True):
             areas[each.picture].append(performance_area(cumulative_performance(np.array([at]), shifts)))
-        by_category = mean_performance(found.tolist(), [each.target for each in searches], 6)
+        by_category = mean_performance(finds.tolist(), [each.target for each in searches], 6)
         ratios = defaultdict(list)
         for each in searches:
             ratios[each.picture].append(scanpath_ratio(each.points + 0.5, each.box or (0, 0, 0, 0)))
@@ -105,7 +105,7 @@ class People:
         return Beside(
             curve,
             (performance_area(curve), float(standard_error(np.array([np.mean(v) for v in areas.values()])))),
-            (tfp_auc(found.tolist(), [each.target for each in searches]), self._error(found, searches)),
+            (tfp_auc(finds.tolist(), [each.target for each in searches]), self._error(finds, searches)),
             probability_mismatch(by_category, self.curve),
             _mean_and_error(ratio),
             self._alike(searches),
@@ -142,10 +142,10 @@ class People:
         ends = np.cumsum([len(each) for each in searches]).tolist()
         return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
 
-    def _error(self, found: NDArray[np.int64], searches: Sequence[Fixations]) -> float:
+    def _error(self, finds: NDArray[np.int64], searches: Sequence[Fixations]) -> float:
         """Standard error of TFP-AUC by bootstrap: pictures are resampled with replacement, target by target."""
         pictures = defaultdict(list)
-        for at, each in zip(found.tolist(), searches, strict=True):
+        for at, each in zip(finds.tolist(), searches, strict=True):
             pictures[each.target, each.picture].append(max(0, 7 - at) if at >= 0 else 0)
         # A search that succeeds after n gaze shifts counts in 7 - n of the seven values that are summed.
         categories = defaultdict(list)

@@ -53,8 +53,8 @@ class Screens:
         return len(self.ids)
 
     def __getitem__(self, index: int) -> Scene:
-        name, known = self.ids[index], self.annotation(index)
-        return Scene(name, name, self._screen(index), known.boxes, known.labels)
+        name, annotation = self.ids[index], self.annotation(index)
+        return Scene(name, name, self._screen(index), annotation.boxes, annotation.labels)
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a screen depend on."""

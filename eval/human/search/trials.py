@@ -38,13 +38,13 @@ def read_searches(path: Path, screen: tuple[int, int], subject: str | None = Non
             raise DataError(f"{path}: expected JSON files of scanpaths, found none")
         return [each for file in files for each in read_searches(file, screen, subject)]
     if path.suffix == ".csv":
-        found = [each.resized(screen) for each in read_table(path)]
+        searches = [each.resized(screen) for each in read_table(path)]
     else:
-        found = read_ruarte(path, screen=screen, subject=subject)
-    for each in found:
+        searches = read_ruarte(path, screen=screen, subject=subject)
+    for each in searches:
         if each.target is None or each.box is None:
             raise DataError(f"{path}: {each.picture}: expected a target and its box, by which searches are scored")
-    return found
+    return searches
 
 
 def shift_found(search: Fixations, longest: int) -> int:

@@ -55,14 +55,14 @@ def events_of(people: Sequence[Fixations], raster: Grid, grid: Grid, longest: in
     bins, before, visited, number, person, cells, fine = [], [], [], [], [], [], []
     for index, each in enumerate(people):
         points = torch.from_numpy(each.points[:longest])
-        found, cell = bins_of(raster, points), grid.cell_of(points)
+        path_bins, cell = bins_of(raster, points), grid.cell_of(points)
         cells.append(cell)
         fine.append(raster.cell_of(points))
-        bins.append(found[1:])
-        before.append(found[:-1])
+        bins.append(path_bins[1:])
+        before.append(path_bins[:-1])
         visited.append(F.one_hot(cell[:-1], len(grid)).cumsum(0).clamp(max=1).float())
-        number.append(torch.arange(len(found) - 1))
-        person.append(torch.full((len(found) - 1,), index))
+        number.append(torch.arange(len(path_bins) - 1))
+        person.append(torch.full((len(path_bins) - 1,), index))
     return Events(
         torch.cat(bins),
         torch.cat(before),

@@ -133,7 +133,7 @@ def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
     """Draw NSS after each gaze shift, for rows with habits."""
     from semfov.viz.human import plot_by_shift
 
-    shown = [
+    names = [
         "nearby",
         *run.config.models,
         "closer-look-learned",
@@ -141,7 +141,7 @@ def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
         *(f"landing + {m}" for m in run.config.models[:1]),
     ]
     curves, errors = {}, {}
-    for name in [*shown, PEOPLE]:
+    for name in [*names, PEOPLE]:
         each = scored.get((name, "with habits"))
         if each is None:
             continue
@@ -160,9 +160,10 @@ def draw_viewings(run: ViewingRun, scored: _Table, reported: Half) -> list[Path]
     written = []
     for place, index in enumerate(reported.pictures[: run.config.drawings]):
         name = str(run.scenes.ids[index])
-        shown = {"people": [each.points[: run.config.longest] for each in run.people[name]]}
-        shown |= {each: drawn_scanpaths(scored[each, "with habits"], reported, place) for each in ("landing", "nearby")}
-        few = {name: paths[:4] for name, paths in shown.items()}
+        scanpaths = {"people": [each.points[: run.config.longest] for each in run.people[name]]}
+        for row in ("landing", "nearby"):
+            scanpaths[row] = drawn_scanpaths(scored[row, "with habits"], reported, place)
+        few = {name: paths[:4] for name, paths in scanpaths.items()}
         figure = plot_scanpaths_beside(run.scenes[index].image, few)
         written.append(save_figure(figure, run.config.out / f"scanpaths_{clean(Path(name).stem)}.png"))
     return written

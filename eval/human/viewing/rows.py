@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -67,7 +67,6 @@ class Half:
     pictures: Sequence[int]
     events: list[Events]
     habits: Habits
-    _kept: dict[tuple[str, int], Tensor] = field(default_factory=dict)
 
     def map_of(self, name: str, place: int) -> Tensor:
         """Maps `(E, H, W)` or `(1, H, W)` of a picture."""
@@ -86,12 +85,12 @@ class Half:
             if name == PEOPLE:  # a density is used as its logarithm, after a small constant is added
                 smooth = (smooth / smooth.sum((-1, -2), keepdim=True) + 0.1 / (height * width)).log()
             terms.append(standardised_maps(smooth).expand(len(chosen), -1, -1))
-        known = {
+        habit_maps = {
             "centre bias": lambda: self.habits.centre.expand(len(chosen), -1, -1),
             "distance": lambda: self.habits.near(events.before[chosen]),
             "return": lambda: enlarged(events.visited[chosen], self.run.grid(self.pictures[place]), height, width),
         }
-        return terms + [known[name]() for name in row.habits]
+        return terms + [habit_maps[name]() for name in row.habits]
 
 
 def people_maps(events: Events, rows: int, columns: int) -> Tensor:
@@ -111,18 +110,18 @@ def fit_row(row: Row, half: Half) -> DensityWeights:
     generator = torch.Generator().manual_seed(density.seed)
     drawn = torch.randperm(int(sizes.sum()), generator=generator)[: density.events].sort().values
     first = sizes.cumsum(0) - sizes
-    parts = [
+    draws = [
         (place, drawn[(drawn >= start) & (drawn < start + size)] - start)
         for place, (start, size) in enumerate(zip(first.tolist(), sizes.tolist(), strict=True))
     ]
-    parts = [(place, chosen) for place, chosen in parts if len(chosen)]
-    bins = torch.cat([half.events[place].bins[chosen] for place, chosen in parts])
+    draws = [(place, chosen) for place, chosen in draws if len(chosen)]
+    bins = torch.cat([half.events[place].bins[chosen] for place, chosen in draws])
     if not names:
         return DensityWeights((), torch.zeros(0), 0.0, 0.0)
     blurs = [each for each in density.blurs if not (PEOPLE in row.maps and each == 0)] if row.maps else [0.0]
     fits = []
     for blur in blurs:
-        split = [half.terms(row, place, blur, chosen) for place, chosen in parts]
+        split = [half.terms(row, place, blur, chosen) for place, chosen in draws]
         fits.append(fit_density(names, [torch.cat(term) for term in zip(*split, strict=True)], bins, blur))
     return max(fits, key=lambda each: each.bits)
 

@@ -144,23 +144,23 @@ class ViewingRun(Run):
             `(E, X·Y)`, the values after each fixation of all people, or `(1, bins)` for a saliency model.
         """
         digest = self._followed(index)
-        kept = self.map_stores[name].read(digest) if self.config.store else None
-        if kept is not None:
-            return kept["values"]
+        tensors = self.map_stores[name].read(digest) if self.config.store else None
+        if tensors is not None:
+            return tensors["values"]
         with one_thread(), torch.inference_mode():
             if name in SALIENCY_CLASSES:
                 saliency = SALIENCY_CLASSES[name]()(self.scenes[index].image[None])
                 columns, rows = self._raster_size
-                found = {name: F.adaptive_avg_pool2d(saliency, (rows, columns)).flatten(1)}
+                maps = {name: F.adaptive_avg_pool2d(saliency, (rows, columns)).flatten(1)}
             else:
                 events = self.events(index)
                 paths = events.fine if name == LANDING else events.cells
                 alike = {each: self.candidate(each, index) for each in self._alike(name)}
-                found = evaluate_along(self.looks(name, index), alike, paths)
+                maps = evaluate_along(self.looks(name, index), alike, paths)
         if self.config.store:
-            for each, values in found.items():
+            for each, values in maps.items():
                 self.map_stores[each].write(digest, {"values": values.float().contiguous()})
-        return found[name].float()
+        return maps[name].float()
 
     def _alike(self, name: str) -> list[str]:
         """The policies with the same observer settings as this one, including itself."""

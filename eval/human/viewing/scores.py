@@ -58,7 +58,7 @@ def halves(run: ViewingRun) -> tuple[Half, Half]:
 
 def score_all(run: ViewingRun, fitted: Half, reported: Half, *, longest: int = 8) -> dict[tuple[str, str], Scored]:
     """Fit and score every row; results by name and group (`Row.group`)."""
-    found = {}
+    scored = {}
     for row in tqdm(rows_of(run.names, run.config.models), desc="scoring", unit="row"):
         weights = fit_row(row, fitted)
         means, shifts = [], []
@@ -67,8 +67,8 @@ def score_all(run: ViewingRun, fitted: Half, reported: Half, *, longest: int = 8
             means.append(figures.mean(0))
             number = events.number.numpy()
             shifts.append([_mean(figures[number == n]) for n in range(longest)])
-        found[row.name, row.group] = Scored(row, weights, np.array(means), np.array(shifts))
-    return found
+        scored[row.name, row.group] = Scored(row, weights, np.array(means), np.array(shifts))
+    return scored
 
 
 def _mean(values: _Array) -> Sequence[float]:

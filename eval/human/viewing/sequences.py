@@ -59,18 +59,18 @@ class DensityChoice(Choice):
         """Draw the next points `(B, 2)` from the row's maps `(B, H, W)` or `(1, H, W)` and the points so far."""
         height, width = self.habits.centre.shape
         last, count = self.points[-1], len(self.points[-1])
-        seen = torch.zeros(count, len(self.grid))
+        visited = torch.zeros(count, len(self.grid))
         for points in self.points:
-            seen.scatter_(1, self.grid.cell_of(points)[:, None], 1.0)
-        known = {
+            visited.scatter_(1, self.grid.cell_of(points)[:, None], 1.0)
+        habit_maps = {
             "centre bias": lambda: self.habits.centre.expand(count, -1, -1),
             "distance": lambda: self.habits.near(bins_of(self.raster, last)),
-            "return": lambda: enlarged(seen, self.grid, height, width),
+            "return": lambda: enlarged(visited, self.grid, height, width),
         }
         terms = []
         for name in self.weights.terms:
-            if name in known:
-                terms.append(known[name]())
+            if name in habit_maps:
+                terms.append(habit_maps[name]())
             elif maps is not None:
                 terms.append(standardised_maps(blurred(maps, self.weights.blur)).expand(count, -1, -1))
         flat = torch.zeros(count, height, width)
@@ -127,22 +127,22 @@ def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[s
     run = half.run
     files = {path.stem: by_picture(read_table(path)) for path in run.config.files}
     chosen = [scored[key] for name in run.config.sequences for key in [_key(name, scored)] if key is not None]
-    found: dict[str, list[float]] = {name: [] for name in [*(each.row.name for each in chosen), *files, PEOPLE]}
+    scores: dict[str, list[float]] = {name: [] for name in [*(each.row.name for each in chosen), *files, PEOPLE]}
     for place, index in enumerate(tqdm(half.pictures, desc="sequences", unit="picture")):
         people = [each.points[: run.config.longest] for each in run.people[str(run.scenes.ids[index])]]
         bandwidth = run.config.bandwidth * max(run.scenes.annotation(index).size)
         every = np.concatenate(people)
         words = _words(people, every, bandwidth)
-        found[PEOPLE].append(_beside(words, words))
+        scores[PEOPLE].append(_beside(words, words))
         for each in chosen:
             drawn = _words(drawn_scanpaths(each, half, place), every, bandwidth)
-            found[each.row.name].append(_beside(drawn, words))
+            scores[each.row.name].append(_beside(drawn, words))
         for name, pictures in files.items():
             theirs = [each.points[: run.config.longest] for each in pictures.get(str(run.scenes.ids[index]), [])]
             if theirs:
                 spelled = _words(theirs, every, bandwidth)
-                found[name].append(float(np.mean([sequence_score(a, b) for a in spelled for b in words])))
-    return {name: np.array(values) for name, values in found.items() if values}
+                scores[name].append(float(np.mean([sequence_score(a, b) for a in spelled for b in words])))
+    return {name: np.array(values) for name, values in scores.items() if values}
 
 
 def _key(name: str, scored: dict[tuple[str, str], Scored]) -> tuple[str, str] | None:

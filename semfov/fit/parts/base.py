@@ -57,7 +57,7 @@ class PartInputs:
         self.components = len(run.scenes.classes) + 1
         self.holdout = self.config.observation.holdout
         self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
-        self.parts: dict[str, PartResult] = {}
+        self.results: dict[str, PartResult] = {}
 
     @property
     def judged(self) -> Sequence[int]:
@@ -72,13 +72,13 @@ class PartInputs:
 
     def model(self, name: str) -> FolderModel | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
-        part = self.parts[name].part
+        part = self.results[name].part
         return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
 
     @property
     def semantic(self) -> Semantic:
         """The belief that fuses scores with the best exponent."""
-        part = self.parts["tempering"].part
+        part = self.results["tempering"].part
         if not part.used:
             return Semantic(self.components)
         return self.fusing(part.settings["scores"], part.settings["exponent"])

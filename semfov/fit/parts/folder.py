@@ -44,9 +44,9 @@ class FolderFit:
         return self.inputs.config
 
     @property
-    def parts(self) -> dict[str, PartResult]:
-        """The finished parts by their names."""
-        return self.inputs.parts
+    def results(self) -> dict[str, PartResult]:
+        """The results of the finished parts by their names."""
+        return self.inputs.results
 
     @property
     def stages(self) -> dict[str, dict[str, float]]:
@@ -65,13 +65,13 @@ class FolderFit:
                     Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
                 )
             write_text(self._record(name), json.dumps({"key": key, **asdict(result)}))
-        self.parts[name] = result
+        self.results[name] = result
         return result
 
     def _settings(self, name: str) -> list[Any]:
         """List everything except the looks that a part and its evaluation depend on."""
-        before = [fitted.part.sha256 for fitted in self.parts.values()]
-        before += [_plain(asdict(each.part)) for each in self.parts.values() if each.part.settings]
+        before = [fitted.part.sha256 for fitted in self.results.values()]
+        before += [_plain(asdict(each.part)) for each in self.results.values() if each.part.settings]
         return [name, _plain(asdict(self.fits[name].settings)), self.config.judged, before]
 
     def _record(self, name: str) -> Path:
