@@ -115,7 +115,6 @@ KNOWN = {
         "3,000 for each": "ten starts for each of 300 photographs",
         f"prior of {BeliefConfig().prior}": "code",
         "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
-        "7 in 10": "an explanation of calibration",
         "91.9 %": "with 15 of the 21 wrong places, 11.3 % become 8.1 %",
     },
     "docs/zoom.md": {

@@ -33,7 +33,7 @@ def test_snippets_run_as_printed(tiny_weights, make_onnx, tmp_path, monkeypatch)
     torch.save(model.state_dict(), "mine.pth")
     space: dict[str, object] = {}
     snippets = blocks("python")
-    assert len(snippets) == 6
+    assert len(snippets) == 5
     image = torch.rand(1, 3, 48, 64)
     for snippet in snippets:
         exec(compile(snippet, "docs/detectors.md", "exec"), space)
