@@ -30,7 +30,7 @@ FIXATIONS = {
     "absent": "No remaining cell is worth a look, and the target is probably absent.",
     "undecided": "No remaining cell is worth a look, but the target is probably there.",
     "closer found": "A closer look confirmed the target.",
-    "closer undecided": "No closer look confirmed the target, but it is probably there.",
+    "closer undecided": "No closer look was sure enough, but the target is probably there.",
 }
 """Sentences for looks of a fovea, by the ending, or by the outcome of the decision that ended the search."""
 
@@ -44,8 +44,8 @@ WINDOWS = {
     "absent": "No remaining look is worth a pass, and the target is probably absent.",
     "undecided": "No remaining look is worth a pass, but the target is probably there.",
     "closer found": "A closer look confirmed the target.",
-    "closer absent": "No closer look confirmed the target, and it is probably absent.",
-    "closer undecided": "No closer look confirmed the target, but it is probably there.",
+    "closer absent": "No closer look was sure enough, and the target is probably absent.",
+    "closer undecided": "No closer look was sure enough, but the target is probably there.",
 }
 """Sentences for looks at windows, by the ending, or by the outcome of the decision that ended the search."""
 
@@ -66,7 +66,7 @@ def sentence(
         The sentence; empty if the reason is not known.
 
     >>> sentence(FIXATIONS, "shifts", None, 8, closer=False), sentence(WINDOWS, "decision", "absent", 3, closer=True)
-    ('All 7 gaze shifts were made.', 'No closer look confirmed the target, and it is probably absent.')
+    ('All 7 gaze shifts were made.', 'No closer look was sure enough, and the target is probably absent.')
     """
     if ending == "decision" and outcome is not None:
         return sentences.get(f"closer {outcome}", sentences[outcome]) if closer else sentences[outcome]

@@ -213,7 +213,7 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     assert path.decision.outcome == "absent"
     assert path.decision.box is None
     assert len(path.closer) == 2
-    assert path.why_it_ended() == "No closer look confirmed the target, and it is probably absent."
+    assert path.why_it_ended() == "No closer look was sure enough, and the target is probably absent."
     # As long as nothing is found the search goes on. Where a square lies on the cells decides how green it looks, so
     # here no look is sure enough.
     looked = []
