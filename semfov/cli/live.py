@@ -14,7 +14,7 @@ from semfov.errors import InputError, check
 from semfov.live import FrameRate, LivePerception
 from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
-from semfov.viz.live import draw_moment, video, video_suffix
+from semfov.viz.live import VIDEOS, draw_moment, video, video_suffix
 
 UNKNOWN_RATE = 15.0
 """Frames per second of the written video if the source does not give its own."""
@@ -36,6 +36,8 @@ def look_live(options: LiveOptions) -> int:
     if options.source is None and options.camera is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
     check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
+    fits = options.out is None or options.out.is_dir() or options.out.suffix.lower() in ("", *VIDEOS)
+    check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEOS)}", options.out)
     start = start_of(options.start)
     _sought(options, detector_classes(options))
     stream = open_live(options)
@@ -64,7 +66,7 @@ def open_live(options: LiveOptions) -> Stream:
 def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
     """Look at every frame, print detections and belief until Ctrl-C, and return the path of the video, if any."""
     if path is not None:
-        path = (path / "live" if path.is_dir() or not path.suffix else path).with_suffix(video_suffix())
+        path = path if path.suffix and not path.is_dir() else path / f"live{video_suffix()}"
     rate = FrameRate()
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or UNKNOWN_RATE) as add:
@@ -84,8 +86,8 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
 def moment_line(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
     if isinstance(moment, WindowMoment):
-        x, y, magnification = moment.window.fixation
-        look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {magnification:.2f}: "
+        x, y = moment.window.centre(moment.lattice)
+        look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {moment.window.fixation[2]:.2f}: "
         if moment.examined is None:
             look += detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)
         else:

@@ -263,8 +263,8 @@ class WindowMoment(ZoomPath, Moment):
 
     @property
     def next_point(self) -> tuple[float, float]:
-        """`(x, y)` in pixels, the centre of the next window."""
-        return self.next_window.fixation[:2]
+        """`(x, y)` in pixels, the centre of what the next window shows."""
+        return self.next_window.centre(self.lattice)
 
     @property
     def window(self) -> Window:

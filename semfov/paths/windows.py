@@ -197,7 +197,7 @@ class ZoomPath(GazeRecord):
 
     def _lines(self) -> list[str]:
         """The windows and the objects."""
-        looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
+        looks = [f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}" for row in self.rows()]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         width, height = self.lattice.size
         return [
@@ -218,13 +218,13 @@ class ZoomPath(GazeRecord):
         closer = {look.number: look.place for look in self.closer}
         rows = []
         for number, glance in enumerate(self.glances):
-            x, y, magnification = glance.window.fixation
+            x, y = glance.window.centre(self.lattice)
             rows.append(
                 {
                     "look": number,
                     "x": x,
                     "y": y,
-                    "magnification": magnification,
+                    "magnification": glance.window.fixation[2],
                     "level": glance.window.level,
                     "value": self._value(number),
                     "closer": closer.get(number),
@@ -238,7 +238,7 @@ class ZoomPath(GazeRecord):
         return value if abs(value) < float("inf") else None
 
     def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
-        return torch.tensor([glance.window.fixation[:2] for glance in self.glances]), self.lattice.size
+        return torch.tensor([glance.window.centre(self.lattice) for glance in self.glances]), self.lattice.size
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}

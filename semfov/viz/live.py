@@ -26,7 +26,8 @@ _Box = tuple[float, float, float, float]
 _LONGEST = 640
 _LONGEST_OF_WINDOWS = 1280  # small objects of large frames are to be seen
 # Containers and codecs in the order in which they are tried; every build of OpenCV has the last one.
-_CODECS = ((".mp4", "mp4v"), (".avi", "MJPG"))
+VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
+"""Suffixes of videos that can be written, and their codecs."""
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
@@ -114,7 +115,7 @@ def _draw_windows(picture: Image.Image, moment: WindowMoment, to_drawing: Callab
 
 def video_suffix() -> str:
     """Suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
-    return next(suffix for suffix, codec in _CODECS if suffix == _CODECS[-1][0] or _writes(suffix, codec))
+    return next(suffix for suffix, codec in VIDEOS.items() if suffix == ".avi" or _writes(suffix, codec))
 
 
 @contextmanager
@@ -122,7 +123,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
     """Write frames to a video, whole or not at all.
 
     Args:
-        path: of the file, with the suffix of `video_suffix`.
+        path: of the file, with a suffix of `VIDEOS`.
         rate: frames per second.
 
     Yields:
@@ -135,7 +136,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
         import cv2
     except ImportError:
         raise DataError(f"{path}: videos need OpenCV: pip install opencv-python-headless") from None
-    codec = dict(_CODECS)[path.suffix]
+    codec = VIDEOS[path.suffix.lower()]
     with replacing(path) as temporary:
         # OpenCV chooses the container by the suffix.
         named = temporary.with_name(temporary.name + path.suffix)
@@ -148,7 +149,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
                     code = cv2.VideoWriter.fourcc(*codec)
                     writer = cv2.VideoWriter(str(named), code, rate, (frame.shape[1], frame.shape[0]))
                     if not writer.isOpened():
-                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder")
+                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder; name it {path.stem}{video_suffix()}")
                 writer.write(np.ascontiguousarray(frame[..., ::-1]))
 
             yield add

@@ -89,6 +89,8 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert re.search(r"\d frames/s$", lines[4])
     assert re.match(r"4 frames, [\d.]+ per second", lines[5])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
+    run("live", path, "--frames", 2, "--out", tmp_path / "seen.avi")
+    assert len(read(tmp_path / "seen.avi")) == 2
     code, printed = run("live", path)
     assert "red.avi: exploring" in printed.out
     assert "p(object) up to 0." in printed.out

@@ -19,6 +19,7 @@ from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Stimulus, WindowMoment, ZoomPath, reduced_copy
+from semfov.paths.endings import FIXATIONS, WINDOWS
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice
@@ -215,6 +216,22 @@ def test_rows_and_fixations_match_the_looks(make):
     fixations = record.as_fixations("a.jpg")
     assert fixations.points.tolist() == [[row["x"], row["y"]] for row in rows]
     assert (fixations.target, fixations.found) == (record.target_name, record.found)
+
+
+@pytest.mark.parametrize("make", [zoom_path, window_moment])
+def test_a_look_is_at_the_centre_of_what_it_shows(make):
+    """The overview is square, and reaches below this wide picture."""
+    record = make()
+    for look in record:
+        x1, y1, x2, y2 = look.region
+        assert look.fixation == pytest.approx(((x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2), abs=1e-3)
+    assert next(iter(record)).fixation == (199.5, 149.5)
+
+
+@pytest.mark.parametrize("sentences", [FIXATIONS, WINDOWS])
+def test_only_a_search_that_found_something_speaks_of_a_confirmed_target(sentences):
+    """Closer looks confirm objects from 0.5 on; a decision may ask for more, and then stays undecided beside them."""
+    assert [each for each, text in sentences.items() if "confirmed" in text] == ["closer found"]
 
 
 def with_picture(make):
