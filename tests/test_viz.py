@@ -202,6 +202,19 @@ def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
     assert [axes.get_ylabel() for axes in figure.axes if not axes.get_title()] == ["probability of cup"]
 
 
+@pytest.mark.parametrize("size", [(640, 425), (640, 300), (480, 640)])
+@pytest.mark.parametrize("looks", [1, 2, 5])
+def test_the_colour_bar_of_a_strip_lies_inside_the_figure(size, looks):
+    grid, cells = Grid(4, 4, size), torch.arange(looks)
+    fixed = {"grid": grid, "cells": cells, "fixations": grid.centres[cells], "values": torch.zeros(looks, 16)}
+    belief = torch.full((looks, 16, 2), 0.5)
+    classes = "background", "baseball glove"
+    figure = draw(plot_belief_strip(Scanpath(classes=classes, target=1, detections=(), probabilities=belief, **fixed)))
+    box, whole = figure.axes[-1].get_tightbbox(), figure.bbox
+    assert whole.x0 <= box.x0 < box.x1 <= whole.x1
+    assert whole.y0 <= box.y0 < box.y1 <= whole.y1
+
+
 def test_bars_are_as_high_as_the_posterior(scanpath):
     with mock.patch.object(Axes3D, "bar3d", autospec=True, side_effect=Axes3D.bar3d) as drawn:
         draw(plot_belief_bars(scanpath, most=2))

@@ -124,7 +124,7 @@ def plot_belief_strip(
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
     width, height = scanpath.grid.extent.tolist()
-    size = max(2.6 * columns, 3.2) + 0.6, rows * (2.6 * height / width + 0.3)
+    size = max(2.6 * columns, 3.2) + 0.6, max(rows * (2.6 * height / width + 0.3), 2.2)
     figure, panels = make_figure(rows, columns, width=size[0], height=size[1], layout="compressed", axes=axes)
     used = panels[: len(fixations)]
     for panel, fixation in zip(used, fixations, strict=True):

@@ -106,10 +106,12 @@ def draw_overlay(axes: Axes, grid: Grid, probabilities: Tensor) -> AxesImage:
 
 
 def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
-    """Draw the colour bar of an image."""
+    """Draw the colour bar of an image. Its ticks have few digits, because the layout leaves no room for more."""
+    from matplotlib.ticker import MaxNLocator
+
     first = axes[0] if isinstance(axes, list) else axes
     figure: Any = first.figure
-    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
 
 
 def cell_table(grid: Grid, values: Tensor) -> Any:
