@@ -16,6 +16,7 @@ from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check
 from semfov.paths import GazeRecord
+from semfov.report.page import page_path
 
 
 class SearchJob(PictureJob):
@@ -70,7 +71,7 @@ class FindJob(PictureJob):
         self.agent = make_agent(options)
         self.targets = several_classes(options.target, self.agent.classes[1:])
         self.target = None if self.targets is None else self.targets[0]
-        self.title = f"all {' and '.join(self.targets or ['objects'])}"
+        self.title = f"all objects{': ' if self.targets else ''}{', '.join(self.targets or [])}"
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Find all objects in a picture."""
@@ -115,6 +116,8 @@ def _check(options: PictureOptions) -> Any:
     """Check what can be checked before anything is loaded; returns the first cell."""
     if options.out is not None:
         kind_of(options.out)
+    if options.report is not None:
+        page_path(options.report)
     check(not options.draw or options.out is not None, "draw", "--out FOLDER beside --draw", "none")
     return start_of(options.start)
 

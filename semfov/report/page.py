@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from semfov.errors import check
 from semfov.io.files import write_text
 from semfov.report.episode import Data
 from semfov.report.looks import ABOUT, looks_html
@@ -35,12 +36,32 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
     Returns:
         The path of the file.
 
+    Raises:
+        InputError: the file does not end in `.html` or `.htm`.
+
     Example::
 
         path = agent.explore("harbour.tif", passes=16)
         write_page(Path("harbour.html"), "Harbour", [zoom_data(path, "harbour.tif", name="harbour")])
     """
-    write_text(path, page_html(title, episodes, sections=sections))
+    write_text(page_path(path), page_html(title, episodes, sections=sections))
+    return path
+
+
+def page_path(path: Path) -> Path:
+    """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`.
+
+    Args:
+        path: the HTML file.
+
+    Returns:
+        The same path.
+
+    >>> page_path(Path("cup.pdf"))
+    Traceback (most recent call last):
+    semfov.errors.InputError: report: expected a file that ends in .html or .htm, got cup.pdf
+    """
+    check(path.suffix.lower() in (".html", ".htm"), "report", "a file that ends in .html or .htm", path)
     return path
 
 
