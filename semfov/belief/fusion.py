@@ -38,8 +38,7 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> kaplan(torch.ones(3), torch.tensor([1.0, 0.0, 0.0]))
     tensor([2., 1., 1.])
     """
-    check_parameters(beta)
-    return kaplan_scaled(beta, scale_likelihood(likelihood))
+    return kaplan_scaled(beta, _checked(beta, likelihood))
 
 
 def product(beta: Tensor, likelihood: Tensor) -> Tensor:
@@ -64,8 +63,7 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([2.2500, 0.7500])
     """
-    check_parameters(beta)
-    return product_scaled(beta, scale_likelihood(likelihood))
+    return product_scaled(beta, _checked(beta, likelihood))
 
 
 def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
@@ -89,8 +87,15 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([1.7500, 1.2500])
     """
+    return sum_scaled(beta, _checked(beta, likelihood))
+
+
+def _checked(beta: Tensor, likelihood: Tensor) -> Tensor:
+    """Check parameters and likelihood, and scale the likelihood."""
     check_parameters(beta)
-    return sum_scaled(beta, scale_likelihood(likelihood))
+    scaled = scale_likelihood(likelihood)
+    check_shape(likelihood, "likelihood", *beta.shape[-1:])
+    return scaled
 
 
 def kaplan_scaled(beta: Tensor, scaled: Tensor) -> Tensor:

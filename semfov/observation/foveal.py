@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.detector import Detector
-from semfov.errors import InputError, check, check_finite, check_shape, lookup, values_known
+from semfov.errors import InputError, check, check_finite, check_shape, check_tensor, lookup, values_known
 from semfov.io import compatibility
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
@@ -103,6 +103,8 @@ class FovealObservationModel(Pretrained):
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        check_tensor(alpha, "alpha")
+        check(not isinstance(classes, str), "classes", "a sequence of names", repr(classes))
         components = len(classes) + 1
         borders = torch.as_tensor(edges, dtype=alpha.dtype, device=alpha.device).reshape(-1).clone()
         check_finite(borders, "edges")
@@ -190,6 +192,9 @@ class FovealObservationModel(Pretrained):
             InputError: shapes do not fit, or a score is negative or not finite.
         """
         components = len(self.classes) + 1
+        check_tensor(scores, "scores")
+        check_tensor(distance, "distance")
+        check(scores.is_floating_point(), "scores", "a floating-point tensor", scores.dtype)
         check_shape(scores, "scores", components)
         check(
             scores.shape[:-1] == distance.shape, "distance", f"shape {tuple(scores.shape[:-1])}", tuple(distance.shape)

@@ -119,6 +119,12 @@ def test_product_and_sum_by_hand():
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+def test_likelihoods_of_another_number_of_classes_are_refused(rule):
+    with pytest.raises(InputError, match=r"^likelihood: expected a tensor of shape \(..., 3\), got \(4, 2\)$"):
+        rule(torch.ones(4, 3), torch.ones(4, 2))
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
 @pytest.mark.parametrize(
     ("bad", "word"),
     [([0.0, 0.0], "zeros"), ([float("nan"), 1.0], "NaN"), ([-0.1, 1.0], "negative"), ([1.0, float("inf")], "inf")],

@@ -408,3 +408,18 @@ def test_distances_in_pixels_are_refused_with_the_unit():
     with pytest.raises(InputError, match=r"^distance: expected units of the image's longer side, got 240; divide"):
         model.log_likelihood(scores, torch.tensor(240.0))
     assert torch.isfinite(model.log_likelihood(scores, torch.tensor(1.5))).all()
+
+
+def test_values_that_are_no_tensors_of_numbers_between_0_and_1_are_refused_with_the_conversion():
+    model = FovealObservationModel(torch.ones(3, 2, 3), [0.2], ("cup", "cat"))
+    scores, distance = torch.tensor([0.2, 0.5, 0.3]), torch.tensor(0.1)
+    with pytest.raises(InputError, match=r"^scores: expected a tensor, got a NumPy array; give torch.as_tensor"):
+        model.calibrate(scores.numpy(), distance)
+    with pytest.raises(InputError, match=r"^distance: expected a tensor, got a float; give torch.as_tensor"):
+        model.calibrate(scores, 0.1)
+    with pytest.raises(InputError, match=r"^scores: expected a floating-point tensor, got torch.int64"):
+        model.calibrate(torch.tensor([0, 1, 0]), distance)
+    with pytest.raises(InputError, match=r"^alpha: expected a tensor, got a list"):
+        FovealObservationModel([[[1.0]]], [0.2], ("cup", "cat"))
+    with pytest.raises(InputError, match=r"^classes: expected a sequence of names, got 'cup'"):
+        FovealObservationModel(torch.ones(3, 2, 3), [0.2], "cup")
