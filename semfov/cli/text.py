@@ -94,10 +94,11 @@ def box_text(box: Sequence[float]) -> str:
 
 
 def regions_lines(scanpath: Scanpath) -> list[str]:
-    """A line for each class that the final map of an exploration names, with its most probable cell."""
+    """A line for each class that was looked for and that the final map names, with its most probable cell."""
     by_class: dict[str, list[int]] = {}
     for label, cells, _ in named_regions(scanpath):
-        by_class.setdefault(label, []).extend(cells)
+        if not scanpath.targets or scanpath.classes.index(label) in scanpath.targets:
+            by_class.setdefault(label, []).extend(cells)
     lines = []
     for label, cells in sorted(by_class.items(), key=lambda item: -len(item[1])):
         chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]

@@ -125,7 +125,13 @@ def class_numbers(
     if names is None:
         return ()
     if isinstance(names, str) or not isinstance(names, Sequence):
-        return (class_index(names, classes, argument),)
+        try:
+            return (class_index(names, classes, argument),)
+        except InputError as error:
+            several = [name.strip() for name in str(names).split(",")]
+            if len(several) == 1:
+                raise
+            raise InputError(f"{error}; several classes are a list: {several}") from None
     check(len(names) > 0, argument, "a class, several, or None for all", names)
     return tuple(dict.fromkeys(class_index(name, classes, argument) for name in names))
 

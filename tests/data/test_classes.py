@@ -1,7 +1,7 @@
 import pytest
 
 from semfov.data import canonical_name, class_index
-from semfov.data.classes import ALIASES, class_indices
+from semfov.data.classes import ALIASES, class_indices, class_numbers
 from semfov.errors import InputError
 
 
@@ -23,3 +23,8 @@ def test_the_error_for_an_unknown_class_suggests_the_nearest_name():
 def test_the_same_class_twice_is_refused():
     with pytest.raises(InputError, match="expected 2 different names"):
         class_indices(("sofa", "couch"))
+
+
+def test_several_classes_in_one_text_are_refused_with_the_list():
+    with pytest.raises(InputError, match=r"; several classes are a list: \['cup', 'sofa'\]$"):
+        class_numbers("cup, sofa", ("cup", "couch"))

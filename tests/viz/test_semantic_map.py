@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,6 +156,8 @@ def test_an_exploration_is_told_as_classes_and_their_cells():
         "  map: cat in 4 cells, p up to 0.95 around (34, 14)",
         "  map: dog in 2 cells, p up to 0.55 around (54, 34)",
     ]
+    cats = replace(marginal_map(), targets=(marginal_map().classes.index("cat"),))
+    assert regions_lines(cats) == ["  map: cat in 4 cells, p up to 0.95 around (34, 14)"]
     empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
     assert regions_lines(scanpath_of(empty, 6)) == []
     one = empty.clone()
