@@ -18,10 +18,16 @@ class Strategy(nn.Module):
     Args:
         observer: turns looks into a belief.
         policy: chooses the next fixation from the belief.
+
+    Raises:
+        InputError: one of them is something else, such as a name or a class.
     """
 
     def __init__(self, observer: Observer, policy: Policy) -> None:
         super().__init__()
+        for argument, part, kind in (("observer", observer, Observer), ("policy", policy, Policy)):
+            got = f"the class {part.__name__}" if isinstance(part, type) else f"a {type(part).__name__}"
+            check(isinstance(part, kind), argument, f"an instance of a subclass of {kind.__name__}", got)
         self.observer = observer
         self.policy = policy
 

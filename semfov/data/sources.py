@@ -54,7 +54,8 @@ def picture_files(source: Path) -> list[Path]:
         return [source]
     files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
     if not files:
-        raise DataError(f"picture: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, got none; folders in it are not searched")
+        kinds = f"({', '.join(PHOTOGRAPHS)})"
+        raise DataError(f"picture: expected photographs {kinds} in {source}, got none; folders in it are not searched")
     return files
 
 

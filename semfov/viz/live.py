@@ -149,7 +149,8 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
                     code = cv2.VideoWriter.fourcc(*codec)
                     writer = cv2.VideoWriter(str(named), code, rate, (frame.shape[1], frame.shape[0]))
                     if not writer.isOpened():
-                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder; name it {path.stem}{video_suffix()}")
+                        other = f"{path.stem}{video_suffix()}"
+                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder; name it {other}")
                 writer.write(np.ascontiguousarray(frame[..., ::-1]))
 
             yield add
