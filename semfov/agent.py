@@ -570,8 +570,6 @@ class ActivePerception(nn.Module):
 
     def _check_parts(self) -> None:
         """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
-        policy = self.exploring.policy
-        check("exploration" in policy.tasks, "explore", "a policy for exploration", type(policy).__name__)
         settings, grid = self.eye.settings(), (self.columns, self.rows)
         for module in self.modules():
             if isinstance(module, FovealObservationModel | TargetEvidence | MapEvidence | Verification):

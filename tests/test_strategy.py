@@ -2,10 +2,9 @@
 
 import pytest
 
-from semfov import ActivePerception, observers, policies
+from semfov import observers, policies
 from semfov.errors import InputError
 from semfov.strategy import Strategy
-from tests import small
 
 
 @pytest.mark.parametrize(
@@ -25,10 +24,3 @@ def test_something_else_than_a_policy_is_refused_by_name(wrong, got):
 def test_a_policy_in_the_place_of_the_observer_is_refused():
     with pytest.raises(InputError, match=r"^observer: expected an instance of a subclass of Observer, got a Random$"):
         Strategy(policies.Random(), observers.Semantic(3))
-
-
-def test_a_policy_that_needs_a_target_cannot_explore():
-    """It would be asked for a target that an exploration does not have."""
-    eye, both = small.agent(small.Coloured()).eye, (observers.Semantic(3), policies.NonPredictive())
-    with pytest.raises(InputError, match=r"^explore: expected a policy for exploration, got NonPredictive$"):
-        ActivePerception(eye, search=both, explore=both)

@@ -14,7 +14,7 @@ from semfov.errors import InputError, check
 from semfov.live import FrameRate, LivePerception
 from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
-from semfov.viz.live import VIDEOS, draw_moment, video, video_suffix
+from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
 UNKNOWN_RATE = 15.0
 """Frames per second of the written video if the source does not give its own."""
@@ -36,8 +36,8 @@ def look_live(options: LiveOptions) -> int:
     if options.source is None and options.camera is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
     check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
-    fits = options.out is None or options.out.is_dir() or options.out.suffix.lower() in ("", *VIDEOS)
-    check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEOS)}", options.out)
+    fits = options.out is None or options.out.is_dir() or options.out.suffix.lower() in ("", *VIDEO_CODECS)
+    check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", options.out)
     start = start_of(options.start)
     _sought(options, detector_classes(options))
     stream = open_live(options)

@@ -26,7 +26,7 @@ _Box = tuple[float, float, float, float]
 _LONGEST = 640
 _LONGEST_OF_WINDOWS = 1280  # small objects of large frames are to be seen
 # Containers and codecs in the order in which they are tried; every build of OpenCV has the last one.
-VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
+VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 """Suffixes of videos that can be written, and their codecs."""
 
 
@@ -115,7 +115,7 @@ def _draw_windows(picture: Image.Image, moment: WindowMoment, to_drawing: Callab
 
 def video_suffix() -> str:
     """Suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
-    return next(suffix for suffix, codec in VIDEOS.items() if suffix == ".avi" or _writes(suffix, codec))
+    return next(suffix for suffix, codec in VIDEO_CODECS.items() if suffix == ".avi" or _writes(suffix, codec))
 
 
 @contextmanager
@@ -123,7 +123,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
     """Write frames to a video, whole or not at all.
 
     Args:
-        path: of the file, with a suffix of `VIDEOS`.
+        path: of the file, with a suffix of `VIDEO_CODECS`.
         rate: frames per second.
 
     Yields:
@@ -136,7 +136,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
         import cv2
     except ImportError:
         raise DataError(f"{path}: videos need OpenCV: pip install opencv-python-headless") from None
-    codec = VIDEOS[path.suffix.lower()]
+    codec = VIDEO_CODECS[path.suffix.lower()]
     with replacing(path) as temporary:
         # OpenCV chooses the container by the suffix.
         named = temporary.with_name(temporary.name + path.suffix)
