@@ -12,7 +12,7 @@ from eval.decide.run import overlap
 from semfov.agents.limits import EpisodeLimits
 from semfov.agents.windows import search_windows
 from semfov.data.scene import Annotation
-from semfov.decision import MOST_CLOSER, OUTCOMES
+from semfov.decision import OUTCOMES
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
@@ -32,7 +32,7 @@ def decide_all(
     slices: Sequence[Window],
     *,
     passes: int,
-    closer: int = MOST_CLOSER,
+    closer: int,
 ) -> list[ResultRecord]:
     """Search a picture until a decision, for each target, with closer looks and without them.
 

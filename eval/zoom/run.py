@@ -20,7 +20,6 @@ from eval.zoom.orders import in_order, oracle, quad_tree, shuffled, sparse
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.decision import MOST_CLOSER
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
 from semfov.runs.results import ResultRecord
@@ -35,6 +34,7 @@ from semfov.runs.window_looking import (
     found_in,
     right_boxes,
 )
+from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -70,7 +70,7 @@ class ZoomConfig(WindowLookingConfig):
             in mosaics, for classes that a slice shows; the `decision` at the end of a search.
         sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
             until a decision (with `target`, only that class is searched for).
-        closer: largest number of closer looks of a search.
+        closer: largest number of closer looks of a search; by default as many as there are passes for, as in the agent.
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
         seed: random seed of mosaics and random orders.
@@ -84,7 +84,7 @@ class ZoomConfig(WindowLookingConfig):
     passes: Annotated[int, Range(2, 100_000)] = 24
     measures: tuple[_Measure, ...] = ("objects", "recall", "hit", "decision")
     sought: Count = 4
-    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
+    closer: Annotated[int, Range(0, 100)] = CLOSER
     observation: str | None = None
     out: Path = Path("runs/zoom")
 
