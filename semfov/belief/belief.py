@@ -3,13 +3,25 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
+
+Kind = TypeVar("Kind")
+
+
+def with_fields(instance: Kind, change: Callable[[Any], Any]) -> Kind:
+    """Copy of a data class with every field changed; of a field that is a tuple, every value in it."""
+
+    def changed(value: Any) -> Any:
+        return tuple(changed(each) for each in value) if isinstance(value, tuple) else change(value)
+
+    values = {each.name: changed(getattr(instance, each.name)) for each in fields(instance)}  # type: ignore[arg-type]
+    return replace(instance, **values)  # type: ignore[type-var]
 
 
 class Belief(ABC):
@@ -94,12 +106,9 @@ class Belief(ABC):
         def mapped(value: Any) -> Any:
             if isinstance(value, Tensor):
                 return function(value)
-            if isinstance(value, Belief):
-                return value.map(function)
-            return tuple(mapped(each) for each in value) if isinstance(value, tuple) else value
+            return value.map(function) if isinstance(value, Belief) else value
 
-        changed = {each.name: mapped(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
-        return replace(self, **changed)  # type: ignore[type-var]
+        return with_fields(self, mapped)
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The belief of the selected episodes."""

@@ -19,7 +19,7 @@ from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
 
 
 class Rates(Protocol):
-    """Predicts how many objects closer looks find: `GlimpseEvidence`, `Survey` or `ObservedRates`."""
+    """Predicts how many objects closer looks find, such as `GlimpseEvidence` and `Survey`."""
 
     @property
     def foresight(self) -> float:

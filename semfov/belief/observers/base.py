@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, with_fields
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
@@ -31,14 +31,7 @@ class Look:
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The selected looks of the batch."""
-
-        def selected(value: Any) -> Any:
-            if isinstance(value, Tensor | Look):
-                return value[index]
-            return tuple(selected(each) for each in value) if isinstance(value, tuple) else value
-
-        chosen = {each.name: selected(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
-        return replace(self, **chosen)  # type: ignore[type-var]
+        return with_fields(self, lambda value: value[index] if isinstance(value, Tensor | Look) else value)
 
     @classmethod
     def join(cls, looks: Sequence[Self]) -> Self:
