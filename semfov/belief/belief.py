@@ -11,10 +11,10 @@ from torch import Tensor
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
 
-Kind = TypeVar("Kind")
+_DataClass = TypeVar("_DataClass")
 
 
-def with_fields(instance: Kind, change: Callable[[Any], Any]) -> Kind:
+def with_fields(instance: _DataClass, change: Callable[[Any], Any]) -> _DataClass:
     """Copy of a data class with every field changed; of a field that is a tuple, every value in it."""
 
     def changed(value: Any) -> Any:
