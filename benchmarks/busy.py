@@ -5,21 +5,18 @@ every operation. Here each path runs with all threads and with one, in turn, fir
 while a loop takes one core. Times are of the clock; run it on a machine that is otherwise quiet.
 """
 
-import argparse
 import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import cycle
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.beliefs import make_belief, make_look, make_model, unvisited
-from benchmarks.images import GAZE, SIGMA, photograph
-from benchmarks.machine import describe
-from benchmarks.tables import RESULTS, number, spread, table, write
+from benchmarks.machine import GAZE, SIGMA, photograph
+from benchmarks.tables import begin, command, number, page, spread, table, write
 from benchmarks.timing import Run, Spread, interleaved
 from semfov import EmbeddedScenes, Grid, ZoomAgent, acquisition, foveate
 from semfov.belief import fuse
@@ -27,6 +24,8 @@ from semfov.data.large import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.scores import Candidates
 from semfov.paths import ZoomPath
+
+TEXT = "Written by `python -m benchmarks.busy`: milliseconds by the clock, medians (quartiles)."
 
 
 def paths() -> dict[str, Run]:
@@ -119,24 +118,17 @@ def times(seconds: float) -> dict[str, dict[str, Spread]]:
 @torch.inference_mode()
 def main() -> None:
     """Measure, and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.busy", description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration of each half")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
-    options = parser.parse_args()
+    options = command("benchmarks.busy", __doc__, seconds=10.0, threads=torch.get_num_threads()).parse_args()
+    _, about = begin(options)
     spreads = times(options.seconds)
     columns = list(next(iter(spreads.values())))
     rows = [
-        [
-            name,
-            *(spread(own[column]) for column in columns),
-            number(own["busy, all threads"].middle / own["quiet, one thread"].middle),
-        ]
+        [name, *map(spread, own.values()), number(own["busy, all threads"].middle / own["quiet, one thread"].middle)]
         for name, own in spreads.items()
     ]
     text = table(["milliseconds", *columns, "busy, all threads / quiet, one thread"], rows)
     figures = {name: {column: asdict(value) for column, value in own.items()} for name, own in spreads.items()}
-    write(options.out, "busy", f"# Beside a program that takes a core\n\n{text}", {"about": describe(), **figures})
-    print(text)
+    write(options.out, "busy", page("Beside a program that takes a core", TEXT, about, text), figures)
 
 
 if __name__ == "__main__":

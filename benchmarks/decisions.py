@@ -1,24 +1,15 @@
-"""Time of one decision where to look next, compared with published times: `python -m benchmarks.decisions`.
+"""Time of one decision where to look next, compared with published times: `python -m benchmarks.decisions`."""
 
-A decision is made for one episode, on a map of 10 x 10 cells and 81 classes, with 8 levels of distance, from a given
-belief. It evaluates every cell, draws the random numbers that break ties, and takes the best cell not visited yet.
-Looking, detecting and updating the belief are not part of a decision; the update is timed separately. A decision by
-saliency uses no belief: it foveates the photograph, computes the saliency of the view, and averages it over the cells.
-"""
-
-import argparse
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.beliefs import CLASSES, DETECTIONS, LEVELS, exploration, make_model, unvisited
-from benchmarks.images import GAZE, photograph, use_threads
-from benchmarks.machine import describe
-from benchmarks.tables import RESULTS, comparison_rows, number, spread, table, write
-from benchmarks.timing import Clock, Measured, Run, Spread, clock_for, interleaved, measure
+from benchmarks.machine import GAZE, photograph
+from benchmarks.tables import begin, command, comparison_rows, number, page, spread, table, write
+from benchmarks.timing import Clock, Measured, Run, Spread, interleaved, measure
 from semfov import (
     Detections,
     DirichletBelief,
@@ -34,6 +25,20 @@ from semfov.sensor import Foveation
 
 TARGET, LOOKS, TIMES = 5, 3, 10
 KL = "KL divergence, raw"
+
+TEXT = f"""\
+Written by `python -m benchmarks.decisions`. Medians (quartiles) of one run. A decision from a belief is run {TIMES}
+times in a row, and the mean is one value.
+
+A decision is made for one episode, with {CLASSES + 1} classes on 10 x 10 cells and {LEVELS} levels of distance, from a
+given belief. It evaluates every cell, draws the random numbers that break ties, and takes the best cell not visited
+yet. Looking, detecting and updating the belief are not part of it. A decision by saliency foveates a photograph of
+640 x 480 from its given pyramid, computes the saliency of the view, and averages it over the cells. Raw: map by
+Kaplan's rule; calibrated: map by the modified rule. Published times are from another machine: only the peers below were
+timed beside semfov."""
+BRUTE_FORCE = """\
+The published sum over the map, computed for every fixation by the formula. The loop evaluates one of the hundred
+fixations, and its time is scaled up. It does not choose the next cell. Ratios are taken within one repetition."""
 
 # Computational cost in ms from the tables of search and of exploration in Luzio, Bernardino and Moreno (2024), measured
 # on another machine. Their "Kaplan" is raw here, their "modified Kaplan" calibrated. Their saliency model is VOCUS2.
@@ -139,27 +144,19 @@ def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
 
 def main() -> None:
     """Measure all rows and write the tables."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.decisions", description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, default=2, help="number of threads")
-    parser.add_argument("--seconds", type=float, default=30.0, help="shortest duration of all measurements together")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
-    options = parser.parse_args()
-    use_threads(options.threads)
-    clock, times = clock_for(options.threads)
-    about = describe() | {"times": times}
+    options = command("benchmarks.decisions", __doc__, seconds=30.0, threads=2).parse_args()
+    clock, about = begin(options)
     # Made outside inference mode, like a loaded model, because only then it caches its tables.
     model = make_model()
     with torch.inference_mode():
         spreads, others, peers = measure_all(model, options.seconds / 3, clock)
-    text = report(about, spreads, others, peers)
-    print(text)
     figures = {
         "machine": about,
         "milliseconds": {name: asdict(values) for name, values in spreads.items()},
         "published_milliseconds": PUBLISHED,
         "peers": asdict(peers),
     }
-    write(options.out, "decisions", text, figures)
+    write(options.out, "decisions", page("Decisions", TEXT, about, *sections(spreads, others, peers)), figures)
 
 
 def measure_all(
@@ -180,46 +177,21 @@ def measure_all(
     return spreads, [*changes, *preparations], measure(brute, seconds, clock, TIMES)
 
 
-def report(about: dict[str, str], spreads: dict[str, Spread], others: list[str], peers: Measured) -> str:
-    """The report with all tables, as Markdown."""
-    sections = []
+def sections(spreads: dict[str, Spread], others: list[str], peers: Measured) -> list[str]:
+    """The tables with their headings, as Markdown."""
+    parts = []
     for experiment, published in PUBLISHED.items():
         rows = [[name, spread(spreads[name]), number(cost) if cost else ""] for name, cost in published.items()]
-        head = ["decision", "semfov, ms", "published, ms"]
-        sections += [f"## One decision of {experiment}", "", table(head, rows), ""]
-    return "\n".join(
-        [
-            "# Decisions",
-            "",
-            "Written by `python -m benchmarks.decisions`. Medians (quartiles) of one run. Decisions from a belief are",
-            f"run {TIMES} times in a row, and their mean is one value.",
-            "",
-            f"A decision is made for one episode, with {CLASSES + 1} classes on 10 x 10 cells and {LEVELS} levels of",
-            "distance, from a given belief. It evaluates every cell, draws the random numbers that break ties, and",
-            "takes the best cell not visited yet. Looking, detecting and updating the belief are not part of a",
-            "decision. A decision by saliency foveates a photograph of 640 x 480 from its given pyramid, computes the",
-            "saliency of the view, and averages it over the cells. Raw: map by Kaplan's rule; calibrated: map by the",
-            "modified rule. Published times are from another machine: only the peers below were timed beside semfov.",
-            "",
-            *(f"- {key}: {value}" for key, value in about.items()),
-            "",
-            *sections,
-            "## Work that decisions need but do not include",
-            "",
-            table(["work", "semfov, ms"], [[name, spread(spreads[name])] for name in others]),
-            "",
-            "The foveated view is an exception: it is included in decisions by saliency.",
-            "",
-            "## Brute force",
-            "",
-            "The published sum over the map, computed for every fixation by the formula. The loop evaluates one of the",
-            "hundred fixations, and its time is scaled up. It does not choose the next cell. Ratios of times are taken",
-            "within one repetition.",
-            "",
-            table(["decision", "peer", "semfov, ms", "peer, ms", "peer / semfov"], comparison_rows(peers)),
-            "",
-        ]
-    )
+        parts += [f"## One decision of {experiment}", table(["decision", "semfov, ms", "published, ms"], rows)]
+    return [
+        *parts,
+        "## Work that decisions need but do not include",
+        table(["work", "semfov, ms"], [[name, spread(spreads[name])] for name in others]),
+        "The foveated view is an exception: it is included in decisions by saliency.",
+        "## Brute force",
+        BRUTE_FORCE,
+        table(["decision", "peer", "semfov, ms", "peer, ms", "peer / semfov"], comparison_rows(peers)),
+    ]
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from semfov.data.images import read_image
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress
@@ -24,15 +25,6 @@ SELECTIONS = {
     "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=10_000, per_class=True),
     "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=10_000),
 }
-
-
-def read_image(path: Path) -> Tensor:
-    """A photograph as `(1, 3, H, W)`, RGB in [0, 1], in the stored orientation, to which COCO's annotations refer."""
-    import numpy as np
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)[None] / 255
 
 
 def rows_above(candidates: Candidates, threshold: float, *, multilabel: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -89,7 +81,8 @@ def average_precision(
     ids = torch.tensor([category[name] for name in detector.classes])
     results: list[list[dict[str, Any]]] = [[] for _ in selections]
     for image_id in tqdm(sorted(truth.imgs), desc=detector.name, unit="image"):
-        image = read_image(root / truth.imgs[image_id]["file_name"])
+        # In the stored orientation, to which COCO's annotations refer.
+        image = read_image(root / truth.imgs[image_id]["file_name"], oriented=False)[None]
         by_selection = detect(detector, image, selections, multilabel=multilabel)
         for result, (boxes, scores, labels) in zip(results, by_selection, strict=True):
             sizes = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1)

@@ -15,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 import torch
 from torch import Tensor
 
-from benchmarks.images import photograph
+from benchmarks.machine import photograph
 from benchmarks.tables import number, spread, table
 from benchmarks.timing import Run, Spread, interleaved
 from semfov.detection import Detector

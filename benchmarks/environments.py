@@ -5,7 +5,6 @@ fixated before, and every episode that ends is followed by another; the time of 
 an agent makes the same number of steps and runs the detector in each.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -17,10 +16,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 import semfov
-from benchmarks.images import use_threads
-from benchmarks.machine import describe
-from benchmarks.tables import RESULTS, number, table, write
-from benchmarks.timing import Run, Spread, clock_for, interleaved
+from benchmarks.tables import begin, command, number, page, table, write
+from benchmarks.timing import Run, Spread, interleaved
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, Scenery, open_scenery
 from semfov.gaze.policies import Task
 
@@ -32,6 +29,11 @@ WORLDS: dict[str, tuple[Task, str, tuple[int, int]]] = {
     "exploration, Kaplan's rule": ("exploration", "kl-raw", (64, 256)),
 }
 """Beliefs of the environments: task, policy, and numbers of episodes that run side by side."""
+TEXT = """\
+Written by `python -m benchmarks.environments`. Steps per second in {} embedded scenes, on 10 x 10 cells: median and
+quartiles over repetitions. The detections from every cell were stored before. Episodes that end are followed by others;
+the time of their first looks is included, without counting as a step. `one that looks itself`: an agent that runs
+YOLOv3-tiny in every step."""
 
 
 def steps(envs: Any, seed: int) -> Run:
@@ -101,17 +103,12 @@ def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tup
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all rows and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.environments", description=__doc__.splitlines()[0])
+    parser = command("benchmarks.environments", __doc__, seconds=6.0)
     parser.add_argument("--scenes", type=int, default=8, help="number of embedded scenes")
     parser.add_argument("--only", choices=list(WORLDS), nargs="+", default=list(WORLDS), help="beliefs to measure")
     parser.add_argument("--cache", type=Path, help="folder of the stored detections from every cell")
-    parser.add_argument("--threads", type=int, default=1, help="number of threads")
-    parser.add_argument("--seconds", type=float, default=6.0, help="shortest duration for each belief")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args(arguments)
-    use_threads(options.threads)
-    clock, times = clock_for(options.threads)
-    about = describe() | {"times": times}
+    clock, about = begin(options)
     rows, figures = [], {}
     for name in options.only:
         task, policy, sizes = WORLDS[name]
@@ -127,21 +124,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             rows.append([name, program, *(number(value) for value in (rates.middle, rates.low, rates.high))])
             figures[f"{name}: {program}"] = asdict(rates)
             print(" | ".join(rows[-1]), flush=True)
-    text = "\n".join(
-        [
-            "# Environments",
-            "",
-            f"Written by `python -m benchmarks.environments`. Steps per second in {options.scenes} embedded scenes, on",
-            "10 x 10 cells: median and quartiles over repetitions. The detections from every cell were stored before.",
-            "Episodes that end are followed by others; the time of their first looks is included, without counting as",
-            "a step. `one that looks itself`: an agent that runs YOLOv3-tiny in every step.",
-            "",
-            *(f"- {key}: {value}" for key, value in about.items()),
-            "",
-            table(["belief", "episodes side by side", "steps a second", "lower quartile", "upper quartile"], rows),
-            "",
-        ]
-    )
+    head = ["belief", "episodes side by side", "steps a second", "lower quartile", "upper quartile"]
+    text = page("Environments", TEXT.format(options.scenes), about, table(head, rows))
     write(options.out, "environments", text, {"machine": about, "steps_per_second": figures})
 
 

@@ -35,6 +35,7 @@ import matplotlib.pyplot  # noqa: F401 (imported once for all forks)
 import torch
 from safetensors import safe_open
 
+from benchmarks.tables import table
 from eval.explore import main as explore
 from eval.search import main as search
 from semfov.io.storage import checksum
@@ -51,11 +52,6 @@ _EXPLORE = [*_SMALL, "--policies", '["random-raw", "kl-calibrated"]']
 _FIT = [
     "--workers", "1", "--data.limit", "4", "--fixations", "1", "--holdout", "3", "--shard", "1", "--method", "newton",
 ]  # fmt: skip
-
-
-def _two(arguments: list[str]) -> list[str]:
-    """Add the option for two workers to the arguments."""
-    return [*arguments, "--workers", "2"]
 
 
 @dataclass(frozen=True)
@@ -99,12 +95,13 @@ class Command:
         return digest.hexdigest()
 
 
+HEAD = ("run", "s", "kills", "finished files", "unfinished files", "processes left", "same bits after restart")
 _RECORDS = ("episodes.jsonl", "summary.csv")
 COMMANDS = (
     Command("store", search, tuple(_SEARCH), (*_RECORDS, "cumulative_performance.png")),
     Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
     Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
-    Command("workers", search, tuple(_two(_SEARCH)), _RECORDS),
+    Command("workers", search, (*_SEARCH, "--workers", "2"), _RECORDS),
     Command("reports", explore, tuple(_EXPLORE), (*_RECORDS, "report.html"), stored=True, finished=True),
 )
 
@@ -115,7 +112,6 @@ class Survived:
 
     Attributes:
         seconds: duration of an undisturbed run.
-        spared: number of runs that ended before their kill.
         progress: for each kill, number of finished files at that moment.
         remains: for each kill, number of unfinished files left behind.
         identical: number of kills after which the restarted run has the same result as the undisturbed run.
@@ -123,7 +119,6 @@ class Survived:
     """
 
     seconds: float
-    spared: int
     progress: list[int]
     remains: list[int]
     identical: int
@@ -148,7 +143,7 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
         shutil.copytree(cache, whole)
         seconds = finish(fork.Process(target=command.run, args=(whole,)))
         expected = command.digest(whole)
-        spared, identical, left = 0, 0, 0
+        identical, left = 0, 0
         progress: list[int] = []
         remains: list[int] = []
         while len(progress) < kills:
@@ -167,10 +162,8 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
                 remains.append(unfinished)
                 finish(fork.Process(target=command.run, args=(here,)))
                 identical += command.digest(here) == expected
-            else:
-                spared += 1
             shutil.rmtree(here)
-    return Survived(seconds, spared, progress, remains, identical, left)
+    return Survived(seconds, progress, remains, identical, left)
 
 
 def descendants(number: int) -> list[int]:
@@ -216,15 +209,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="random seed of the moments of the kills")
     parser.add_argument("--json", type=Path, help="JSON file to write the results to, too")
     options = parser.parse_args()
-    print("| run | s | kills | finished files | unfinished files | processes left | same bits after restart |")
-    print("|---|---|---|---|---|---|---|", flush=True)
-    figures = {}
+    rows, figures = [], {}
     for command in [c for c in COMMANDS if options.only is None or c.name in options.only]:
         result = survive(command, options.kills, options.seed)
         figures[command.name] = result.__dict__
         files = f"{min(result.progress)} to {max(result.progress)}"
-        cells = [f"{result.seconds:.1f}", options.kills, files, sum(result.remains), result.left, result.identical]
-        print(f"| {command.name} | {' | '.join(map(str, cells))} |", flush=True)
+        counts = [options.kills, files, sum(result.remains), result.left, result.identical]
+        rows.append([command.name, f"{result.seconds:.1f}", *map(str, counts)])
+    print(table(HEAD, rows))
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
 

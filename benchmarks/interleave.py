@@ -24,13 +24,16 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 import semfov
-from benchmarks.images import photograph
+from benchmarks.machine import photograph
+from benchmarks.tables import number, spread, table
 from benchmarks.timing import Clock, Comparison, Spread, interleaved
 from semfov.detection import Detections
 from semfov.detection.export import export_onnx
@@ -53,45 +56,43 @@ def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
     return detector
 
 
-def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, clock: Clock) -> dict[str, list[float]]:
-    """Milliseconds per fixation of the sensor alone, of the detector alone and of both in turn, by repetition."""
-    gazes = fixations.split(1)
+def random_cells(count: int, size: tuple[int, int]) -> tuple[Tensor, ...]:
+    """Centres of random cells of an image, each `(1, 2)`."""
+    grid = semfov.Grid(COLUMNS, ROWS, size)
+    order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
+    return grid.centres[order[:count]].split(1)
+
+
+def taking_turns(eye: Eye, view: View, gazes: Sequence[Tensor]) -> dict[str, Callable[[], list[Any]]]:
+    """Programs that fixate all of `gazes`: the sensor alone, the detector alone, and both in turn."""
     canvases = [eye.foveated(view, gaze) for gaze in gazes]
-    runs: dict[str, Callable[[], object]] = {
+    return {
         "sensor": lambda: [eye.foveated(view, gaze) for gaze in gazes],
         "detector": lambda: [eye.detector.detect(canvas, view.placement) for canvas in canvases],
         "in turn": lambda: [eye.look(view, gaze) for gaze in gazes],
     }
-    times = interleaved(runs, 0, clock, least=repetitions)
-    return {name: [each / len(gazes) for each in values] for name, values in times.items()}
 
 
 def in_turn(fixations: int = 10) -> Comparison:
     """Fixations in which sensor and detector alternate, compared with all sensor work first and then all detection."""
-    image = photograph()
-    grid = semfov.Grid(COLUMNS, ROWS, (640, 480))
-    order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
-    gazes = grid.centres[order[:fixations]].split(1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "yolov3-tiny.onnx"
         with torch.inference_mode(False), torch.no_grad():
             export_onnx(load_yolo("yolov3-tiny"), path)
         eye = Eye(semfov.Foveation(100.0), load(path, torch.get_num_threads(), spinning=False))
-    view = eye.open(image)
+    programs = taking_turns(eye, eye.open(photograph()), random_cells(fixations, (640, 480)))
 
     def apart() -> list[Detections]:
-        canvases = [eye.foveated(view, gaze) for gaze in gazes]
-        return [eye.detector.detect(canvas, view.placement) for canvas in canvases]
-
-    def ours() -> list[Detections]:
-        return [eye.look(view, gaze) for gaze in gazes]
+        programs["sensor"]()
+        return programs["detector"]()
 
     def agree() -> None:
-        for one, other in zip(ours(), apart(), strict=True):
+        for one, other in zip(programs["in turn"](), apart(), strict=True):
             torch.testing.assert_close(one.boxes, other.boxes)
             torch.testing.assert_close(one.scores, other.scores)
 
-    return Comparison(f"{fixations} fixations, sensor and detector in turn", ours, {"each alone": apart}, {}, agree)
+    name = f"{fixations} fixations, sensor and detector in turn"
+    return Comparison(name, programs["in turn"], {"each alone": apart}, {}, agree)
 
 
 def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
@@ -132,59 +133,42 @@ def scanpath(
     return (1e3 * totals / fixations).tolist()
 
 
-def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
-    """Median and quartiles, as text."""
-    quartiles = Spread.of([scale * value for value in values])
-    return f"{quartiles.middle:.{digits}f} ({quartiles.low:.{digits}f}-{quartiles.high:.{digits}f})"
-
-
-def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
-    """Print the times of sensor and detector, each alone and both in turn."""
-    grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
-    order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
-    fixations = grid.centres[order[: options.fixations]]
-    print(f"\n{options.repetitions} repetitions of {len(fixations)} fixations, ms per fixation\n")
-    print("| threads | spinning | sensor | detector | in turn | in turn / (sensor + detector) |")
-    print("|---|---|---|---|---|---|")
+def turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> list[list[str]]:
+    """Table rows: times of sensor and detector, each alone and both in turn, and their ratio."""
+    gazes = random_cells(options.fixations, (image.shape[-1], image.shape[-2]))
+    rows = []
     for threads in options.threads:
         torch.set_num_threads(threads)
         for spinning in (False, True) if threads > 1 else (False,):
             eye = Eye(semfov.Foveation(100.0), load(path, threads, spinning))
-            times = taking_turns(eye, eye.open(image), fixations, options.repetitions, clock)
+            times = interleaved(taking_turns(eye, eye.open(image), gazes), 0, clock, least=options.repetitions)
             ratios = [together / (a + b) for a, b, together in zip(*times.values(), strict=True)]
-            cells = " | ".join(f"{statistics.median(values):.2f}" for values in times.values())
-            print(f"| {threads} | {'on' if spinning else 'off'} | {cells} | {spread(ratios)} |")
+            medians = [number(statistics.median(values) / len(gazes)) for values in times.values()]
+            rows.append([str(threads), "on" if spinning else "off", *medians, spread(Spread.of(ratios))])
+    return rows
 
 
-def report_stages(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
-    """Print the times of the parts of a fixation."""
+def stages(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> list[list[str]]:
+    """Table rows: times of the parts of a fixation, and of letterbox and pyramid, once per image."""
     grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
-    opened: dict[int, float] = {}
-    print("\nparts of a fixation, ms; overhead is the share of all parts except the detector\n")
-    print("| threads | policy | sensor | detector | belief | policy | overhead, % |")
-    print("|---|---|---|---|---|---|---|")
+    rows = []
     for threads in options.threads:
         torch.set_num_threads(threads)
         eye = Eye(semfov.Foveation(100.0), load(path, threads, spinning=False))
+        view = eye.open(image)
+        opening = interleaved({"open": partial(eye.open, image)}, 0, clock, options.repetitions)["open"]
         kinds = strategies(eye.detector.classes)
-        opening: list[float] = []
-        rows: dict[str, list[list[float]]] = {name: [] for name in kinds}
+        times: dict[str, list[list[float]]] = {name: [] for name in kinds}
         for repetition in range(-1, options.repetitions):
-            start = clock()
-            view = eye.open(image)
-            opening.append(1e3 * (clock() - start))
             for name, strategy in kinds.items():
                 row = scanpath(eye, view, grid, strategy, options.fixations, repetition + 1, clock)
                 if repetition >= 0:
-                    rows[name].append(row)
-        for name, measured in rows.items():
-            cells = " | ".join(f"{statistics.median(column):.2f}" for column in zip(*measured, strict=True))
-            shares = [1 - row[STAGES.index("detector")] / sum(row) for row in measured]
-            print(f"| {threads} | {name} | {cells} | {spread(shares, 100, 1)} |")
-        opened[threads] = statistics.median(opening)
-
-    openings = ", ".join(f"{time:.2f} ({threads})" for threads, time in opened.items())
-    print(f"\nletterbox and pyramid, once per image, ms (threads): {openings}")
+                    times[name].append(row)
+        for name, measured in times.items():
+            medians = [number(statistics.median(column)) for column in zip(*measured, strict=True)]
+            shares = Spread.of([100 * (1 - row[STAGES.index("detector")] / sum(row)) for row in measured])
+            rows.append([str(threads), name, *medians, spread(shares), number(statistics.median(opening))])
+    return rows
 
 
 def main() -> None:
@@ -195,9 +179,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=20, help="number of repetitions")
     parser.add_argument("--fixations", type=int, default=10, help="number of fixations in every repetition")
     parser.add_argument("--keep-memory", action="store_true", help="make the C library keep freed memory")
-    parser.add_argument(
-        "--processor-time", action="store_true", help="measure CPU time of the calling thread; 1 thread"
-    )
+    parser.add_argument("--processor-time", action="store_true", help="CPU time of the calling thread; 1 thread")
     options = parser.parse_args()
     options.threads = options.threads or sorted({1, torch.get_num_threads()})
     clock = time.perf_counter
@@ -211,9 +193,11 @@ def main() -> None:
         if path is None:
             path = Path(folder) / "yolov3-tiny.onnx"
             export_onnx(load_yolo("yolov3-tiny"), path)
-        print(path.name)
-        report_turns(path, image, options, clock)
-        report_stages(path, image, options, clock)
+        print(f"{path.name}, {options.repetitions} repetitions of {options.fixations} fixations, ms per fixation\n")
+        head = ["threads", "spinning", "sensor", "detector", "in turn", "in turn / (sensor + detector)"]
+        print(table(head, turns(path, image, options, clock)))
+        head = ["threads", "policy", *STAGES, "overhead: all but the detector, %", "letterbox and pyramid, once"]
+        print("", table(head, stages(path, image, options, clock)), sep="\n")
 
 
 if __name__ == "__main__":

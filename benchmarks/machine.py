@@ -1,4 +1,4 @@
-"""Description of the machine on which results were measured."""
+"""The machine on which results are measured: its description, number of threads, and the photograph to work on."""
 
 import os
 import platform
@@ -6,10 +6,13 @@ import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import torch
+from torch import Tensor
 
-from benchmarks.timing import Clock, interleaved
+from semfov.detection.placement import resize
 
+GAZE, SIGMA = (290.0, 280.0), 100.0
 PACKAGES = ("torch", "kornia", "numpy", "opencv-python-headless", "scipy", "dirichlet")
 
 
@@ -40,9 +43,14 @@ def processor() -> str:
     return names[0] if names else platform.processor() or "unknown"
 
 
-def copy_bandwidth(seconds: float, clock: Clock) -> float:
-    """Bytes per second, read and written, of a copy between two arrays of 256 MB; the best of all repetitions."""
-    source = torch.ones(2**26)
-    target = torch.empty_like(source)
-    times = interleaved({"copy": lambda: target.copy_(source)}, seconds, clock)["copy"]
-    return 2 * source.numel() * source.element_size() / (min(times) / 1e3)
+def photograph(width: int = 640, height: int = 480) -> Tensor:
+    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
+    from skimage import data
+
+    return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (width, height)).clamp(0, 1)
+
+
+def use_threads(count: int) -> None:
+    """Set the number of threads of torch and of OpenCV."""
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)

@@ -15,7 +15,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from benchmarks.images import use_threads
+from benchmarks.machine import use_threads
 from benchmarks.tables import comparison_rows, table
 from benchmarks.timing import Clock, Comparison, clock_for, measure
 from semfov.gaze.saliency.blur import gaussian_blur, gaussian_kernel

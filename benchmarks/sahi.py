@@ -10,7 +10,7 @@ looks anew, so that its seconds are its own: reading, detecting, choosing and me
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -34,7 +34,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom.episode import Order, look_by_look
+from semfov.zoom.episode import Order, WindowStep, look_by_look
 from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import Lattice
@@ -111,17 +111,7 @@ class Slicing(DetectionModel):
 
 @dataclass
 class Outcome:
-    """Result of a way of looking in all pictures.
-
-    Attributes:
-        found: number of objects found.
-        objects: number of objects.
-        boxes: number of boxes reported.
-        passes: number of detector passes.
-        seconds: time that it took.
-        scores: scores of the boxes of each picture.
-        right: which of them are right.
-    """
+    """Counts, seconds, and the scores of boxes and whether they are right, of a way of looking in all pictures."""
 
     found: int = 0
     objects: int = 0
@@ -172,17 +162,12 @@ def sliced(run: ZoomRun, pixels: NDArray[np.uint8], **merging: str) -> tuple[Obj
     return Objects(boxes, scores, labels, torch.zeros_like(labels)), model.passes
 
 
-def ordered(run: ZoomRun, pixels: NDArray[np.uint8], order: Callable[[Lattice], Order]) -> tuple[Objects, int]:
-    """Objects that an order of windows shows in a picture, and its passes."""
+def merged(
+    run: ZoomRun, pixels: NDArray[np.uint8], turns: Callable[[LiveGlances], Iterable[WindowStep]], passes: int
+) -> tuple[Objects, int]:
+    """Objects that the first looks at windows of a picture show, and the number of looks."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
-    looks = [turn.glance for turn in islice(look_by_look(glances, order(glances.lattice), None), run.config.passes)]
-    return merge(looks, run.target, score=DETECTION_SCORE), len(looks)
-
-
-def chosen(run: ZoomRun, pixels: NDArray[np.uint8], passes: int) -> tuple[Objects, int]:
-    """Objects in the windows that semfov chooses, and its passes."""
-    glances = LiveGlances(run.eye, run.eye.open(pixels))
-    looks = [turn.glance for turn in islice(find_everything(glances, run.evidence, run.target), passes)]
+    looks = [turn.glance for turn in islice(turns(glances), passes)]
     return merge(looks, run.target, score=DETECTION_SCORE), len(looks)
 
 
@@ -190,20 +175,28 @@ def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects,
     """The ways of looking at a picture, by name."""
     config, targets = run.config, [] if run.target is None else [run.target]
 
-    def cut(lattice: Lattice) -> list[Window]:
-        return slices(lattice, config.slice, config.overlap)
+    def ordered(order: Callable[[Lattice, list[Window]], Order]) -> Callable[[LiveGlances], Iterable[WindowStep]]:
+        def turns(glances: LiveGlances) -> Iterable[WindowStep]:
+            lattice = glances.lattice
+            return look_by_look(glances, order(lattice, slices(lattice, config.slice, config.overlap)), None)
 
-    orders: dict[str, Callable[[Lattice], Order]] = {
-        "the same slices, merged here": lambda lattice: in_order(cut(lattice)),
-        "sparse slices": lambda lattice: sparse(cut(lattice), targets, config.sparse),
-        "slices as in ASAHI": lambda lattice: in_order(adaptive_slices(lattice)),
-        "quad-tree": lambda lattice: quad_tree(lattice, run.target, most=False),
+        return turns
+
+    orders: dict[str, Callable[[Lattice, list[Window]], Order]] = {
+        "the same slices, merged here": lambda lattice, cut: in_order(cut),
+        "sparse slices": lambda lattice, cut: sparse(cut, targets, config.sparse),
+        "slices as in ASAHI": lambda lattice, cut: in_order(adaptive_slices(lattice)),
+        "quad-tree": lambda lattice, cut: quad_tree(lattice, run.target, most=False),
     }
+
+    def chosen(glances: LiveGlances) -> Iterable[WindowStep]:
+        return find_everything(glances, run.evidence, run.target)
+
     return {
         "SAHI": partial(sliced, run),
         "SAHI, NMS": partial(sliced, run, postprocess_type="NMS", postprocess_match_metric="IOU"),
-        **{name: partial(ordered, run, order=order) for name, order in orders.items()},
-        **{f"ours, {number} passes": partial(chosen, run, passes=number) for number in AFTER[1:]},
+        **{name: partial(merged, run, turns=ordered(each), passes=config.passes) for name, each in orders.items()},
+        **{f"ours, {number} passes": partial(merged, run, turns=chosen, passes=number) for number in AFTER[1:]},
     }
 
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.images import photograph
+from benchmarks.machine import photograph
 from benchmarks.timing import Comparison
 from semfov.gaze.saliency import VOCUS2, IttiKoch
 

@@ -5,18 +5,14 @@ not visited yet. The table also gives how often the choice is the same as that o
 beliefs.
 """
 
-import argparse
 from dataclasses import asdict
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.beliefs import CLASSES, make_belief, unvisited
-from benchmarks.images import use_threads
-from benchmarks.machine import describe
-from benchmarks.tables import RESULTS, spread, table, write
-from benchmarks.timing import Run, Spread, clock_for, interleaved
+from benchmarks.tables import begin, command, page, spread, table, write
+from benchmarks.timing import Run, Spread, interleaved
 from semfov import FovealObservationModel, Grid, acquisition, policies
 from semfov.gaze import select_fixation
 
@@ -26,6 +22,9 @@ POLICIES = {
     "entropy limit": "entropy-limit",
     "ideal observer": "ideal-observer",
 }
+TEXT = """\
+Written by `python -m benchmarks.searchers`. Medians (quartiles) for one episode and a given belief. The same choice:
+share of {} random beliefs, before the first look."""
 
 
 def searchers(side: int) -> dict[str, acquisition.AcquisitionFunction]:
@@ -51,18 +50,12 @@ def decide(value: acquisition.AcquisitionFunction, cells: int) -> Run:
 @torch.inference_mode()
 def main() -> None:
     """Measure all rows and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.searchers", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--sides", type=int, nargs="+", default=[5, 7, 10], help="numbers of rows (and columns) of grids"
-    )
+    parser = command("benchmarks.searchers", __doc__, seconds=10.0)
+    parser.add_argument("--sides", type=int, nargs="+", default=[5, 7, 10], help="rows (and columns) of the grids")
     parser.add_argument("--episodes", type=int, default=150, help="number of beliefs for which choices are compared")
-    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each grid")
-    parser.add_argument("--threads", type=int, default=1, help="number of threads")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args()
-    use_threads(options.threads)
-    clock, times = clock_for(options.threads)
-    about = describe() | {"times": times, "observation model": MODEL}
+    clock, about = begin(options)
+    about["observation model"] = MODEL
     rows, figures = [], {}
     for side in options.sides:
         every = searchers(side)
@@ -74,19 +67,7 @@ def main() -> None:
             rows.append([f"{side} x {side}", name, spread(milliseconds), f"{100 * same:.0f} %"])
             figures[f"{name}, {side} x {side}"] = asdict(milliseconds) | {"same_choice": same}
     head = ["grid", "searcher", "ms a decision", "same choice as the ideal observer"]
-    text = "\n".join(
-        [
-            "# Searchers from the literature",
-            "",
-            "Written by `python -m benchmarks.searchers`. Medians (quartiles) for one episode and a given belief. The",
-            f"same choice: share of {options.episodes} random beliefs, before the first look.",
-            "",
-            *(f"- {key}: {value}" for key, value in about.items()),
-            "",
-            table(head, rows),
-            "",
-        ]
-    )
+    text = page("Searchers from the literature", TEXT.format(options.episodes), about, table(head, rows))
     print(text)
     write(options.out, "searchers", text, {"machine": about, "milliseconds": figures})
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.images import GAZE, SIGMA, photograph
+from benchmarks.machine import GAZE, SIGMA, photograph
 from benchmarks.timing import Comparison
 from semfov.sensor import foveate, laplacian_pyramid
 from semfov.sensor.pyramid import Convention

@@ -1,12 +1,30 @@
-"""Results as Markdown tables, and the two files that every run writes."""
+"""What benchmarks that write a page share: options, numbers, tables, and the two files of a run."""
 
+import argparse
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.timing import Measured, Spread
+from benchmarks.machine import describe, use_threads
+from benchmarks.timing import Clock, Measured, Spread, clock_for
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def command(name: str, description: str | None, seconds: float, threads: int = 1) -> argparse.ArgumentParser:
+    """A command line with the options of all benchmarks that write a page."""
+    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=(description or "").split("\n", 1)[0])
+    parser.add_argument("--seconds", type=float, default=seconds, help="shortest duration of each measurement")
+    parser.add_argument("--threads", type=int, default=threads, help="number of threads")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
+    return parser
+
+
+def begin(options: argparse.Namespace) -> tuple[Clock, dict[str, str]]:
+    """Set the number of threads; returns the clock for it and the description of the machine."""
+    use_threads(options.threads)
+    clock, times = clock_for(options.threads)
+    return clock, describe() | {"times": times}
 
 
 def number(value: float) -> str:
@@ -32,6 +50,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def page(title: str, text: str, about: Mapping[str, str], *sections: str) -> str:
+    """A Markdown page: title, text, the machine, and sections."""
+    machine = "\n".join(f"- {key}: {value}" for key, value in about.items())
+    return "\n\n".join([f"# {title}", text, machine, *sections]) + "\n"
 
 
 def write(folder: Path, name: str, text: str, figures: Mapping[str, object]) -> None:

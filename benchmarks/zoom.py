@@ -6,17 +6,13 @@ reading and resampling windows, pooling hints, updating the belief, choosing the
 record.
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import torch
 
-from benchmarks.images import use_threads
-from benchmarks.machine import describe
-from benchmarks.tables import RESULTS, number, spread, table, write
-from benchmarks.timing import Clock, Run, Spread, clock_for, interleaved
+from benchmarks.tables import begin, command, number, page, spread, table, write
+from benchmarks.timing import Clock, Run, Spread, interleaved
 from semfov import EmbeddedScenes, ZoomAgent
 from semfov.data.large import to_bytes
 from semfov.data.mosaics import Mosaics
@@ -26,6 +22,9 @@ from semfov.paths import ZoomPath
 PASSES = 16
 TILES = {"2560 × 1920 px": (4, 480), "3840 × 2160 px": (6, 360), "10240 × 7680 px": (16, 480)}
 """For each size of a mosaic its tiles along a side, which are 640 pixels wide, and their height."""
+TEXT = f"""\
+Written by `python -m benchmarks.zoom`. YOLOX-nano, {PASSES} passes over mosaics of embedded scenes. Medians over
+repetitions; ratios with quartiles."""
 
 
 def programs(agent: ZoomAgent, side: int, height: int) -> dict[str, tuple[Run, Run, int]]:
@@ -68,14 +67,10 @@ def cost(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread
 @torch.inference_mode()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all tasks and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.zoom", description=__doc__.splitlines()[0])
+    parser = command("benchmarks.zoom", __doc__, seconds=10.0)
     parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
-    parser.add_argument("--threads", type=int, default=1, help="number of threads")
-    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each task")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args(arguments)
-    use_threads(options.threads)
-    clock, times = clock_for(options.threads)
+    clock, about = begin(options)
     agent = ZoomAgent.recommended("yolox-nano", weights=options.weights)
     rows, figures = [], {}
     for size, (side, height) in TILES.items():
@@ -85,21 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             rows.append([f"{name}, {size}", *each, spread(ratio)])
             figures[f"{name}, {size}"] = {"task": asdict(whole), "detector": asdict(alone), "ratio": asdict(ratio)}
             print(" | ".join(rows[-1]), flush=True)
-    about = describe() | {"times": times}
     head = ["task", "pass, ms", "detector, ms", "task by detector"]
-    text = "\n".join(
-        [
-            "# Large pictures",
-            "",
-            f"Written by `python -m benchmarks.zoom`. YOLOX-nano, {PASSES} passes over mosaics of embedded scenes.",
-            "Medians over repetitions; ratios with quartiles.",
-            "",
-            *(f"- {key}: {value}" for key, value in about.items()),
-            "",
-            table(head, rows),
-            "",
-        ]
-    )
+    text = page("Large pictures", TEXT, about, table(head, rows))
     write(options.out, "zoom", text, {"machine": about, "milliseconds": figures})
 
 

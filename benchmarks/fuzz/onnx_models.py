@@ -1,7 +1,7 @@
 """Fuzz ONNX files: detectors with unusual shapes, types and metadata, valid or damaged."""
 
 import json
-import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ import torch
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from benchmarks.fuzz.models import changed
-from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
+from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov.detection import Detections, Detector
 from semfov.detection.onnx import load_onnx
 
@@ -36,46 +35,42 @@ METADATA: tuple[dict[str, str], ...] = (
 )
 
 
-def onnx_files(data: st.DataObject) -> str:
+def onnx_files(draw: Draw, folder: Path) -> Case:
     """`load_onnx`: a detector with finite boxes and scores on the simplex, or an error that names the fault."""
-    rng = draw_rng(data)
-    faults = data.draw(st.sets(st.sampled_from(FAULTS), max_size=2), label="faults")
-    shape = [1, 3, 32, 32]
-    for place, (name, odd) in enumerate(
-        (("batch", ("b", 2, 10**9, 0)), ("channels", (1, 4, "c")), ("height", SIDES), ("width", SIDES))
-    ):
-        if name in faults:
-            shape[place] = choose(data, odd, name)
-    rank = choose(data, (2, 1, 0), "rank") if "rank" in faults else 3
-    kind = choose(data, TYPES, "type") if "type" in faults else TensorProto.FLOAT
-    classes = choose(data, (0, 1, 3), "classes") if "classes" in faults else 2
+    faults = draw.data.draw(st.sets(st.sampled_from(FAULTS), max_size=2), label="faults")
+
+    def faulty(fault: str, odd: Iterable[Any], usual: Any) -> Any:
+        return draw.choose(odd, fault) if fault in faults else usual
+
+    shape = [
+        faulty("batch", ("b", 2, 10**9, 0), 1),
+        faulty("channels", (1, 4, "c"), 3),
+        faulty("height", SIDES, 32),
+        faulty("width", SIDES, 32),
+    ]
+    rank, kind = faulty("rank", (2, 1, 0), 3), faulty("type", TYPES, TensorProto.FLOAT)
     options: dict[str, Any] = {"head": "yolov5", "classes": ["cup", "cat"]}
     if "options" in faults:
-        del options[choose(data, list(options), "left out")]
-        options |= choose(data, ({}, {"input_size": (32, 32)}, {"input_size": 10**9}, {"threshold": 2}), "option")
-    model = network(shape, rank, classes, kind, rng)
-    if "metadata" in faults:
-        for key, value in choose(data, METADATA, "metadata").items():
-            model.metadata_props.add(key=key, value=value)
-    damage = choose(data, ("cut", "bytes", "bit", "text", "longer"), "damage") if "file" in faults else "none"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "model.onnx")
-        path.write_bytes(changed(model.SerializeToString(), damage, rng))
+        del options[draw.choose(options, "left out")]
+        options |= draw.choose(({}, {"input_size": (32, 32)}, {"input_size": 10**9}, {"threshold": 2}), "option")
+    model = network(shape, rank, faulty("classes", (0, 1, 3), 2), kind, draw.rng)
+    for key, value in faulty("metadata", METADATA, {}).items():
+        model.metadata_props.add(key=key, value=value)
+    damage = faulty("file", ("cut", "bytes", "bit", "text", "longer"), "none")
+    path = folder / "model.onnx"
+    path.write_bytes(changed(model.SerializeToString(), damage, draw.rng))
 
-        def detect() -> tuple[Detector, Detections]:
-            detector = load_onnx(path, threads=1, **options)
-            return detector, detector(torch.rand(1, 3, 40, 30))
+    def detect() -> tuple[Detector, Detections]:
+        detector = load_onnx(path, threads=1, **options)
+        return detector, detector(torch.rand(1, 3, 40, 30))
 
-        result = attempt(detect)
-    if failed(result):
-        assert faults, result
-        return outcome(result)
-    assert isinstance(result, tuple)
-    detector, detections = result
-    assert bool(detections.boxes.isfinite().all())
-    assert detections.scores.shape[-1] == len(detector.classes) + 1
-    assert bool(((detections.scores.sum(-1) - 1).abs() < 1e-3)[detections.mask].all())
-    return "result"
+    def check(found: tuple[Detector, Detections]) -> None:
+        detector, detections = found
+        assert bool(detections.boxes.isfinite().all())
+        assert detections.scores.shape[-1] == len(detector.classes) + 1
+        assert bool(((detections.scores.sum(-1) - 1).abs() < 1e-3)[detections.mask].all())
+
+    return Case(detect, check, may=bool(faults), must=False)
 
 
 def network(image: list[Any], rank: int, classes: int, kind: int, rng: np.random.Generator) -> onnx.ModelProto:

@@ -32,5 +32,5 @@ def test_benchmark_prints_its_tables(make_onnx, monkeypatch, capsys, options):
     for line in parts:
         sensor, detector, belief, policy = (float(cell) for cell in line.split("|")[3:7])
         assert min(sensor, detector, belief, policy) > 0
-        low, high = (float(number) for number in re.search(r"\(([-.\d]+)-([-.\d]+)\)", line).groups())
+        low, high = (float(number) for number in re.search(r"\(([-.\d]+) to ([-.\d]+)\)", line).groups())
         assert 0 < low <= high < 100

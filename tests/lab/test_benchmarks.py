@@ -9,7 +9,6 @@ import torch
 
 from benchmarks import decisions
 from benchmarks.__main__ import COMPARISONS
-from benchmarks.limits import paths
 from benchmarks.tables import comparison_rows
 from benchmarks.timing import Comparison, Spread, interleaved, measure
 
@@ -66,9 +65,3 @@ def test_decisions_have_a_row_for_every_published_cost(tmp_path, monkeypatch):
     assert set(figures["peers"]["ratios"]) == {"loop over fixations and cells", "all pairs at once"}
     assert figures["published_milliseconds"]["exploration"]["KL divergence, raw"] == 9851
     assert platform.node() not in json.dumps(figures["machine"]).split('"')
-
-
-def test_bytes_of_the_sensor_equal_the_size_of_its_tensors():
-    path = paths()["foveation, pyramid included"]
-    assert path.bytes == 2 * 3 * 480 * 640 * 4
-    assert path.run().numel() * 4 * 2 == path.bytes
