@@ -77,14 +77,12 @@ def tracked(folder):
     return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", *DATA}}
 
 
-def test_the_wheel_contains_exactly_the_package_and_its_data(built):
-    names = {name for name in names_in(built, "*.whl") if ".dist-info/" not in name}
+def test_the_wheel_contains_exactly_the_package_its_data_and_the_licence(built):
+    every = names_in(built, "*.whl")
+    assert any(name.endswith("licenses/LICENSE") for name in every)
+    names = {name for name in every if ".dist-info/" not in name}
     assert names == tracked(PACKAGE)
     assert sum(name.endswith(".safetensors") for name in names) > 15
-
-
-def test_the_wheel_contains_the_licence(built):
-    assert any(name.endswith("licenses/LICENSE") for name in names_in(built, "*.whl"))
 
 
 def test_the_sdist_contains_the_files_that_the_tests_need(built):

@@ -43,13 +43,6 @@ def test_every_main_subpackage_has_a_guide():
     assert {guide.stem for guide in GUIDES} >= rooms
 
 
-def test_every_public_name_has_a_docstring():
-    for module, entries_of_module in entries().items():
-        for name, value in entries_of_module:
-            assert inspect.getdoc(value), f"{module}.{name} has no docstring"
-            assert len(inspect.getdoc(value).splitlines()[0]) > 10, f"{module}.{name}"
-
-
 def test_the_reference_contains_no_addresses_or_local_paths():
     """It contains neither memory addresses of objects nor the path of the checkout."""
     text = "\n".join(pages().values())

@@ -105,30 +105,6 @@ def test_a_run_finishes_after_a_killed_worker_a_full_disk_and_an_interrupt(whole
     assert not list(tmp_path.rglob("*.part"))
 
 
-@pytest.mark.parametrize("full", ["cache", "out"])
-def test_a_run_goes_on_after_a_full_disk(whole, tmp_path, capsys, full):
-    """On a file system of 8 kB the error names the file and no part is left; with more space the run finishes."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", disk], capture_output=True, check=False)
-    if mount.returncode != 0:
-        pytest.skip("may not mount a file system")
-    try:
-        other = tmp_path / "other"
-        out, cache = (disk, other) if full == "out" else (other, disk)
-        assert run_in(out, cache) == 1
-        message = capsys.readouterr().err.strip().splitlines()[-1]
-        assert message.startswith(f"error: cannot write {disk}")
-        assert "No space left" in message
-        assert not list(disk.rglob("*.part"))
-        subprocess.run(["mount", "-o", "remount,size=64m", disk], check=True)
-        assert run_in(out, cache) == 0
-        assert result_files(out) == result_files(whole / "out")
-    finally:
-        # This process may still have files of the disk mapped into memory.
-        subprocess.run(["umount", "--lazy", disk], check=True)
-
-
 def test_two_processes_can_share_a_cache(whole, tmp_path):
     together = [start(tmp_path / name, tmp_path / "cache", "--workers", "1") for name in ("first", "second")]
     for process in together:

@@ -13,7 +13,7 @@ from docs.site.docstrings import markdown as docstring
 from docs.site.formulas import mathml
 from docs.site.names import Names
 from docs.site.stage import Stage, place_of
-from docs.site.tutorials import SOURCES, execute, page, read
+from docs.site.tutorials import execute, page
 
 SPACE = "{http://www.w3.org/1998/Math/MathML}"
 
@@ -174,10 +174,6 @@ def test_docstring_examples_of_the_documentation_tools_pass(module):
     assert tried > 0
 
 
-def test_there_are_five_tutorials():
-    assert {source.stem for source in SOURCES} == {"foveate", "belief", "search", "own_detector", "own_policy"}
-
-
 @pytest.mark.slow
 def test_a_tutorial_with_a_warning_is_refused(tmp_path):
     source = tmp_path / "warns.py"
@@ -195,10 +191,3 @@ def test_a_picture_without_alt_text_is_refused(tmp_path):
         page(notebook, "draws", tmp_path)
     notebook.cells[0].metadata["alt"] = "a line"
     assert "![a line](draws-0.png)" in page(notebook, "draws", tmp_path)
-
-
-def test_sources_of_tutorials_start_with_a_title():
-    for source in SOURCES:
-        cells = read(source).cells
-        assert cells[0].cell_type == "markdown"
-        assert cells[0].source.startswith("# ")
