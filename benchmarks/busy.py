@@ -128,7 +128,8 @@ def main() -> None:
     ]
     text = table(["milliseconds", *columns, "busy, all threads / quiet, one thread"], rows)
     figures = {name: {column: asdict(value) for column, value in own.items()} for name, own in spreads.items()}
-    write(options.out, "busy", page("Beside a program that takes a core", TEXT, about, text), figures)
+    text = page("Beside a program that takes a core", TEXT, about, text)
+    write(options.out, "busy", text, {"machine": about, **figures})
 
 
 if __name__ == "__main__":
