@@ -163,7 +163,7 @@ def sliced(run: ZoomRun, pixels: NDArray[np.uint8], **merging: str) -> tuple[Obj
 
 
 def merged(
-    run: ZoomRun, pixels: NDArray[np.uint8], turns: Callable[[LiveGlances], Iterable[WindowStep]], passes: int
+    run: ZoomRun, pixels: NDArray[np.uint8], turns: Callable[[LiveGlances], Iterable[WindowStep[Any]]], passes: int
 ) -> tuple[Objects, int]:
     """Objects that the first looks at windows of a picture show, and the number of looks."""
     glances = LiveGlances(run.eye, run.eye.open(pixels))
@@ -175,8 +175,8 @@ def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects,
     """The ways of looking at a picture, by name."""
     config, targets = run.config, [] if run.target is None else [run.target]
 
-    def ordered(order: Callable[[Lattice, list[Window]], Order]) -> Callable[[LiveGlances], Iterable[WindowStep]]:
-        def turns(glances: LiveGlances) -> Iterable[WindowStep]:
+    def ordered(order: Callable[[Lattice, list[Window]], Order]) -> Callable[[LiveGlances], Iterable[WindowStep[Any]]]:
+        def turns(glances: LiveGlances) -> Iterable[WindowStep[Any]]:
             lattice = glances.lattice
             return look_by_look(glances, order(lattice, slices(lattice, config.slice, config.overlap)), None)
 
@@ -189,7 +189,7 @@ def ways(run: ZoomRun) -> dict[str, Callable[[NDArray[np.uint8]], tuple[Objects,
         "quad-tree": lambda lattice, cut: quad_tree(lattice, run.target, most=False),
     }
 
-    def chosen(glances: LiveGlances) -> Iterable[WindowStep]:
+    def chosen(glances: LiveGlances) -> Iterable[WindowStep[Any]]:
         return find_everything(glances, run.evidence, run.target)
 
     return {
