@@ -29,7 +29,7 @@ from eval.explore.config import ExploreConfig
 from eval.page.curves import OBJECTS
 from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
-from eval.page.findings import findings, words_of_findings
+from eval.page.findings import findings
 from eval.page.origin import missing, origin
 from eval.page.tables import (
     Runs,
@@ -148,7 +148,6 @@ _SEARCHES, _EXPLORATIONS = (tuple(published(kind).values()) for kind in ("search
 WHOLE = {
     "paper": PageTable(_SEARCHES, beside_paper),
     "findings": PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
-    "findings-words": PageTable((*_SEARCHES, *_EXPLORATIONS), words_of_findings),
     "verdicts": PageTable(AT_THRESHOLDS, verdicts),
     "verdicts-words": PageTable(AT_THRESHOLDS, words_of_verdicts),
     "thresholds": PageTable(AT_THRESHOLDS, by_threshold),

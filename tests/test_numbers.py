@@ -56,7 +56,7 @@ COMPANIONS = {
     "docs/results.md": ["docs/tables.md"],
     "docs/tables.md": ["docs/results.md"],
     "docs/decisions/closer_looks.md": ["docs/results.md", "docs/tables.md"],
-    "docs/decisions/tempering.md": ["docs/results.md"],
+    "docs/decisions/tempering.md": ["docs/results.md", "docs/tables.md"],
     "docs/zoom.md": ["docs/measurements/zoom.md"],
     "docs/head.md": ["docs/measurements/head.md"],
     "docs/human.md": ["docs/measurements/human.md"],
@@ -106,11 +106,11 @@ KNOWN = {
         f"at least {_DATA.min_instances} boxes": "code",
         f"at most {100 * (_DATA.max_target_area or 1):.0f} %": "code",
         "1,893 others": "size of the fit set, in the cards of the models",
-        f"({_OBJECTS[-1]} of {_DETECTIONS[-1]:,})": "counts in the file of the model",
-        f"({_OBJECTS[0]} of {_DETECTIONS[0]:,})": "counts in the file of the model",
         "9.9 seconds": "in milliseconds in the linked table",
     },
     "docs/tables.md": {
+        f"({_OBJECTS[-1]} of {_DETECTIONS[-1]:,})": "counts in the file of the model",
+        f"({_OBJECTS[0]} of {_DETECTIONS[0]:,})": "counts in the file of the model",
         "10,790 searches": "ten starts for each of the pairs in the table of photographs",
         "3,000 for each": "ten starts for each of 300 photographs",
         f"prior of {BeliefConfig().prior}": "code",
@@ -202,7 +202,7 @@ IN_WORDS = re.compile(
 """Shares and ratios in words."""
 
 SHARES = {
-    "docs/results.md": {
+    "docs/tables.md": {
         "more than half of them were objects": (_OBJECTS[-1], _DETECTIONS[-1]),
         "one in ten at the fovea": (_OBJECTS[0], _DETECTIONS[0]),
     },

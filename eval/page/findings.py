@@ -9,7 +9,7 @@ from eval.page import paper
 from eval.page.curves import OBJECTS, behind, corrected_signs, paired_difference, points, spans
 from eval.page.experiments import DETECTORS
 from eval.page.tables import Runs, published_columns
-from eval.page.verdicts import VERDICTS, Answer, gain_verdict, legend, overtaken_verdict
+from eval.page.verdicts import Answer, gain_verdict, overtaken_verdict
 from semfov.metrics.averages import FloatArray
 from semfov.runs.tables import table
 
@@ -241,9 +241,3 @@ def findings(runs: Runs) -> list[str]:
             answers[heading] = str(finding.answer(folder, measure)) if first or finding.detects else "no detector"
         rows.append([finding.text, finding.sizes, finding.test.published(), *answers.values()])
     return table(rows)
-
-
-def words_of_findings(runs: Runs) -> list[str]:
-    """The verdicts that the table of all findings uses, and their meanings."""
-    cells = "\n".join(findings(runs))
-    return legend({word for word in VERDICTS if f": {word} " in cells})
