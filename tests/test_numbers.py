@@ -22,7 +22,7 @@ from semfov.agents.head import CONFIRM
 from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds

@@ -235,7 +235,7 @@ class ContextPrior(Pretrained):
             path: CSV file with the names of other classes in the first row and of targets in the first column; an
                 empty cell is unknown.
             classes: names of the detector's classes; names in the table are matched to them in any spelling, or by
-                their synonyms (`semfov.data.naming.alike`).
+                their synonyms (`semfov.data.classes.alike`).
             source: where the table comes from; it is saved in the metadata, with the sha256 of the table.
             places: CSV file with the names of classes in the first column, and the log odds of the class at each
                 height of a picture, from the top row to the bottom row; None uses no places.

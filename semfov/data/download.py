@@ -86,20 +86,7 @@ def download_coco(split: str, root: str | os.PathLike[str], *, address: str = AD
 def fetch_split(
     split: str, root: Path, images: Archive, annotations: Archive, *, address: str, keep: bool, pause: float = 1.0
 ) -> None:
-    """`download_coco` for any pair of archives.
-
-    Args:
-        split: name of the split.
-        root: folder of the data set.
-        images: archive of the images.
-        annotations: archive of the annotations.
-        address: address of the server.
-        keep: keep the archives that were fetched.
-        pause: seconds to wait before a failed transfer is tried again.
-
-    Raises:
-        DataError: the network fails, the disk is full, or a file is not the official one.
-    """
+    """`download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
     instances = f"annotations/instances_{split}.json"
     try:
         if _is_complete(root, split, instances):

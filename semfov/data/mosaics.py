@@ -1,7 +1,5 @@
 """Pictures larger than a detector's input, composed of annotated photographs by a seed."""
 
-import hashlib
-import json
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +11,7 @@ from torch.nn import functional as F
 
 from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import check
+from semfov.io.files import json_sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 
@@ -79,7 +78,7 @@ class Mosaics:
         self._seed = seed
         self._alike = alike
         what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill, *([alike] if alike else [])]
-        self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
+        self.fingerprint = json_sha256(what)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -138,7 +137,7 @@ class Mosaics:
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""
         tiles = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
-        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, tiles]).encode()).hexdigest()
+        return json_sha256([_VERSION, self.size, self.fill, tiles])
 
 
 def _moved(part: Annotation, tile: Tile) -> Tensor:

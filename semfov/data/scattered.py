@@ -1,7 +1,5 @@
 """Large pictures of one scene, composed by a seed: parts of photographs scattered over one ground."""
 
-import hashlib
-import json
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +11,7 @@ from torch.nn import functional as F
 
 from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import check
+from semfov.io.files import json_sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 _MARGIN = 0.15
@@ -88,7 +87,7 @@ class Scattered:
         self.ids = list(range(count))
         self._seed = seed
         self._what = [_VERSION, scenes.fingerprint, whole, size, sides, most, seed]
-        self.fingerprint = hashlib.sha256(json.dumps([*self._what, count]).encode()).hexdigest()
+        self.fingerprint = json_sha256([*self._what, count])
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -183,7 +182,7 @@ class Scattered:
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a picture depend on."""
-        return hashlib.sha256(json.dumps([*self._what, self.ids[index]]).encode()).hexdigest()
+        return json_sha256([*self._what, self.ids[index]])
 
     def _generator(self, index: int, part: int = 0) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], part]))

@@ -5,7 +5,6 @@ without touching each other, so every box is known by construction.
 """
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -22,6 +21,7 @@ from semfov.data.classes import class_indices
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene, legal_targets
 from semfov.errors import DataError, check
+from semfov.io.files import json_sha256, sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 
@@ -136,9 +136,8 @@ class EmbeddedScenes:
         files = sorted(
             {(p.package, p.file) for p in PHOTOGRAPHED_OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES}
         )
-        digests = [hashlib.sha256(_path(*file).read_bytes()).hexdigest() for file in files]
-        settings = json.dumps([_VERSION, self.classes, count, seed, digests])
-        self.fingerprint = hashlib.sha256(settings.encode()).hexdigest()
+        digests = [sha256(_path(*file)) for file in files]
+        self.fingerprint = json_sha256([_VERSION, self.classes, count, seed, digests])
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -151,50 +150,22 @@ class EmbeddedScenes:
         return Scene(self.ids[index], name, image.float() / 255, annotation.boxes, annotation.labels)
 
     def items(self, index: int) -> list[Item]:
-        """List the photographs in a scene, objects first.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The photographs with their places.
-        """
+        """List the photographs in a scene with their places, objects first."""
         return _layout(self._generator(index))
 
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, without composing its image.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The objects of the detector's classes.
-        """
+        """Return the objects of a scene, of the detector's classes, without composing its image."""
         objects = [item for item in self.items(index) if item.photograph.label in self._labels]
         boxes = torch.tensor([item.box() for item in objects], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([self._labels[item.photograph.label] for item in objects], dtype=torch.int64)
         return Annotation(boxes, labels, torch.zeros(len(objects), dtype=torch.bool), _SIZE)
 
     def targets(self, index: int) -> list[int]:
-        """List the classes of a scene that may be searched for.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            Class indices 1..K, ascending.
-        """
+        """List the classes of a scene that may be searched for, 1..K, ascending."""
         return legal_targets(self.annotation(index))
 
     def digest(self, index: int) -> str:
-        """Compute the sha256 of a scene's pixels.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            64 hexadecimal digits.
-        """
+        """Compute the sha256 of a scene's pixels."""
         return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
 
     def _generator(self, index: int) -> np.random.Generator:

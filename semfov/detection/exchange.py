@@ -170,21 +170,7 @@ class Exchange:
 def named_detections(
     boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, Any]
 ) -> supervision.Detections:
-    """Make `supervision.Detections`, which number classes from 0.
-
-    Args:
-        boxes: `(L, 4)`.
-        labels: `(L,)`, classes 1..K.
-        scores: `(L,)`, scores of the classes.
-        classes: names of the K classes, for `data["class_name"]`; None leaves them out.
-        data: further data of the boxes.
-
-    Returns:
-        The detections for Supervision.
-
-    Raises:
-        InputError: Supervision is not installed.
-    """
+    """`supervision.Detections` of boxes, with classes from 0, their names unless None, and further data."""
     library, numbers = _supervision(), (labels - 1).numpy()
     names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
     made: supervision.Detections = library.Detections(
@@ -196,18 +182,7 @@ def named_detections(
 def coco_results(
     image_id: int, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int]
 ) -> list[dict[str, Any]]:
-    """Make COCO results.
-
-    Args:
-        image_id: id of the image.
-        boxes: `(L, 4)`, corners.
-        labels: `(L,)`, classes 1..K.
-        scores: `(L,)`, scores of the classes.
-        ids: category id by class.
-
-    Returns:
-        One result for each box, with the box as `[x, y, width, height]`.
-    """
+    """COCO results of boxes (corners), with the category id of each class 1..K from `ids`."""
     size = boxes[:, 2:] - boxes[:, :2]
     placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
     return [

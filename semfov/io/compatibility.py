@@ -104,17 +104,7 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str, *, strict: bool = False) -> None:
-    """Warn where the sensor has other settings than the one that the model was fitted with; raise if it is strict.
-
-    Args:
-        fitted: settings of the sensor of the fit; empty if they are not known.
-        sensor: settings of the sensor.
-        what: title of the model, for the message.
-        strict: whether another sensor is an error.
-
-    Raises:
-        InputError: the settings differ, and it is strict.
-    """
+    """Warn, or raise if it is strict, where the sensor has other settings than in the fit; empty ones are unknown."""
     others = _others(fitted, sensor, set()) if sensor and fitted else []
     if others and strict:
         raise InputError(

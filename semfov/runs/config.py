@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
-from semfov.detection.onnx_twin import Runtime
+from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import lookup
 from semfov.gaze.policies import Task

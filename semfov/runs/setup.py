@@ -21,7 +21,7 @@ from semfov.eye import Eye
 from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
-from semfov.io.shipped import shipped_model
+from semfov.io.pretrained import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from semfov.data.annotations import read_annotations
+from semfov.data.coco import read_annotations
 from semfov.errors import DataError
 
 BOXES = [(10, "person", (1, 2, 3, 4)), (10, "cat", (0, 0, 5, 5)), (20, "person", (1.5, 2.25, 3, 4))]

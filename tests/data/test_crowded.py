@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov.data import EmbeddedScenes
-from semfov.data.crowded import Crowded
+from semfov.data.scene import Crowded
 from semfov.errors import InputError
 
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data import WordVectors, spread
-from semfov.data.naming import alike
+from semfov.data.classes import alike
 from semfov.data.word_vectors import words_of
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.errors import DataError, InputError
 
 VECTORS = np.random.default_rng(0).normal(size=(6, 5))

@@ -1,8 +1,7 @@
 import pytest
 
-from semfov.detection.architectures import ARCHITECTURES
-from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_layers import Convolution, Head
+from semfov.detection.darknet import Convolution, Darknet, Head
+from semfov.detection.darknet_config import ARCHITECTURES
 from semfov.detection.weights import WEIGHTS
 
 

@@ -9,10 +9,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from semfov.detection.architectures import yolov3, yolov3_tiny
-from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_config import Section, parse_cfg, read_cfg
-from semfov.detection.darknet_weights import read_weights
+from semfov.detection.darknet import Darknet, read_weights
+from semfov.detection.darknet_config import Section, parse_cfg, read_cfg, yolov3, yolov3_tiny
 from semfov.errors import DataError, InputError
 
 

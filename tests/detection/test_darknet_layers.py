@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.detection.darknet_layers import ACTIVATIONS, MaxPool, Route, Shortcut, Upsample
+from semfov.detection.darknet import ACTIVATIONS, MaxPool, Route, Shortcut, Upsample
 
 
 def darknet_maxpool(image: np.ndarray, size: int, stride: int, padding: int) -> np.ndarray:

@@ -3,9 +3,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from semfov.detection.darknet import Darknet
+from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import read_cfg
-from semfov.detection.darknet_weights import read_weights
 from semfov.errors import DataError
 
 

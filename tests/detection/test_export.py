@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.darknet_onnx import OUTPUTS
 from semfov.detection.export import export_onnx, largest_difference, main
-from semfov.detection.export_graph import OUTPUTS
 from semfov.detection.load import load_detector, load_yolo
 from semfov.detection.onnx import load_onnx
 from semfov.errors import DataError, InputError

@@ -6,9 +6,9 @@ import torch
 from torch import nn
 
 from semfov import ActivePerception
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.darknet_onnx import RUNTIMES
 from semfov.detection.load import check_detector, detector_name, load_detector
-from semfov.detection.onnx_twin import RUNTIMES
 from semfov.detection.placement import resize
 from semfov.errors import DataError, InputError
 

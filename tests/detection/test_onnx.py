@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
 from semfov.detection.preprocessing import Preprocessing
@@ -319,7 +319,7 @@ def test_published_models_are_loaded_by_name(make_onnx, monkeypatch, tmp_path):
     monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path / "cache"))
     (tmp_path / "cache").mkdir()
     (tmp_path / "cache" / "yolox_tiny.onnx").write_bytes(path.read_bytes())
-    monkeypatch.setattr("semfov.detection.sources.Address.fetch", refuse)
+    monkeypatch.setattr("semfov.detection.weights.Address.fetch", refuse)
     with pytest.warns(UserWarning, match="damaged"), pytest.raises(DataError, match=r"give its path as weights="):
         load_detector("yolox-tiny")
     with pytest.raises(InputError, match="did you mean 'yolox-tiny'"):

@@ -1,6 +1,6 @@
 import pytest
 
-from semfov.detection.onnx_recognition import HEADS, Signature, recognise
+from semfov.detection.onnx_heads import HEADS, Signature, recognise
 from semfov.errors import InputError
 
 LEVELS = (6400, 1600, 400)

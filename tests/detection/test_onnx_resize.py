@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from torchvision.ops import box_iou
 
 from semfov.detection.load import load_detector
-from semfov.detection.onnx_resize import with_input_size
+from semfov.detection.onnx_file import with_input_size
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import InputError
 

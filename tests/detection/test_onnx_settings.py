@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from semfov.detection.onnx_settings import read_settings
+from semfov.detection.onnx_file import read_settings
 from semfov.errors import DataError
 
 

@@ -11,9 +11,8 @@ import torch
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp
 
-from semfov.detection.export_graph import VERSION, network_model
+from semfov.detection.darknet_onnx import VERSION, OnnxTwin, exported, network_digest, network_model
 from semfov.detection.load import load_yolo
-from semfov.detection.onnx_twin import OnnxTwin, exported, network_digest
 from semfov.errors import InputError
 
 CLASSES = ("cat", "dog")
@@ -41,7 +40,7 @@ def looks(monkeypatch):
 def folder(tmp_path, monkeypatch):
     """An empty cache for one test."""
     path = tmp_path / "cache"
-    monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: path)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.cache_folder", lambda: path)
     return path
 
 
@@ -230,7 +229,7 @@ def test_every_network_and_version_has_its_own_export(make, folder, monkeypatch)
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
     assert exported(network, folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.export_graph.VERSION", VERSION + 1)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", VERSION + 1)
     assert exported(network, folder) != path
     with torch.no_grad():
         network.layers[0].weight.mul_(2)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from semfov.detection.overlaps import neighbours, survivors
+from semfov.detection.objects import neighbours, survivors
 
 
 def test_neighbours_are_all_pairs_of_intersecting_intervals():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from semfov.detection.sources import Address, SourceDistribution
+from semfov.detection.weights import Address, SourceDistribution
 from semfov.errors import DataError
 
 CONTENT = b"numbers" * 1000

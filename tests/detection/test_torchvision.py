@@ -7,11 +7,10 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBo
 from torchvision.models.detection.ssd import SSD
 from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import load_detector
 from semfov.detection.selection import Selection
-from semfov.detection.torchvision import TorchvisionDetector, load_torchvision
-from semfov.detection.torchvision_heads import output_count
+from semfov.detection.torchvision import TorchvisionDetector, load_torchvision, output_count
 from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
 

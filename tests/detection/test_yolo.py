@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from semfov.detection import Selection
-from semfov.detection.darknet import Darknet
+from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import read_cfg
-from semfov.detection.darknet_weights import read_weights
 from semfov.detection.yolo import YoloV3, decode_yolo
 from semfov.errors import InputError
 

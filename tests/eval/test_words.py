@@ -10,7 +10,7 @@ import torch
 
 from eval.words.run import WordsConfig, differences, outcome_tables, words
 from semfov.belief import ContextPrior
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.errors import InputError
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 

@@ -12,9 +12,9 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
 from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io import storage
-from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
+from semfov.io.storage import read_tensors, write_tensors
 from semfov.zoom import GlimpseEvidence
 
 CLASSES = ["cup", "cat"]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.belief import ContextPrior
 from semfov.belief.context import reaches
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.errors import DataError, check
 from semfov.fit.outputs import model_path, training_of, write_outputs
 from semfov.metrics.averages import standard_error
