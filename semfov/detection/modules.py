@@ -53,7 +53,7 @@ def edge_scale(images: Tensor, edges: tuple[int, int]) -> float:
     return min(edges[0] / min(width, height), edges[1] / max(width, height))
 
 
-def resized(
+def resized_images(
     images: Tensor, *, scale: float = 1.0, size: tuple[int, int] | None = None, antialias: bool = False
 ) -> tuple[Tensor, Placement]:
     """Images resized bilinearly by a scale, or to `(width, height)`, and their placement, without padding."""

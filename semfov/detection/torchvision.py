@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.detector import check_images
-from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized
+from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
@@ -85,8 +85,8 @@ class TorchvisionDetector(ModuleDetector):
         check_images(images)
         transform: Any = self.model.transform
         if transform.fixed_size is not None:
-            return resized(images, size=self.input_size)
-        return resized(images, scale=edge_scale(images, (transform.min_size[-1], transform.max_size)))
+            return resized_images(images, size=self.input_size)
+        return resized_images(images, scale=edge_scale(images, (transform.min_size[-1], transform.max_size)))
 
     def outputs(self, canvas: Tensor) -> Raw:
         """Compute the boxes and scores of the model before it filters them.

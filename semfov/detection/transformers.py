@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.detection.detector import check_images
-from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized
+from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import decode_detr, decode_rtdetr
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
@@ -92,7 +92,7 @@ class TransformersDetector(ModuleDetector):
         if self.edges is None:
             return letterbox(images, self.input_size, stretch=True)
         scale = edge_scale(images, self.edges)
-        return resized(images, scale=scale, antialias=scale < 1)
+        return resized_images(images, scale=scale, antialias=scale < 1)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""

@@ -190,7 +190,7 @@ class Sensor(nn.Module, ABC):
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
 
-def stacked(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
+def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
     """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""
     views = [view(b, g) for b in range(batch) for g in range(many)]
     whole = torch.stack(views) if views else empty[None].expand(0, *empty.shape)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
-from semfov.sensor.base import stacked
+from semfov.sensor.base import stacked_views
 
 Padding = Literal["zeros", "border", "fill"]
 Length = TypeVar("Length", float, Tensor)
@@ -70,7 +70,7 @@ def glimpse(
     def view(b: int, g: int) -> Tensor:
         return _window(image[b], windows[b, g], size, padding_mode, value)
 
-    result = stacked(view, batch, windows.shape[1], image.new_zeros(image.shape[1], size[1], size[0]))
+    result = stacked_views(view, batch, windows.shape[1], image.new_zeros(image.shape[1], size[1], size[0]))
     return result if boxes.ndim == 3 else result[:, 0]
 
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
-from semfov.sensor.base import stacked
+from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
 
 
@@ -52,7 +52,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     def view(b: int, g: int) -> Tensor:
         return sample(source[b], poses[b, g], size, antialias=antialias)
 
-    result = stacked(view, batch, poses.shape[1], panorama.new_zeros(panorama.shape[1], size[1], size[0]))
+    result = stacked_views(view, batch, poses.shape[1], panorama.new_zeros(panorama.shape[1], size[1], size[0]))
     return result if pose.ndim == 3 else result[:, 0]
 
 

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from semfov.detection.load import load_yolo
+from semfov.detection.yolo import YoloV3
+
 SMALL_CFG = """
 [net]
 width=64
@@ -143,6 +146,17 @@ def write_weights(tmp_path: Path) -> Callable[..., Path]:
 def small_weights(write_weights: Callable[..., Path]) -> Path:
     """Random weights for `small_cfg`."""
     return write_weights()
+
+
+@pytest.fixture
+def make_small(small_cfg: Path, small_weights: Path) -> Callable[..., YoloV3]:
+    """Loads the network of `small_cfg` with random weights."""
+
+    def make(runtime: str = "torch", **options: object) -> YoloV3:
+        settings = {"weights": small_weights, "classes": ("cat", "dog"), "stride": 16, "runtime": runtime}
+        return load_yolo(str(small_cfg), **{**settings, **options})
+
+    return make
 
 
 @pytest.fixture
