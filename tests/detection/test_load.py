@@ -1,6 +1,3 @@
-import sys
-from types import SimpleNamespace
-
 import pytest
 import torch
 from torch import nn
@@ -67,21 +64,6 @@ def test_missing_and_unsuitable_files_are_refused(small_cfg, write_weights, tmp_
         load_detector(small_cfg, weights=write_weights(), classes=tmp_path / "missing.names")
 
 
-def test_onnx_and_torchvision_loaders_are_imported_when_needed(monkeypatch):
-    calls = []
-    for module, function in [("onnx", "load_onnx"), ("torchvision", "load_torchvision")]:
-        stand_in = SimpleNamespace(**{function: lambda name, _f=function, **options: calls.append((_f, name, options))})
-        monkeypatch.setitem(sys.modules, f"semfov.detection.{module}", stand_in)
-    load_detector("folder/model.onnx", threshold=0.1)
-    load_detector("yolox-nano")
-    load_detector("torchvision:fcos_resnet50_fpn")
-    assert calls == [
-        ("load_onnx", "folder/model.onnx", {"threshold": 0.1}),
-        ("load_onnx", "yolox-nano", {}),
-        ("load_torchvision", "torchvision:fcos_resnet50_fpn", {}),
-    ]
-
-
 def test_coco_classes_equal_those_of_the_annotations(shared):
     import json
 
@@ -125,18 +107,6 @@ def test_one_thread_is_reproducible_and_two_threads_agree_with_it(tiny_weights, 
     assert torch.equal(one.classes, again.classes)
     torch.testing.assert_close(two.boxes, one.boxes, atol=1e-3, rtol=1e-5)
     torch.testing.assert_close(two.classes, one.classes, atol=1e-5, rtol=1e-4)
-
-
-@pytest.mark.weights
-def test_both_runtimes_give_the_same_detections(tiny, tiny_weights):
-    from skimage import data
-
-    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
-    network = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch")
-    expected, actual = network(image), tiny(image)
-    assert torch.equal(actual.labels, expected.labels)
-    torch.testing.assert_close(actual.scores, expected.scores, atol=1e-4, rtol=0)
-    torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.01, rtol=0)
 
 
 def test_a_detector_is_returned_as_it_is(small_cfg, write_weights):

@@ -75,20 +75,6 @@ def test_selection_applies_threshold_suppression_and_order():
     torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
 
 
-def test_an_image_does_not_depend_on_its_batch():
-    candidates = make(40, batch=3)
-    whole = select(candidates, None, Selection(), "residual")
-    for image in range(3):
-        part = Candidates(
-            *(x[image : image + 1] for x in (candidates.boxes, candidates.classes, candidates.objectness))
-        )
-        alone = select(part, None, Selection(), "residual")
-        length = int(alone.count)
-        assert int(whole.count[image]) == length
-        assert torch.equal(whole.boxes[image, :length], alone.boxes[0])
-        assert torch.equal(whole.scores[image, :length], alone.scores[0])
-
-
 def test_boxes_outside_the_image_are_dropped():
     _, placement = letterbox(torch.zeros(1, 3, 32, 64), (64, 64))
     boxes = torch.tensor([[[10.0, 0.0, 20.0, 15.0], [10.0, 20.0, 20.0, 30.0]]])  # the first box lies in the padding
@@ -102,9 +88,6 @@ def test_a_selection_without_candidates_is_empty(count):
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
     assert found.count.tolist() == [0, 0]
-
-
-def test_one_image_of_a_batch_may_have_no_detections():
     candidates = make(5)
     candidates.objectness[0] = 0
     assert select(candidates, None, Selection(), "residual").count.tolist()[0] == 0

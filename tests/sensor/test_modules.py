@@ -1,24 +1,58 @@
 """Sensors as submodules of other modules."""
 
+from typing import ClassVar
+
+import pytest
 import torch
 
+from semfov.errors import InputError
 from semfov.sensor import Foveation, Glimpse, LogPolar, MultiScaleFovea, Perspective, RandomFoveation
 from tests.base_tester import GraphTester, TensorTester
-from tests.small import rand
+from tests.small import close, draw, rand
 
 # Fixations off the centres of pixels, where bilinear interpolation has no derivative.
 GAZES = torch.tensor([[20.3, 30.1], [45.7, 9.4]])
 
 
-class TestFoveation(GraphTester):
+class SensorTester(GraphTester):
+    """Tests of sensors: many fixations of each image, images that were prepared before, and what is refused."""
+
     batched = (0, 1)
     differentiable = (0, 1)
-
-    def make(self):
-        return Foveation(9.0, levels=2, learnable=True)
+    prepare: ClassVar[str]
 
     def inputs(self):
         return rand(2, 3, 48, 64), GAZES
+
+    @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
+    def test_many_fixations(self, size, device):
+        """They equal a loop over them, each alone, and an image that was prepared before gives the same."""
+        sensor, image, gaze = self.make().double().to(device), draw(2, 3, *size, device=device), 30 * draw(2, 4, 2)
+        gaze = gaze.to(device)
+        many, state = sensor(image, gaze), getattr(sensor, self.prepare)(image)
+        assert many.shape[:2] == (2, 4)
+        for g in range(4):
+            close(many[:, g], sensor(state, gaze[:, g]))
+            close(many[1, g], sensor(image[1:], gaze[1, g])[0])
+
+    def test_bad_input(self):
+        image, gaze = torch.rand(2, 3, 8, 8), torch.tensor([4.0, 4.0])
+        for arguments, message in (
+            ((image, gaze * torch.nan), "gaze: expected finite numbers"),
+            ((image, torch.tensor([[[torch.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
+            *(((image, torch.rand(*shape)), "gaze: expected") for shape in ((3,), (), (3, 2), (1, 4, 2), (1, 2, 4, 2))),
+            ((image[0, 0, 0], gaze), "image: expected"),
+            ((image[:, :, :0], gaze), "image: expected at least one pixel"),
+        ):
+            with pytest.raises(InputError, match=message):
+                self.make()(*arguments)
+
+
+class TestFoveation(SensorTester):
+    prepare = "pyramid"
+
+    def make(self):
+        return Foveation(9.0, levels=2, learnable=True)
 
 
 class TestFoveationAsOpenCV(TestFoveation):
@@ -29,26 +63,18 @@ class TestFoveationAsOpenCV(TestFoveation):
         return rand(2, 3, 33, 47), GAZES
 
 
-class TestLogPolar(GraphTester):
-    batched = (0, 1)
-    differentiable = (0, 1)
+class TestLogPolar(SensorTester):
+    prepare = "pyramid"
 
     def make(self):
         return LogPolar(9.0)
 
-    def inputs(self):
-        return rand(2, 3, 48, 64), GAZES
 
-
-class TestMultiScaleFovea(GraphTester):
-    batched = (0, 1)
-    differentiable = (0, 1)
+class TestMultiScaleFovea(SensorTester):
+    prepare = "means"
 
     def make(self):
         return MultiScaleFovea(16, 3)
-
-    def inputs(self):
-        return rand(2, 3, 48, 64), GAZES
 
 
 class TestPerspective(TensorTester):
