@@ -273,21 +273,7 @@ def network_digest(network: Darknet) -> str:
 
 
 def exported(network: Darknet, folder: Path) -> Path:
-    """Find the ONNX model of a network in a folder, and export it if it is missing.
-
-    The name of the file contains a digest of the network and exporter, and the file's own sha256. A damaged file does
-    not have this sha256 and is exported again. Files are written atomically, so several processes may do this at once.
-
-    Args:
-        network: the network.
-        folder: the folder.
-
-    Returns:
-        The path of the model.
-
-    Raises:
-        DataError: the model cannot be written.
-    """
+    """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
     source = json.dumps([network_digest(network), VERSION, torch.__version__])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
     whole = _whole(folder.glob(f"{key}.*.onnx"))

@@ -192,19 +192,7 @@ def coco_results(
 
 
 def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
-    """Make score vectors of boxes for which only one class and its score are known; the rest is background.
-
-    Args:
-        labels: class of each box, 1..K, `(L,)`.
-        scores: score of that class, `(L,)`; None for 1.
-        classes: number of classes K.
-
-    Returns:
-        Score vectors `(L, K+1)`.
-
-    >>> vectors_of(torch.tensor([2]), torch.tensor([0.75]), 3)
-    tensor([[0.2500, 0.0000, 0.7500, 0.0000]])
-    """
+    """Score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1) each; the rest is background."""
     check_whole(classes, "classes", 1, 10**6)
     scores = torch.ones(len(labels), device=labels.device) if scores is None else scores
     scores = scores if scores.is_floating_point() else scores.float()

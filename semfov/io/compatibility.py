@@ -31,34 +31,12 @@ _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 
 def recommended_model(detector: str, growth: float) -> str:
-    """Name the observation model that is shipped for a detector with a sensor of this growth.
-
-    Args:
-        detector: name of the detector.
-        growth: growth of the foveal sensor.
-
-    Returns:
-        The name of the model.
-
-    >>> recommended_model("yolov3-tiny", 2.0), recommended_model("yolov3-tiny", 1.0)
-    ('yolov3-tiny', 'yolov3-tiny-sharp')
-    """
+    """Name the observation model that is shipped for a detector with a sensor of this growth."""
     return f"{detector}-sharp" if growth == 1 else detector
 
 
 def learned_for(detector: str, growth: float) -> str:
-    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth.
-
-    Args:
-        detector: name of the detector.
-        growth: growth of the foveal sensor.
-
-    Returns:
-        The name of the models.
-
-    >>> learned_for("yolov3-tiny", 2.0), learned_for("yolov3-tiny", 1.0)
-    ('yolov3-tiny', 'yolov3-tiny-published')
-    """
+    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth."""
     return f"{detector}-published" if growth == 1 else detector
 
 

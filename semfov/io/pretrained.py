@@ -143,19 +143,7 @@ def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
 
 
 def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
-    """Check that a model is shipped under a name.
-
-    Args:
-        kind: kind of model.
-        name: name of the model for a detector and a sensor.
-        model: name or file of the detector, as the user gave it.
-
-    Returns:
-        The name.
-
-    Raises:
-        InputError: no such model is shipped; the message has the command that fits one.
-    """
+    """Return the name under which a kind of model is shipped; if none is, the error has the command that fits one."""
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
     names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))

@@ -349,10 +349,10 @@ def _record(
     path: Path, name: str, trial: Mapping[str, Any], keys: tuple[str, str, str] = ("X", "Y", "T"), **fields: Any
 ) -> Fixations:
     """The record of a trial with lists of x, y and durations; a scanpath that was cut may have more durations."""
-    x, y, times = (trial.get(key) for key in keys)
-    count = len(trial[keys[0]])
-    if count != len(trial[keys[1]]):
-        raise DataError(f"{path}: {name}: expected as many Y as X, got {count} X and {len(trial[keys[1]])} Y")
+    x, y, times = trial[keys[0]], trial[keys[1]], trial.get(keys[2])
+    count = len(x)
+    if count != len(y):
+        raise DataError(f"{path}: {name}: expected as many Y as X, got {count} X and {len(y)} Y")
     if times is not None and len(times) < count:
         raise DataError(f"{path}: {name}.{keys[2]}: expected durations of {count} fixations, got {len(times)}")
     durations = None if times is None else np.asarray(times[:count], dtype=np.float64)
