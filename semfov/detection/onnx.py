@@ -80,7 +80,6 @@ class OnnxDetector(Detector):
         )
         fixed = None not in session.shape[2:]
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
-        check(stride is None or stride > 0, "stride", "None or a positive number of pixels", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
 

@@ -92,7 +92,7 @@ def read_cocosearch(
             subject=str(trial.get("subject", path.stem)),
             size=screen,
             target=trial.get("task"),
-            box=None if box is None else _box(*box[:2], box[0] + box[2], box[1] + box[3]),
+            box=None if box is None else _box(box[0], box[1], box[0] + box[2], box[1] + box[3]),
             found=flag if isinstance(flag, bool) else None,
         )
         if sizes is None:
