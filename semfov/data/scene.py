@@ -1,9 +1,11 @@
-"""Scenes (images with the boxes of their objects), the interface of sets of scenes, and their most crowded subset."""
+"""Scenes (images with the boxes of their objects), the interface of their sets, and sets that are composed or chosen."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -174,6 +176,42 @@ def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage
         return present
     boxes, labels, size = annotation.boxes, annotation.labels, annotation.size
     return [label for label in present if box_coverage(boxes[labels == label], size, coverage) <= max_area]
+
+
+class ComposedScenes(ABC):
+    """Base of sets whose scenes are composed by a seed: a scene depends only on the seed and on its number.
+
+    Args:
+        classes: names of the detector's classes 1..K.
+        count: number of scenes.
+        seed: seed of the compositions.
+    """
+
+    def __init__(self, classes: tuple[str, ...], count: int, seed: int) -> None:
+        check(count >= 1, "count", "at least 1", count)
+        check(seed >= 0, "seed", "at least 0", seed)
+        self.classes, self._seed = classes, seed
+        self.ids = list(range(count))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @abstractmethod
+    def annotation(self, index: int) -> Annotation:
+        """Return the objects of a scene, without composing its image."""
+
+    def targets(self, index: int) -> list[int]:
+        """List the classes that may be searched for, ascending: those that cover at most a fifth of the scene."""
+        return legal_targets(self.annotation(index))
+
+    def _generator(self, index: int, *part: int) -> np.random.Generator:
+        """The random numbers of a scene, or of a part of it."""
+        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], *part]))
+
+    def _scene(self, index: int, kind: str, image: Tensor) -> Scene:
+        """A composed image with its objects, named after its kind."""
+        annotation, number = self.annotation(index), self.ids[index]
+        return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)
 
 
 class Crowded:
