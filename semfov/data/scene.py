@@ -1,4 +1,4 @@
-"""Scenes (images with the boxes of their objects), the interface of their sets, and sets that are composed or chosen."""
+"""Scenes (images with the boxes of their objects), the interface of their sets, and composed and chosen sets."""
 
 import math
 from abc import ABC, abstractmethod
