@@ -1,6 +1,6 @@
 """Sensors as submodules of other modules."""
 
-from typing import ClassVar
+import copy
 
 import pytest
 import torch
@@ -14,45 +14,15 @@ from tests.small import close, draw, rand
 GAZES = torch.tensor([[20.3, 30.1], [45.7, 9.4]])
 
 
-class SensorTester(GraphTester):
-    """Tests of sensors: many fixations of each image, images that were prepared before, and what is refused."""
-
+class TestFoveation(GraphTester):
     batched = (0, 1)
     differentiable = (0, 1)
-    prepare: ClassVar[str]
-
-    def inputs(self):
-        return rand(2, 3, 48, 64), GAZES
-
-    @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-    def test_many_fixations(self, size, device):
-        """They equal a loop over them, each alone, and an image that was prepared before gives the same."""
-        sensor, image, gaze = self.make().double().to(device), draw(2, 3, *size, device=device), 30 * draw(2, 4, 2)
-        gaze = gaze.to(device)
-        many, state = sensor(image, gaze), getattr(sensor, self.prepare)(image)
-        assert many.shape[:2] == (2, 4)
-        for g in range(4):
-            close(many[:, g], sensor(state, gaze[:, g]))
-            close(many[1, g], sensor(image[1:], gaze[1, g])[0])
-
-    def test_bad_input(self):
-        image, gaze = torch.rand(2, 3, 8, 8), torch.tensor([4.0, 4.0])
-        for arguments, message in (
-            ((image, gaze * torch.nan), "gaze: expected finite numbers"),
-            ((image, torch.tensor([[[torch.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
-            *(((image, torch.zeros(shape)), "gaze: expected") for shape in ((3,), (), (3, 2), (1, 4, 2), (1, 2, 4, 2))),
-            ((image[0, 0, 0], gaze), "image: expected"),
-            ((image[:, :, :0], gaze), "image: expected at least one pixel"),
-        ):
-            with pytest.raises(InputError, match=message):
-                self.make()(*arguments)
-
-
-class TestFoveation(SensorTester):
-    prepare = "pyramid"
 
     def make(self):
         return Foveation(9.0, levels=2, learnable=True)
+
+    def inputs(self):
+        return rand(2, 3, 48, 64), GAZES
 
 
 class TestFoveationAsOpenCV(TestFoveation):
@@ -63,18 +33,58 @@ class TestFoveationAsOpenCV(TestFoveation):
         return rand(2, 3, 33, 47), GAZES
 
 
-class TestLogPolar(SensorTester):
-    prepare = "pyramid"
+class TestLogPolar(GraphTester):
+    batched = (0, 1)
+    differentiable = (0, 1)
 
     def make(self):
         return LogPolar(9.0)
 
+    def inputs(self):
+        return rand(2, 3, 48, 64), GAZES
 
-class TestMultiScaleFovea(SensorTester):
-    prepare = "means"
 
+class TestMultiScaleFovea(TestFoveation):
     def make(self):
         return MultiScaleFovea(16, 3)
+
+
+of_each_sensor = pytest.mark.parametrize(
+    ("sensor", "prepare"),
+    [
+        (Foveation(9.0, levels=2), "pyramid"),
+        (Foveation(9.0, levels=2, convention="opencv"), "pyramid"),
+        (LogPolar(9.0), "pyramid"),
+        (MultiScaleFovea(16, 3), "means"),
+    ],
+)
+
+
+@of_each_sensor
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
+def test_many_fixations_equal_a_loop_over_them(sensor, prepare, size, device):
+    """Also of an image that was prepared before."""
+    image, gaze = draw(2, 3, *size, device=device), (30 * draw(2, 4, 2)).to(device)
+    sensor = copy.deepcopy(sensor).double().to(device)
+    many, state = sensor(image, gaze), getattr(sensor, prepare)(image)
+    assert many.shape[:2] == (2, 4)
+    for g in range(4):
+        close(many[:, g], sensor(state, gaze[:, g]))
+        close(many[1, g], sensor(image[1:], gaze[1, g])[0])
+
+
+@of_each_sensor
+def test_bad_input(sensor, prepare):
+    image, gaze = torch.rand(2, 3, 8, 8), torch.tensor([4.0, 4.0])
+    for arguments, message in (
+        ((image, gaze * torch.nan), "gaze: expected finite numbers"),
+        ((image, torch.tensor([[[torch.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
+        *(((image, torch.zeros(shape)), "gaze: expected") for shape in ((3,), (), (3, 2), (1, 4, 2), (1, 2, 4, 2))),
+        ((image[0, 0, 0], gaze), "image: expected"),
+        ((image[:, :, :0], gaze), "image: expected at least one pixel"),
+    ):
+        with pytest.raises(InputError, match=message):
+            sensor(*arguments)
 
 
 class TestPerspective(TensorTester):
