@@ -227,9 +227,7 @@ def test_models_that_cannot_be_read_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="detector: expected hf:owner/name, got 'hf:'"):
         load_detector("hf:")
     small_text = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
-    text = hf.OwlViTForObjectDetection(
-        hf.OwlViTConfig(text_config=small_text, vision_config=small_text, projection_dim=8)
-    )
+    config = hf.OwlViTConfig(text_config=small_text, vision_config=small_text, projection_dim=8)
     with pytest.raises(InputError, match=r"classes of its own, such as RTDetr.*got OwlViT"):
         load_detector(hf.OwlViTForObjectDetection(config))
     monkeypatch.setitem(sys.modules, "transformers", None)
