@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from semfov.detection import Candidates, Selection, letterbox
 from semfov.detection.selection import select, suppress
+from semfov.errors import InputError
+from tests.small import Fixed
 
 
 def overlap(a, b) -> float:
@@ -101,3 +103,32 @@ def test_gradients_reach_boxes_classes_and_objectness():
     for leaf in leaves:
         rows = leaf.grad.reshape(20, -1).abs().sum(-1) > 0
         assert int(rows.sum()) == int(found.count)
+
+
+def made_of(**changes):
+    parts = {
+        "boxes": torch.tensor([[[1.0, 1, 9, 9], [10, 10, 20, 20]]]),
+        "classes": torch.tensor([[[0.9, 0.1], [0.2, 0.7]]]),
+        "objectness": torch.tensor([[0.8, 0.6]]),
+    }
+    for name, value in changes.items():
+        parts[name][0, 1] = value
+    return Candidates(**parts)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"classes": torch.nan}, "confidence.*finite"),
+        ({"objectness": torch.nan}, "confidence.*finite"),
+        ({"boxes": torch.nan}, "boxes.*finite"),
+        ({"boxes": torch.inf}, "boxes.*finite"),
+        ({"classes": 1.5}, r"class scores.*\[0, 1\]"),
+        ({"objectness": 2.0}, r"objectness.*\[0, 1\]"),
+    ],
+)
+def test_invalid_scores_and_boxes_are_refused_and_are_no_image_without_detections(changes, message):
+    image = torch.rand(1, 3, 32, 32)
+    assert Fixed(candidates=made_of())(image).count.tolist() == [2]
+    with pytest.raises(InputError, match=message):
+        Fixed(candidates=made_of(**changes))(image)
