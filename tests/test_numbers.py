@@ -43,7 +43,10 @@ STRICT = [
 """Pages whose sentences repeat what tables say."""
 
 OTHERS = [
-    *(f"docs/{name}.md" for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method", "words")),
+    *(
+        f"docs/{name}.md"
+        for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method", "words")
+    ),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/measurements/*.md")),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md")),
 ]

@@ -5,7 +5,7 @@ import inspect
 import pytest
 import torch
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
+from semfov import DirichletBelief, Grid, InputError, acquisition
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
 from tests import small
@@ -16,9 +16,7 @@ TARGETS = torch.tensor([2, 1, 3])
 
 
 def model():
-    alpha = 0.5 + 3 * rand(4, 3, 4) + 2 * torch.eye(4, dtype=torch.float64)[:, None]
-    names, misses = ("cat", "cup", "dog"), 0.1 + 0.8 * rand(4, 3)
-    return FovealObservationModel(alpha, [0.2, 0.5], names, miss_rate=misses).requires_grad_(False)
+    return small.model().double().requires_grad_(False)
 
 
 SEARCH = {
@@ -115,16 +113,9 @@ def test_a_batch_gives_the_values_of_each_episode_alone(name, dtype):
         assert torch.equal(alone, together[row : row + 1])
 
 
-@pytest.mark.parametrize("name", BLIND)
-def test_functions_that_ignore_the_belief_have_no_gradient(name):
-    known = beliefs()
-    known.beta.requires_grad_()
-    assert not EVERY[name]()(known, visits()).requires_grad
-
-
 def test_values_have_the_dtype_of_the_belief(name):
-    """An observation model in double precision works with beliefs in single precision."""
-    function, known = EVERY[name](), beliefs()
+    """A function and an observation model in double precision work with beliefs in single precision."""
+    function, known = EVERY[name]().double(), beliefs()
     single = DirichletBelief(known.beta.float(), known.closest.float())
     if name == "Static":
         function = function.float()
@@ -167,14 +158,6 @@ def test_values_depend_only_on_the_probability_of_the_target(name):
 def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cells():
     alone = target_belief(rand(3, 12), rand(3, 12, seed=1), GRID.cell_distance[[0, 6, 11]].double())
     assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
-
-
-@pytest.mark.parametrize("name", [name for name in EVERY if name != "Static"])
-def test_a_function_in_double_precision_keeps_the_dtype_of_the_belief(name):
-    """Its values are compared with other values of that belief, so they have the same dtype."""
-    known = beliefs()
-    values = EVERY[name]().double()(DirichletBelief(known.beta.float(), known.closest.float()), visits())
-    assert values.dtype == torch.float32
 
 
 @pytest.mark.parametrize("shape", [(5,), (11, 4), (1, 13, 4)])
