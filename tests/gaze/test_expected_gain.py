@@ -8,10 +8,10 @@ from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import CloserLook, ExpectedGain
-from semfov.gaze.policies import POLICIES, Closer, Gain, Random, SaliencyMaximum, policy_names
+from semfov.gaze.policies import Closer, Gain, Random, SaliencyMaximum
 from semfov.runs.candidates import Models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
-from semfov.runs.presets import label, presets, resolve
+from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
 
 GRID = Grid(5, 4, (50, 40))
@@ -108,21 +108,6 @@ LEARNED = {
     "vocus2-learned": PolicyConfig("saliency", "learned", saliency="vocus2"),
     "itti-koch-learned": PolicyConfig("saliency", "learned", saliency="itti-koch"),
 }
-
-
-def test_presets_of_learned_maps():
-    known = presets("exploration")
-    assert {name: known[name] for name in LEARNED} == LEARNED
-    assert resolve("recommended", "exploration") == LEARNED["closer-look-learned"]
-    for name, policy in LEARNED.items():
-        assert resolve(name, "exploration") == resolve(policy, "exploration") == policy
-        assert label(name, "exploration") == label(policy, "exploration") == name
-    assert not any(
-        POLICIES[policy.policy].needs_map for policy in presets("search").values() if policy.policy in POLICIES
-    )
-    for name in policy_names("exploration"):
-        if POLICIES[name].needs_model:
-            assert f"{name}-learned" not in known
 
 
 DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
