@@ -5,13 +5,14 @@ import inspect
 import pytest
 import torch
 
-from semfov import DirichletBelief, Grid, InputError, acquisition
+from semfov import DirichletBelief, InputError, acquisition
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
 from tests import small
+from tests.gaze.test_modules import LOOKAHEADS, functions
+from tests.small import GRID
 from tests.small import draw as rand
 
-GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
 
 
@@ -19,33 +20,9 @@ def model():
     return small.model().double().requires_grad_(False)
 
 
-SEARCH = {
-    "TargetPosterior": lambda: acquisition.TargetPosterior(TARGETS),
-    "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(TARGETS, model()),
-    "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(TARGETS, model(), GRID),
-    "FovealHit": lambda: acquisition.FovealHit(TARGETS, model(), GRID),
-    "PlaceInformation": lambda: acquisition.PlaceInformation(TARGETS, model(), GRID),
-}
-EXPLORATION = {
-    "KLDivergence": lambda: acquisition.KLDivergence(model(), GRID),
-    "BayesianSurprise": lambda: acquisition.BayesianSurprise(model(), GRID),
-    "NegativeEntropy": lambda: acquisition.NegativeEntropy(model(), GRID),
-    "TwoPeaks": lambda: acquisition.TwoPeaks(model(), GRID),
-    "UpperConfidenceBound": lambda: acquisition.UpperConfidenceBound(model(), GRID),
-    "ProbabilityOfImprovement": lambda: acquisition.ProbabilityOfImprovement(model(), GRID),
-    "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID),
-    "CloserLook": lambda: acquisition.CloserLook(GRID, 0.2),
-    "ObjectEvidence": acquisition.ObjectEvidence,
-}
-BLIND = {"Static": lambda: acquisition.Static(rand(3, 12)), "Uniform": acquisition.Uniform}
-PRIOR = {
-    "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(TARGETS), rand(3, 12), weight=0.3)
-}
-EVERY = SEARCH | EXPLORATION | BLIND | PRIOR
+EVERY = functions(TARGETS, model, rand(3, 12))
 # These need only the probabilities of the target, or no belief at all.
-OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", *BLIND}
-# These predict the belief after a look at each cell of their grid.
-GRIDDED = ["NeighbourhoodPosterior", *(name for name in EXPLORATION if name not in ("CloserLook", "ObjectEvidence"))]
+OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", "Static", "Uniform"}
 
 
 def beliefs():
@@ -161,7 +138,7 @@ def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cell
 
 
 @pytest.mark.parametrize("shape", [(5,), (11, 4), (1, 13, 4)])
-@pytest.mark.parametrize("name", GRIDDED)
+@pytest.mark.parametrize("name", ["NeighbourhoodPosterior", *LOOKAHEADS])
 def test_a_belief_with_another_number_of_cells_is_refused(name, shape):
     with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 12, any\)"):
         small.values_of(EVERY[name](), torch.ones(shape))
