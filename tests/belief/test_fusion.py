@@ -181,19 +181,6 @@ def test_fuse_equals_the_loop(name, dtype):
     assert torch.equal(beta, before)
 
 
-def test_fused_maps_do_not_depend_on_the_size_of_the_batch():
-    torch.manual_seed(0)
-    beta, likelihood = torch.rand(40, 100, 81) + 0.2, torch.rand(40, 12, 81)
-    footprint = torch.rand(40, 12, 100) < 0.2
-    whole = fuse(beta, likelihood, footprint)
-    for size in (1, 7):
-        parts = [
-            fuse(b, l, f)
-            for b, l, f in zip(beta.split(size), likelihood.split(size), footprint.split(size), strict=True)
-        ]
-        assert torch.equal(torch.cat(parts), whole)
-
-
 def test_fuse_changes_nothing_if_detections_cover_no_cell():
     beta = torch.rand(2, 3, 4)
     got = fuse(beta, torch.zeros(2, 5, 4), torch.zeros(2, 5, 3, dtype=torch.bool))
