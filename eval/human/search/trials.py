@@ -126,6 +126,6 @@ def drawn_searches(
         cells = np.concatenate([[first], others])
         steps = _steps_to_target(np.stack([cells % grid.columns, cells // grid.columns], -1), each, grid)
         points = centres[cells[:steps]].astype(np.float64)
-        goal = {"target": each.target, "box": each.box, "found": steps is not None}
-        drawn.append(Fixations(each.picture, name, points, each.size, None, **goal))
+        found = steps is not None
+        drawn.append(Fixations(each.picture, name, points, each.size, None, each.target, each.box, found))
     return drawn

@@ -60,11 +60,12 @@ def events_of(people: Sequence[Fixations], raster: Grid, grid: Grid, longest: in
     cells, fine = (tuple(each.cell_of(path) for path in paths) for each in (grid, raster))
     columns = []
     for index, (path, cell) in enumerate(zip(paths, cells, strict=True)):
-        bins = bins_of(raster, path)
-        visited = F.one_hot(cell[:-1], len(grid)).cumsum(0).clamp(max=1).float()
-        number = torch.arange(len(bins) - 1)
-        columns.append((bins[1:], bins[:-1], visited, number, torch.full_like(number, index)))
-    return Events(*map(torch.cat, zip(*columns, strict=True)), cells, fine)
+        along = bins_of(raster, path)
+        seen = F.one_hot(cell[:-1], len(grid)).cumsum(0).clamp(max=1).float()
+        shifts = torch.arange(len(along) - 1)
+        columns.append((along[1:], along[:-1], seen, shifts, torch.full_like(shifts, index)))
+    bins, before, visited, number, person = map(torch.cat, zip(*columns, strict=True))
+    return Events(bins, before, visited, number, person, cells, fine)
 
 
 def bins_of(raster: Grid, points: Tensor) -> Tensor:
