@@ -22,7 +22,7 @@ from semfov.belief.verification import Verification
 from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
-from semfov.errors import InputError, check
+from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -63,8 +63,6 @@ class DecisionRun(Run):
     config: DecisionConfig
 
     def __init__(self, config: DecisionConfig) -> None:
-        context = config.belief.context
-        check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
         # The key of the run, which the base makes first, depends on this model.
         self.verification: Verification | None = None
         super().__init__(config)

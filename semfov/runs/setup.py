@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence, Verification
+from semfov.belief import MapEvidence, TargetEvidence, Verification
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
@@ -228,13 +228,6 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     model = ClassTemplates.from_pretrained(name or eye.detector.name)
     model.check_eye(eye.settings(), eye.detector.classes)
     return model
-
-
-def make_context(name: str, eye: Eye) -> ContextPrior:
-    """Load a fitted context; check that it knows the detector's classes."""
-    prior = ContextPrior.from_pretrained(name)
-    prior.check_compatible(eye.detector.classes)
-    return prior.requires_grad_(False)
 
 
 def plain(settings: dict[str, Any]) -> Any:
