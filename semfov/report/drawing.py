@@ -32,9 +32,9 @@ def record_html(record: Record) -> str:
         size = f'width="{width}" height="{height}" preserveAspectRatio="none"'
         shapes = [f'<image href="{jpeg_uri(record.image, WIDTH, _QUALITY)}" {size}/>']
     for look in record:
-        x1, y1, x2, y2 = look.region
-        if x2 - x1 > width - 1 and y2 - y1 > height - 1:
+        if record.is_whole(look.region):
             continue
+        x1, y1 = look.region[:2]
         shapes.append(_rect(look.region, GAZE, unit))
         at = f'x="{x1 + 3 * unit:.0f}" y="{y1 + 11 * unit:.0f}"'
         style = f'font-size="{11 * unit:.0f}" fill="{GAZE}" stroke="#fff" stroke-width="{3 * unit:.1f}"'
@@ -46,7 +46,8 @@ def record_html(record: Record) -> str:
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
-    key = f"Objects from {record.measure} {record.least:g} are orange, and confirmed ones green."
+    green = ", and confirmed ones green" if record.confirmable else ""
+    key = f"Objects from {record.measure} {record.least:g} are orange{green}."
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
 
 

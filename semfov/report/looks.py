@@ -37,11 +37,11 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
     head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'
     looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
+    confirmed = " Green objects were confirmed by the decision or a closer look." if data["confirmable"] else ""
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
-        f"Click on the number or the border of a window to choose its look. Green objects were confirmed by the "
-        f"decision or a closer look.</p>"
+        f"Click on the number or the border of a window to choose its look.{confirmed}</p>"
         f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data)}</figure>'
         f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
@@ -121,10 +121,11 @@ def _objects(data: Data, count: int) -> str:
     """The table of the objects, most confident first."""
     if not count:
         return "<p>No objects were found.</p>"
-    rows = [["#", "class", "score", "box", "look", "confirmed"]]
+    rows = [["#", "class", "score", "box", "look", *(["confirmed"] if data["confirmable"] else [])]]
     for order, each in enumerate(data["objects"][:LISTED], 1):
-        place, sure = _corners(each["box"]), "yes" if each["confirmed"] else "no"
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), sure])
+        sure = ["yes" if each["confirmed"] else "no"] if data["confirmable"] else []
+        place = _corners(each["box"])
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), *sure])
     caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the look of each box"
     return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
 

@@ -65,12 +65,11 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
     """Draw the windows of looks up to `last` (None: all), numbered; returns the rectangles of the numbers."""
     from matplotlib.patches import Rectangle
 
-    width, height = path.size
     numbers: list[tuple[float, float]] = []
-    room = 0.025 * width
+    room = 0.025 * path.size[0]
     for look in path:
         x1, y1, x2, y2 = look.region
-        if (x2 - x1 > width - 1 and y2 - y1 > height - 1) or (last is not None and look.number > last):
+        if path.is_whole(look.region) or (last is not None and look.number > last):
             continue
         style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
