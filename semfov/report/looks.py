@@ -16,7 +16,7 @@ ABOUT = {
     "detector": "Detector",
     "sensor": "Sensor",
     "passes": "Passes of the detector",
-    "decision": "Decision",
+    "decision": "Outcome",
 }
 """Entries at the head of an episode, by their keys in its data."""
 
