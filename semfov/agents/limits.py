@@ -1,13 +1,18 @@
-"""EpisodeLimits that all agents share: passes of the detector, time on this machine, and what the caller says."""
+"""What agents share: limits of an episode, checks of arguments, and where their parts compute."""
 
+import copy
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+from torch import nn
 
 from semfov.errors import InputError, check, check_number, check_whole
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
@@ -18,7 +23,7 @@ OnLook = Callable[[Any], object]
 
 @dataclass(frozen=True)
 class EpisodeLimits:
-    """EpisodeLimits of one episode. It ends at the first one that is reached.
+    """Limits of one episode. It ends at the first one that is reached.
 
     Args:
         passes: largest number of passes of the detector, closer looks included, 1 to 1,000,000; None for no limit.
@@ -123,3 +128,21 @@ def known_options(options: Collection[str], known: Iterable[str], what: str) -> 
 def without_none(**values: Any) -> dict[str, Any]:
     """The arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}
+
+
+def on_cpu(module: _Module) -> _Module:
+    """A module on the CPU, without moving the given one, which other parts of the agent may share.
+
+    Args:
+        module: the module.
+
+    Returns:
+        The module itself if all of it is on the CPU, else a copy.
+
+    >>> layer = nn.Linear(2, 1)
+    >>> on_cpu(layer) is layer
+    True
+    """
+    if all(each.device.type == "cpu" for each in (*module.parameters(), *module.buffers())):
+        return module
+    return copy.deepcopy(module).cpu()

@@ -9,8 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options
-from semfov.agents.placement import on_cpu
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options, on_cpu
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from semfov.report.curves import table_html
 from semfov.report.episode import Data
 from semfov.report.zoom import LISTED
 from semfov.viz.labels import place_labels
@@ -152,3 +151,20 @@ def _framed(box: Sequence[float]) -> str:
 def _rect(box: Sequence[float], kind: str) -> str:
     x1, y1, x2, y2 = box
     return f'<rect class="{kind}" x="{x1:g}" y="{y1:g}" width="{max(x2 - x1, 0):g}" height="{max(y2 - y1, 0):g}"/>'
+
+
+def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
+    """A table whose first row is its head and whose first column names the rows."""
+    kinds = ["", *[' class="number"'] * (len(rows[0]) - 1)]
+    head = "".join(f'<th scope="col"{kind}>{escape(cell)}</th>' for kind, cell in zip(kinds, rows[0], strict=True))
+    body = "".join(
+        f'<tr><th scope="row">{escape(row[0])}</th>'
+        + "".join(f'<td class="number">{escape(cell)}</td>' for cell in row[1:])
+        + "</tr>"
+        for row in rows[1:]
+    )
+    label = escape(caption)
+    return (
+        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )

@@ -6,7 +6,7 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief import DirichletBelief, TargetEvidence
 from semfov.belief.observers import Semantic, SemanticLook, Target
-from semfov.envs.looks import SceneLooks
+from semfov.envs.cells import SceneLooks
 from semfov.episode import Memory, StoredLooks, attend, rollout
 from semfov.gaze import Given
 from semfov.gaze.acquisition import Uniform
