@@ -186,7 +186,7 @@ class HeadAgent(nn.Module):
             seconds: time in seconds that looks may take on this machine; None for no limit.
             duration: time limit of the scene in seconds, as for `search`.
             on_look: called after each look with the record so far; returning False ends it.
-            worth: least gain for which a look is worth it, as for `explore`.
+            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
             start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
@@ -200,33 +200,18 @@ class HeadAgent(nn.Module):
         """
         indices = class_numbers(target, self.classes[1:], "target")
         limits = self._limits(passes, seconds, on_look)
-        return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
+        views = self.views(scene, color)
+        check_number(worth, "worth", 0, float("inf"))
+        evidence = on_cpu(self.map_evidence)
+        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
+        return self._look(observer, gain, indices, start, limits, duration, seed, worth=worth)
 
-    def explore(
-        self,
-        scene: SceneLike,
-        *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        duration: float = DURATION,
-        on_look: OnLook | None = None,
-        worth: float = 0.0,
-        start: int | None = None,
-        seed: int = 0,
-        color: Color = "rgb",
-    ) -> HeadPath:
+    def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
         """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
-            passes: largest number of looks; None takes 40.
-            seconds: time in seconds that looks may take on this machine; None for no limit.
-            duration: time limit of the scene in seconds, as for `search`.
-            on_look: called after each look with the record so far; returning False ends the exploration.
-            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
-            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
-            seed: of the generator that breaks ties.
-            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
+            options: arguments of `find_all`, except for the target.
 
         Returns:
             The record of the exploration.
@@ -235,26 +220,10 @@ class HeadAgent(nn.Module):
             InputError: an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        limits = self._limits(passes, seconds, on_look)
-        return self._explore(self.views(scene, color), (), start, limits, duration, worth, seed)
+        return self.find_all(scene, None, **options)
 
     def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
         return EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
-
-    def _explore(
-        self,
-        views: Views,
-        targets: tuple[int, ...],
-        start: int | None,
-        limits: EpisodeLimits,
-        duration: float,
-        worth: float,
-        seed: int,
-    ) -> HeadPath:
-        check_number(worth, "worth", 0, float("inf"))
-        evidence = on_cpu(self.map_evidence)
-        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return self._look(observer, gain, targets, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()
     def _look(

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.paths import FoveaMoment, Record
-from semfov.viz.animation import Film, render
+from semfov.viz.animation import Film, film_or_file
 from semfov.viz.drawing import CONFIDENT, Tag, draw_boxes, draw_cross, draw_image, draw_tags, photograph_of
 from semfov.viz.labels import LabelBox
 from semfov.viz.objects import draw_legend, draw_objects, object_entries
-from semfov.viz.style import GAZE, STYLE, TARGET, lay_out, make_figure, only, styled
+from semfov.viz.style import GAZE, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -149,12 +149,7 @@ def animate_looks(
 
         animate_looks(agent.find_all("harbour.tif", "person"), "harbour.gif")
     """
-    from matplotlib import rc_context
-
-    picture = photograph_of(path, image)
-    with rc_context(STYLE):
-        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
-    return film if file is None else film.save(file)[0]
+    return film_or_file(path, _frames(path, photograph_of(path, image)), seconds, hold, file)
 
 
 def _frames(path: Record, image: Tensor) -> Iterator[Figure]:
