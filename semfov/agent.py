@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, cast, get_args
 
 from torch import Tensor, nn
 
-from semfov.agents.fovea import MOST_SHIFTS, FoveaAgent, Start
+from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
 from semfov.agents.limits import EpisodeLimits, OnLook, known_options, only_for, without_none
 from semfov.agents.windows import ZoomAgent, pays
@@ -360,12 +360,11 @@ class ActivePerception(nn.Module):
         only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
-            usual = 30 if passes is None else MOST_SHIFTS
             return self.fovea.search(
                 self._photograph(picture, color),
                 target,
                 EpisodeLimits(**limits),
-                shifts=usual if shifts is None else shifts,
+                shifts=shifts,
                 closer=MOST_CLOSER if closer is None else closer,
                 start=start,
                 seed=seed,
@@ -434,10 +433,8 @@ class ActivePerception(nn.Module):
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
-            usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            record = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
-            return _counting(record, least)
+            return _counting(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
         if kind == "head":
             arguments = without_none(worth=worth, duration=duration, **limits)
             return _counting(self.head.find_all(open_scene(picture, color), targets, **arguments), least)
@@ -497,9 +494,7 @@ class ActivePerception(nn.Module):
         only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
-            usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            shifts = usual if shifts is None else shifts
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
             return _counting(record, least)
         if kind == "head":

@@ -283,15 +283,6 @@ def test_every_look_of_an_agent_is_timed(agent, image):
             assert min(seconds.values()) > 0
 
 
-def test_class_names_are_suggested(agent, image):
-    with pytest.raises(InputError, match="did you mean 'green'"):
-        agent.search(image, "gren")
-    with pytest.raises(InputError, match="target"):
-        agent.search(image, 3)
-    with pytest.raises(InputError, match="start"):
-        agent.search(image, 1, start=48)
-
-
 def test_confirmation_of_a_batch_equals_that_of_each_look():
     grid, generator = Grid(4, 3, SIZE), torch.Generator().manual_seed(0)
     corner = torch.rand(40, 3, 2, generator=generator) * 100
