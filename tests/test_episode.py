@@ -18,7 +18,7 @@ from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from
 from semfov.gaze.policies import KL, NonPredictive, Random
-from tests.small import Coloured
+from tests.small import Coloured, tensors
 
 GRID = Grid(3, 2, (90, 60))
 CELLS = len(GRID)
@@ -334,14 +334,6 @@ def test_live_and_stored_looks_give_the_same_scanpath(kind, target):
             torch.testing.assert_close(mine.scores[row][mine.mask[row]], theirs.scores[row][theirs.mask[row]])
 
 
-def tensors_of(instance):
-    found = []
-    for name in instance.__dataclass_fields__:
-        part = getattr(instance, name)
-        found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
-    return found
-
-
 def observed():
     names = [f"class {number}" for number in range(1, 21)]
     alpha = 0.5 + 4 * rand(21, 2, 21) + 3 * torch.eye(21)[:, None]
@@ -385,7 +377,7 @@ def test_an_episode_in_a_batch_equals_the_episode_alone_to_the_bit(name):
         for one, (step, row) in zip(alone, shared, strict=True):
             for field in ("cell", "fixation", "visited", "values", "next_cell", "next_fixation"):
                 assert torch.equal(getattr(one, field)[0], getattr(step, field)[row]), field
-            for mine, theirs in zip(tensors_of(one.belief), tensors_of(step.belief), strict=True):
+            for mine, theirs in zip(tensors(one.belief), tensors(step.belief), strict=True):
                 assert torch.equal(mine[0], theirs[row])
 
 
@@ -512,7 +504,7 @@ def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
     for one, other in zip(first, again, strict=True):
         for name in ("episodes", "cell", "fixation", "visited", "values"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
-        for mine, theirs in zip(tensors_of(one.belief), tensors_of(other.belief), strict=True):
+        for mine, theirs in zip(tensors(one.belief), tensors(other.belief), strict=True):
             assert torch.equal(mine, theirs)
 
 

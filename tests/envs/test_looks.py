@@ -10,6 +10,7 @@ from semfov.envs.cells import SceneLooks
 from semfov.episode import Memory, StoredLooks, attend, rollout
 from semfov.gaze import Given
 from semfov.gaze.acquisition import Uniform
+from tests.small import tensors
 
 SIZES = [(90, 60), (60, 80), (120, 30)]
 CELLS = 6
@@ -40,12 +41,6 @@ OBSERVERS = {
     "soft": lambda dtype: Semantic(4, footprint="soft", tempering=0.5, memory="closest"),
     "target": lambda dtype: Target(evidence(dtype)),
 }
-
-
-def tensors(belief):
-    found = []
-    belief.map(lambda tensor: found.append(tensor) or tensor)
-    return found
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
