@@ -192,10 +192,10 @@ class _Episode:
         """Number of passes that are left; none after another limit was reached."""
         return self.limits.room(self.passes) if self.limit in (None, "passes") else 0
 
-    def run(self, start: Start, shifts: int | None, usual: int, seed: int) -> tuple[Scanpath, int, Step]:
+    def run(self, start: Start, shifts: int | None, default: int, seed: int) -> tuple[Scanpath, int, Step]:
         """Move the gaze; returns the scanpath, the number of the outcome and the last step."""
         if shifts is None:
-            shifts = usual if self.limits.passes is None else MOST_SHIFTS
+            shifts = default if self.limits.passes is None else MOST_SHIFTS
         check_whole(shifts, "shifts", 0, MOST_SHIFTS)
         first, generator = first_cell(cell_at(start, self.agent.cells), seed, len(self.grid))
         eye, grid = self.agent.eye, self.grid
