@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.episode import Stopwatch
 from semfov.errors import DataError, check
-from semfov.gaze.acquisition import Static
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around
@@ -183,7 +183,7 @@ class HeadRun(SceneRun):
             "ours, blind to time": lambda action: PerSecond(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),
-            "random head and eye": lambda action: Static(torch.zeros(len(views.grid))),
+            "random head and eye": lambda action: Anywhere(views),
             "eye alone": lambda action: Scan(gain, [pose], 1, action),
         }
 
@@ -308,6 +308,22 @@ def scene_answers(views: Views, places: Places, labels: Tensor, classes: int) ->
     overlap |= places.contain(world.centres)
     overlap &= views.reachable
     return overlap.T.float() @ F.one_hot(labels, classes + 1).float() > 0
+
+
+class Anywhere(AcquisitionFunction):
+    """Baseline: a pose of the head and a fixation of the eye, drawn at random.
+
+    Args:
+        views: the possible views and fixations.
+    """
+
+    def __init__(self, views: Views) -> None:
+        super().__init__()
+        self.views = views
+
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """The same value for all actions, `(1, A)`."""
+        return torch.zeros(1, len(self.views.grid))
 
 
 def rests_on(views: Views, action: int, places: Places) -> Tensor:
