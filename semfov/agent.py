@@ -3,14 +3,15 @@
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Literal, Self, cast, get_args
 
 from torch import Tensor, nn
 
-from semfov.agents.fovea import MOST_SHIFTS, FoveaAgent, Start
+from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook, only_for, without_none
+from semfov.agents.limits import EpisodeLimits, OnLook, known_options, only_for, without_none
 from semfov.agents.windows import ZoomAgent, pays
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -22,7 +23,7 @@ from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
-from semfov.detection.load import DetectorLike
+from semfov.detection.load import DetectorLike, load_yolo
 from semfov.detection.scores import HALVES
 from semfov.errors import InputError, SemfovError, check, check_number, check_whole, lookup
 from semfov.eye import Eye
@@ -130,7 +131,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_arguments(name, sigma, growth, grid, context, **options))
+        return cls._of(recommended_arguments, name, sigma, growth, grid, context, **options)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -148,7 +149,7 @@ class ActivePerception(nn.Module):
             DataError: a file is missing or damaged, or the detector is not the one that the models were fitted to.
         """
         folder = open_folder(name)
-        return cls.recommended(fspath(name), **options) if folder is None else cls._of(folder.arguments(**options))
+        return cls.recommended(fspath(name), **options) if folder is None else cls._of(folder.arguments, **options)
 
     @classmethod
     def published(
@@ -183,7 +184,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector or this sensor, or the folder has no observation model.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(published_arguments(name, sensor, search, calibrated, **options))
+        return cls._of(published_arguments, name, sensor, search, calibrated, **options)
 
     @classmethod
     def raw(cls, name: DetectorLike = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
@@ -201,11 +202,14 @@ class ActivePerception(nn.Module):
             InputError: the detector or the sensor is unknown.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(raw_arguments(name, sensor, **options))
+        return cls._of(raw_arguments, name, sensor, **options)
 
     @classmethod
-    def _of(cls, fields: dict[str, Any]) -> Self:
-        """The agent with these parts, ready for use."""
+    def _of(cls, make: Callable[..., dict[str, Any]], /, *given: Any, **options: Any) -> Self:
+        """The agent with the parts that a function makes from the options of a constructor, ready for use."""
+        known = [*signature(make).parameters, *signature(load_yolo).parameters]
+        with known_options(options, known, "the agent or of semfov.load_detector"):
+            fields = make(*given, **options)
         return cls(**fields).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -356,12 +360,11 @@ class ActivePerception(nn.Module):
         only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
-            usual = 30 if passes is None else MOST_SHIFTS
             return self.fovea.search(
                 self._photograph(picture, color),
                 target,
                 EpisodeLimits(**limits),
-                shifts=usual if shifts is None else shifts,
+                shifts=shifts,
                 closer=MOST_CLOSER if closer is None else closer,
                 start=start,
                 seed=seed,
@@ -430,10 +433,8 @@ class ActivePerception(nn.Module):
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
-            usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            record = self.fovea.find_all(image, targets, bounds, shifts=usual if shifts is None else shifts)
-            return _counting(record, least)
+            return _counting(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
         if kind == "head":
             arguments = without_none(worth=worth, duration=duration, **limits)
             return _counting(self.head.find_all(open_scene(picture, color), targets, **arguments), least)
@@ -493,9 +494,7 @@ class ActivePerception(nn.Module):
         only_for(kind, "head", "seconds", duration=duration)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
-            usual = 20 if passes is None else MOST_SHIFTS
             image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
-            shifts = usual if shifts is None else shifts
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
             return _counting(record, least)
         if kind == "head":

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, Scanpath
-from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief import Belief, ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
 from semfov.data.scene import Annotation, Scene
@@ -91,6 +91,13 @@ def context(**weights: tuple[float, float]) -> ContextPrior:
 def beliefs() -> Tensor:
     """Parameters `(2, 12, 4)` of two Dirichlet beliefs."""
     return 0.5 + 3 * rand(2, len(GRID), 4)
+
+
+def tensors(belief: Belief) -> list[Tensor]:
+    """The tensors of a belief."""
+    found: list[Tensor] = []
+    belief.map(lambda tensor: found.append(tensor) or tensor)
+    return found
 
 
 def memory() -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 
-from semfov import ActivePerception, FovealObservationModel, Foveation, Grid
+from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, HeadAgent, ZoomAgent
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.observers import Context, Semantic, Target
 from semfov.decision import confirms
@@ -283,15 +283,6 @@ def test_every_look_of_an_agent_is_timed(agent, image):
             assert min(seconds.values()) > 0
 
 
-def test_class_names_are_suggested(agent, image):
-    with pytest.raises(InputError, match="did you mean 'green'"):
-        agent.search(image, "gren")
-    with pytest.raises(InputError, match="target"):
-        agent.search(image, 3)
-    with pytest.raises(InputError, match="start"):
-        agent.search(image, 1, start=48)
-
-
 def test_confirmation_of_a_batch_equals_that_of_each_look():
     grid, generator = Grid(4, 3, SIZE), torch.Generator().manual_seed(0)
     corner = torch.rand(40, 3, 2, generator=generator) * 100
@@ -350,6 +341,23 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
 def test_invalid_grids_are_refused(grid):
     with pytest.raises(InputError, match=r"^grid: expected"):
         ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "refused"),
+    [
+        (ActivePerception.recommended, {"columns": 12}, r"columns: expected an option of .*; did you mean grid=\?$"),
+        (ActivePerception.from_pretrained, {"sigmas": 50.0}, r"sigmas: .*; did you mean sigma=\?$"),
+        (ActivePerception.published, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
+        (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one$"),
+        (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
+        (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
+        (HeadAgent.recommended, {"grid": (3, 3)}, r"grid: expected an option of semfov.load_detector, got an unknown"),
+    ],
+)
+def test_unknown_options_are_named_with_the_nearest_ones(make, options, refused):
+    with pytest.raises(InputError, match=f"^{refused}"):
+        make("yolov3-tiny", **options)
 
 
 def test_any_of_a_list_of_classes_will_do(agent, image):

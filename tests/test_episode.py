@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-import semfov
 from semfov import FovealObservationModel, Foveation, Grid, InputError
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.evidence import Gathered
@@ -15,11 +14,11 @@ from semfov.belief.observers import Context, Semantic, Target
 from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye
-from semfov.gaze import Choice, Given, Greedy, Relaxed, soft_fixation
+from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
-from semfov.gaze.choice import drawn_by, drawn_from
+from semfov.gaze.choice import drawn_from
 from semfov.gaze.policies import KL, NonPredictive, Random
-from tests.small import Coloured
+from tests.small import Coloured, tensors
 
 GRID = Grid(3, 2, (90, 60))
 CELLS = len(GRID)
@@ -335,14 +334,6 @@ def test_live_and_stored_looks_give_the_same_scanpath(kind, target):
             torch.testing.assert_close(mine.scores[row][mine.mask[row]], theirs.scores[row][theirs.mask[row]])
 
 
-def tensors_of(instance):
-    found = []
-    for name in instance.__dataclass_fields__:
-        part = getattr(instance, name)
-        found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
-    return found
-
-
 def observed():
     names = [f"class {number}" for number in range(1, 21)]
     alpha = 0.5 + 4 * rand(21, 2, 21) + 3 * torch.eye(21)[:, None]
@@ -386,7 +377,7 @@ def test_an_episode_in_a_batch_equals_the_episode_alone_to_the_bit(name):
         for one, (step, row) in zip(alone, shared, strict=True):
             for field in ("cell", "fixation", "visited", "values", "next_cell", "next_fixation"):
                 assert torch.equal(getattr(one, field)[0], getattr(step, field)[row]), field
-            for mine, theirs in zip(tensors_of(one.belief), tensors_of(step.belief), strict=True):
+            for mine, theirs in zip(tensors(one.belief), tensors(step.belief), strict=True):
                 assert torch.equal(mine[0], theirs[row])
 
 
@@ -513,7 +504,7 @@ def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
     for one, other in zip(first, again, strict=True):
         for name in ("episodes", "cell", "fixation", "visited", "values"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
-        for mine, theirs in zip(tensors_of(one.belief), tensors_of(other.belief), strict=True):
+        for mine, theirs in zip(tensors(one.belief), tensors(other.belief), strict=True):
             assert torch.equal(mine, theirs)
 
 
@@ -538,29 +529,6 @@ def test_a_given_scanpath_may_revisit_cells_and_repeats_its_last_cell():
     steps = list(rollout(looks, Semantic(4), Uniform(), cells[:, 0], Given(cells), most=5))
     assert torch.stack([step.cell for step in steps], 1).tolist() == [[0, 3, 0, 0, 0], [4, 4, 1, 1, 1]]
     assert steps[-1].visited.sum(-1).tolist() == [2, 2]
-
-
-def test_noise_drawn_at_each_shift_is_reproducible_by_its_seed():
-    looks = StoredLooks(stored(), GRID)
-
-    def cells(seed):
-        choice = Greedy(drawn_by(torch.Generator().manual_seed(seed), CELLS, looks.like))
-        return torch.stack([step.cell for step in rollout(looks, Semantic(4), Uniform(), START, choice, most=4)])
-
-    assert torch.equal(cells(3), cells(3))
-    assert not torch.equal(cells(3), cells(4))
-
-
-def test_rollout_takes_a_custom_choice():
-    class First(Choice):
-        """The first cell that was not visited."""
-
-        def __call__(self, shift, episodes, values, visited, centres):
-            cell = visited.logical_not().int().argmax(-1)
-            return centres[cell], cell
-
-    steps = list(rollout(StoredLooks(stored(), GRID), Semantic(4), Uniform(), START[1:2], First(), most=50))
-    assert [int(step.cell) for step in steps] == [4, 0, 1, 2, 3, 5]
 
 
 def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
@@ -593,13 +561,6 @@ def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
     assert rows == [rest, rest | {"weigh": 0.0}, rest | {"weigh": 0.0}]
 
 
-def test_every_stage_takes_a_positive_time():
-    eye, view = live()
-    for step in rollout(LiveLooks(eye, view, GRID), Semantic(4), Uniform(), START, Greedy(drawn_from(NOISE)), most=2):
-        assert tuple(step.seconds) == STAGES
-        assert all(0 < seconds < 60 for seconds in step.seconds.values())
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["map", "target"])
 def test_beliefs_have_the_device_and_dtype_of_the_looks(kind, dtype, device):
@@ -614,7 +575,3 @@ def test_beliefs_have_the_device_and_dtype_of_the_looks(kind, dtype, device):
         for tensor in (step.values, step.fixation, step.next_fixation, step.belief.probability(targets)):
             assert tensor.dtype == dtype
             assert tensor.device.type == device.type
-
-
-def test_rollout_is_public():
-    assert semfov.rollout is rollout

@@ -17,7 +17,7 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
 from semfov.live import FovealPerception, FrameRate
-from tests.small import Coloured
+from tests.small import Coloured, tensors
 
 SIZE = (160, 120)
 
@@ -53,12 +53,6 @@ def agent_with(observer, policy=None):
     policy = policy or NonPredictive()
     mapper = Semantic(3) if observer.by_target else observer
     return ActivePerception(eye, (observer, policy), (mapper, Random()), grid=(8, 6)).eval()
-
-
-def tensors(belief):
-    found = []
-    belief.map(lambda tensor: found.append(tensor) or tensor)
-    return found
 
 
 @pytest.mark.parametrize("name", observers())

@@ -11,17 +11,18 @@ from typing import Any
 
 import yaml
 
+from eval.comparison.curves_html import curves_html
 from eval.comparison.replay import replay
 from eval.comparison.run import Run
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
-from semfov.report.curves import curves_html, table_html
+from semfov.paths import Stimulus
 from semfov.report.episode import Data, episode_data
+from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import plain
-from semfov.viz.views import foveated_views
 
 MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""
@@ -107,7 +108,7 @@ def _episodes(run: Run, records: Sequence[ResultRecord]) -> list[Data]:
             break
         index = list(run.scenes.ids).index(record["scene"])
         scene, scanpath = run.scenes[index], replay(run, index, record)
-        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        views = Stimulus.of(run.eye, scene.image).views(scanpath.fixations)
         boxes = None if scanpath.target is None else scene.boxes[scene.labels == scanpath.target]
         name = f"{scene.name}, {record['policy']}"
         data.append(

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
@@ -20,8 +21,8 @@ from semfov.episode import Stopwatch
 from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
-from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
-from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, LookGain, PerSecond, Scan, SearchGain
+from semfov.head.episode import Detect, HeadStep, live, look_around
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, Scan, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Boxes, Flat, Panorama
 from semfov.head.speeds import Speeds
@@ -307,3 +308,46 @@ def scene_answers(views: Views, places: Places, labels: Tensor, classes: int) ->
     overlap |= places.contain(world.centres)
     overlap &= views.reachable
     return overlap.T.float() @ F.one_hot(labels, classes + 1).float() > 0
+
+
+class Anywhere(AcquisitionFunction):
+    """Baseline: a pose of the head and a fixation of the eye, drawn at random.
+
+    Args:
+        views: the possible views and fixations.
+    """
+
+    def __init__(self, views: Views) -> None:
+        super().__init__()
+        self.views = views
+
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """The same value for all actions, `(1, A)`."""
+        return torch.zeros(1, len(self.views.grid))
+
+
+def rests_on(views: Views, action: int, places: Places) -> Tensor:
+    """Which objects overlap the cell that an action fixates.
+
+    A cell and an object overlap if one contains a point of the other. 9 × 9 points spread over each are tested.
+
+    Args:
+        views: the possible views and fixations.
+        action: number of the pose and cell.
+        places: regions that the objects cover.
+
+    Returns:
+        `(M,)`, boolean.
+    """
+    pose, cell = divmod(action, views.cells)
+    edges = views.view_grid.edges[cell]
+    share = torch.linspace(0, 1, 9)
+    y, x = torch.meshgrid(share, share, indexing="ij")
+    inside = edges[:2] + torch.stack([x, y], -1).flatten(0, 1) * (edges[2:] - edges[:2]) - 0.5
+    held = places.contain(views.world.to_scene(inside, views.poses[pose])).any(-1)
+    if bool(held.all()):
+        return held
+    samples = places.samples()
+    points, _ = views.world.to_view(samples.flatten(0, 1), views.poses[pose])
+    within = ((points + 0.5 >= edges[:2]) & (points + 0.5 <= edges[2:])).all(-1)
+    return held | within.view(samples.shape[:2]).any(-1)

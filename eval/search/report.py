@@ -26,10 +26,10 @@ from semfov.errors import DataError
 from semfov.io.files import clean, inside
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance, random_search
+from semfov.paths import Stimulus
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
-from semfov.viz.views import foveated_views
 
 SEARCH_SHIFTS = (1, 5, 10, 15, 30)
 """Gaze shifts at which tables show the cumulative performance."""
@@ -135,7 +135,7 @@ def draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
         index = run.scenes.ids.index(record["scene"])
         scene = run.scenes[index]
         scanpath = replay(run, index, record)
-        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        views = Stimulus.of(run.eye, scene.image).views(scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
         # An id may be any text. Cleaned ids may coincide, so the scene's number is put before them.
         scene_name = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"

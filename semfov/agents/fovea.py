@@ -78,7 +78,7 @@ class FoveaAgent:
         limits: EpisodeLimits,
         *,
         start: Start = None,
-        shifts: int = 30,
+        shifts: int | None = None,
         seed: int = 0,
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
@@ -98,7 +98,7 @@ class FoveaAgent:
             verifier = Verifier(model, places, close_up, at, closer)
         outcome = outcome_of(weights, grid, goal, thresholds, 0.5 if confirm is None else confirm)
         episode = _Episode(self, image, grid, strategy, index, limits, verifier, outcome)
-        scanpath, ended, last = episode.run(start, shifts, seed)
+        scanpath, ended, last = episode.run(start, shifts, 30, seed)
         index = class_meant(last.belief, index)
         scanpath = replace(scanpath, found=OUTCOMES[ended] == "found", target=index)
         if goal is not None:
@@ -124,7 +124,7 @@ class FoveaAgent:
         limits: EpisodeLimits,
         *,
         start: Start = None,
-        shifts: int = 20,
+        shifts: int | None = None,
         seed: int = 0,
         worth: float | None = None,
     ) -> Scanpath:
@@ -137,15 +137,17 @@ class FoveaAgent:
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
             )
         episode = _Episode(self, image, grid, self.exploring, None, limits, None, outcome)
-        scanpath, ended, _ = episode.run(start, shifts, seed)
+        scanpath, ended, _ = episode.run(start, shifts, 20, seed)
         return replace(scanpath, ending="worth") if ended else scanpath
 
-    def find_all(self, image: Tensor, targets: tuple[int, ...], limits: EpisodeLimits, *, shifts: int = 20) -> Scanpath:
+    def find_all(
+        self, image: Tensor, targets: tuple[int, ...], limits: EpisodeLimits, *, shifts: int | None = None
+    ) -> Scanpath:
         """Look for all objects of classes 1..K; none stand for all classes (`ActivePerception.find_all`)."""
         one = targets[0] if len(targets) == 1 else None
         strategy = self.exploring if one is None else self.searching
         episode = _Episode(self, image, self.grid(image), strategy, one, limits, None, None)
-        return replace(episode.run(None, shifts, 0)[0], target=None, targets=targets)
+        return replace(episode.run(None, shifts, 20, 0)[0], target=None, targets=targets)
 
     def grid(self, image: Tensor) -> Grid:
         """The grid of the belief over an image `(1, 3, H, W)`."""
@@ -190,8 +192,10 @@ class _Episode:
         """Number of passes that are left; none after another limit was reached."""
         return self.limits.room(self.passes) if self.limit in (None, "passes") else 0
 
-    def run(self, start: Start, shifts: int, seed: int) -> tuple[Scanpath, int, Step]:
+    def run(self, start: Start, shifts: int | None, default: int, seed: int) -> tuple[Scanpath, int, Step]:
         """Move the gaze; returns the scanpath, the number of the outcome and the last step."""
+        if shifts is None:
+            shifts = default if self.limits.passes is None else MOST_SHIFTS
         check_whole(shifts, "shifts", 0, MOST_SHIFTS)
         first, generator = first_cell(cell_at(start, self.agent.cells), seed, len(self.grid))
         eye, grid = self.agent.eye, self.grid

@@ -2,20 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from inspect import signature
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
-from semfov.agents.placement import on_cpu
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options, on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
-from semfov.detection.load import load_detector
+from semfov.detection.load import load_detector, load_yolo
 from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneBelief, SceneObserver
@@ -80,7 +80,8 @@ class HeadAgent(nn.Module):
             InputError: no models are shipped for a detector of this name.
             DataError: the weights cannot be obtained, or are damaged.
         """
-        eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
+        with known_options(options, signature(load_yolo).parameters, "semfov.load_detector"):
+            eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
         shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
         models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
         for model in models:
@@ -185,7 +186,7 @@ class HeadAgent(nn.Module):
             seconds: time in seconds that looks may take on this machine; None for no limit.
             duration: time limit of the scene in seconds, as for `search`.
             on_look: called after each look with the record so far; returning False ends it.
-            worth: least gain for which a look is worth it, as for `explore`.
+            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
             start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
@@ -199,33 +200,18 @@ class HeadAgent(nn.Module):
         """
         indices = class_numbers(target, self.classes[1:], "target")
         limits = self._limits(passes, seconds, on_look)
-        return self._explore(self.views(scene, color), indices, start, limits, duration, worth, seed)
+        views = self.views(scene, color)
+        check_number(worth, "worth", 0, float("inf"))
+        evidence = on_cpu(self.map_evidence)
+        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
+        return self._look(observer, gain, indices, start, limits, duration, seed, worth=worth)
 
-    def explore(
-        self,
-        scene: SceneLike,
-        *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        duration: float = DURATION,
-        on_look: OnLook | None = None,
-        worth: float = 0.0,
-        start: int | None = None,
-        seed: int = 0,
-        color: Color = "rgb",
-    ) -> HeadPath:
+    def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
         """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
-            passes: largest number of looks; None takes 40.
-            seconds: time in seconds that looks may take on this machine; None for no limit.
-            duration: time limit of the scene in seconds, as for `search`.
-            on_look: called after each look with the record so far; returning False ends the exploration.
-            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
-            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
-            seed: of the generator that breaks ties.
-            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
+            options: arguments of `find_all`, except for the target.
 
         Returns:
             The record of the exploration.
@@ -234,26 +220,10 @@ class HeadAgent(nn.Module):
             InputError: an argument is out of range.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        limits = self._limits(passes, seconds, on_look)
-        return self._explore(self.views(scene, color), (), start, limits, duration, worth, seed)
+        return self.find_all(scene, None, **options)
 
     def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
         return EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
-
-    def _explore(
-        self,
-        views: Views,
-        targets: tuple[int, ...],
-        start: int | None,
-        limits: EpisodeLimits,
-        duration: float,
-        worth: float,
-        seed: int,
-    ) -> HeadPath:
-        check_number(worth, "worth", 0, float("inf"))
-        evidence = on_cpu(self.map_evidence)
-        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return self._look(observer, gain, targets, start, limits, duration, seed, worth=worth)
 
     @torch.inference_mode()
     def _look(

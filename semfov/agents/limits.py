@@ -1,11 +1,18 @@
-"""EpisodeLimits that all agents share: passes of the detector, time on this machine, and what the caller says."""
+"""What agents share: limits of an episode, checks of arguments, and where their parts compute."""
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+from torch import nn
 
 from semfov.errors import InputError, check, check_number, check_whole
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
@@ -16,7 +23,7 @@ OnLook = Callable[[Any], object]
 
 @dataclass(frozen=True)
 class EpisodeLimits:
-    """EpisodeLimits of one episode. It ends at the first one that is reached.
+    """Limits of one episode. It ends at the first one that is reached.
 
     Args:
         passes: largest number of passes of the detector, closer looks included, 1 to 1,000,000; None for no limit.
@@ -87,6 +94,55 @@ def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
             )
 
 
+@contextmanager
+def known_options(options: Collection[str], known: Iterable[str], what: str) -> Iterator[None]:
+    """Raise `InputError` in place of the `TypeError` for an option that the functions called inside do not have.
+
+    Args:
+        options: names of the options that were given.
+        known: names of options that may be meant.
+        what: whose options are passed on, for the message.
+
+    Raises:
+        InputError: one of the options is unknown; the message has the nearest names.
+        TypeError: any other one is not changed.
+
+    >>> with known_options(["gird"], ["grid", "sigma"], "this agent"):
+    ...     (lambda grid: grid)(gird=(12, 8))
+    Traceback (most recent call last):
+    semfov.errors.InputError: gird: expected an option of this agent, got an unknown one; did you mean grid=?
+    """
+    try:
+        yield
+    except TypeError as error:
+        name = next((name for name in options if f"unexpected keyword argument '{name}'" in str(error)), None)
+        if name is None:
+            raise
+        names = list(known)
+        cells = name in ("columns", "rows", "cells") and "grid" in names
+        near = ["grid"] if cells else get_close_matches(name, names, n=3)
+        hint = f"; did you mean {' or '.join(f'{each}=' for each in near)}?" if near else ""
+        raise InputError(f"{name}: expected an option of {what}, got an unknown one{hint}") from None
+
+
 def without_none(**values: Any) -> dict[str, Any]:
     """The arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}
+
+
+def on_cpu(module: _Module) -> _Module:
+    """A module on the CPU, without moving the given one, which other parts of the agent may share.
+
+    Args:
+        module: the module.
+
+    Returns:
+        The module itself if all of it is on the CPU, else a copy.
+
+    >>> layer = nn.Linear(2, 1)
+    >>> on_cpu(layer) is layer
+    True
+    """
+    if all(each.device.type == "cpu" for each in (*module.parameters(), *module.buffers())):
+        return module
+    return copy.deepcopy(module).cpu()

@@ -3,19 +3,19 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from inspect import signature
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook
-from semfov.agents.placement import on_cpu
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options, on_cpu
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
 from semfov.decision import check_thresholds
 from semfov.detection.detections import Detections
-from semfov.detection.load import load_detector
+from semfov.detection.load import load_detector, load_yolo
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_whole
 from semfov.paths.endings import Ending
@@ -94,7 +94,8 @@ class ZoomAgent(nn.Module):
             InputError: no evidence is shipped for a detector of this name.
             DataError: the weights cannot be downloaded, or they are damaged.
         """
-        eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
+        with known_options(options, ["finest", "cut", *signature(load_yolo).parameters], "semfov.load_detector"):
+            eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
         return cls(eye, evidence).eval().requires_grad_(False)
 
@@ -224,28 +225,12 @@ class ZoomAgent(nn.Module):
                     break
         return path.record(ending or ("windows" if evidence is None else "worth"))
 
-    def explore(
-        self,
-        picture: _Picture,
-        *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        on_look: OnLook | None = None,
-        batch: int = 1,
-        worth: float = NEW_OBJECTS,
-        least: float | None = None,
-    ) -> ZoomPath:
-        """Find all objects of all classes; see `find_all`.
+    def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
+        """Find all objects of all classes.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
-            passes: largest number of passes of the detector; None takes 24.
-            seconds: longest time in seconds on this machine.
-            on_look: called after each look with the record so far; returning False ends the exploration.
-            batch: number of windows that are chosen jointly and pass the detector together.
-            worth: the exploration ends when no look is expected to find more new objects than this.
-            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
-                takes 0.3.
+            options: arguments of `find_all`, except for the target.
 
         Returns:
             The looks and the objects.
@@ -254,8 +239,7 @@ class ZoomAgent(nn.Module):
             InputError: an argument does not fit.
             DataError: the file cannot be read.
         """
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
-        return self.find_all(picture, None, batch=batch, worth=worth, least=least, **limits)
+        return self.find_all(picture, None, **options)
 
     def _evidence(self) -> GlimpseEvidence | None:
         """The evidence on the CPU, where the looks are that it reads."""
@@ -310,11 +294,9 @@ def search_windows(
         classes: names of the classes, background first.
         target: class 1..K.
         limits: limits of the search.
-        confirm: probability from which on the target is found: with closer looks, that it is at the place; otherwise,
-            that the picture holds it. None takes the threshold of the evidence.
-        give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
-            of the evidence.
-        closer: largest number of closer looks; 0 decides without them, as does evidence without fitted verification.
+        confirm: probability from which on the target is found, as for `ZoomAgent.search`.
+        give_up: probability that a look shows the target, below which no look is worth a pass.
+        closer: largest number of closer looks.
 
     Returns:
         The looks, the objects of the class, and the decision.

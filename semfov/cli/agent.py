@@ -8,7 +8,8 @@ from typing import Any
 from semfov.agent import ActivePerception
 from semfov.cli.options import AgentOptions
 from semfov.data.classes import class_index
-from semfov.detection.load import check_detector
+from semfov.detection.load import check_detector, detector_name
+from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
 from semfov.sensor.foveation import Foveation
@@ -17,7 +18,14 @@ from semfov.sensor.named import SENSORS
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     """Names of the detector's classes, or None where they are known only after it is loaded."""
-    return check_detector(options.detector) if options.models is None else Manifest.read(options.models).classes
+    if options.models is not None:
+        return Manifest.read(options.models).classes
+    classes, weights = check_detector(options.detector), options.weights
+    own = WEIGHTS.get(detector_name(options.detector))
+    mixed = weights is not None and weights.suffix == ".onnx" and own is not None and not own.file.endswith(".onnx")
+    expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
+    check(not mixed, "weights", expected, weights)
+    return classes
 
 
 def make_agent(options: AgentOptions) -> ActivePerception:

@@ -20,13 +20,13 @@ import torch
 from tqdm import tqdm
 
 from semfov.agent import ActivePerception, How, PictureLike
-from semfov.cli.options import PictureOptions
+from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import ResultsFile, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.sources import embedded_picture
-from semfov.errors import InputError, SemfovError
+from semfov.errors import InputError, SemfovError, check
 from semfov.head.world import World
 from semfov.io.code import package_digest
 from semfov.io.files import write_bytes
@@ -49,11 +49,15 @@ class PictureJob(ABC):
         agent: the agent.
         title: title of the page.
         target: class that is searched for, which an embedded scene must hold; None for none.
+        drawings: figures that looks of a fovea have.
+        every: whether all objects are to be found (`ActivePerception.kind_of_look`).
     """
 
     agent: ActivePerception
     title: str
     target: str | None = None
+    drawings: tuple[Drawing, ...] = ALL_DRAWINGS
+    every = False
 
     def __init__(self, options: Any) -> None:
         self.options: Any = options
@@ -72,6 +76,16 @@ class PictureJob(ABC):
     @abstractmethod
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Look at a picture, with the arguments that all subcommands share, and return the record."""
+
+    def check_drawings(self) -> None:
+        """Raise `InputError` for a named figure that the looks at one of the pictures do not have."""
+        wanted = self.options.draw or ()
+        for source in self.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
+            kind = self.agent.kind_of_look(source.opened("auto"), self.options.how, every=self.every)
+            have = self.drawings if kind == "fovea" else OF_ANY_LOOK
+            missing = ", ".join(name for name in wanted if name not in have)
+            expected = f"{' or '.join(have)} for {source.name}, which is looked at by {kind!r}"
+            check(not missing, "draw", expected, missing)
 
     def outcome(self, number: int) -> PictureOutcome | SemfovError:
         """Look at the picture of this number, and make its text, row and figures; an error is returned, not raised."""
@@ -202,6 +216,7 @@ def look_at_pictures(job: PictureJob) -> int:
     Raises:
         SemfovError: nothing could be looked at.
     """
+    job.check_drawings()
     sources, several = job.sources, job.several
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")

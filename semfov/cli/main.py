@@ -14,7 +14,6 @@ from typing import Any, TextIO
 
 from semfov.cli import help as texts
 from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
-from semfov.cli.words import in_command_words
 from semfov.runs.command import GOES_ON, make_parser, run_command
 from semfov.version import __version__
 
@@ -119,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         usage = command.text.partition("\nusage:")[0]
         make_parser(options, usage, command.positional, program).print_help()
         return 0
-    words = partial(in_command_words, options=[field.name for field in fields(options)])
+    words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
     names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
     with _plain_warnings(words):
         return run_command(command.run, options, command.text, rest, words=words, **names)

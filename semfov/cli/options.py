@@ -17,6 +17,9 @@ Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 """Figures that are drawn unless others are named."""
 
+OF_ANY_LOOK: tuple[Drawing, ...] = ("scanpath", "animation")
+"""Figures of looks of any kind; the others are of a fovea, and `belief_bars` of a search."""
+
 MostCloserLooks = Annotated[int, Range(0, 100)]
 """Largest number of closer looks."""
 
@@ -60,8 +63,9 @@ class PictureOptions(AgentOptions):
         duration: longest time in seconds that eye and head move in a scene (none: 30).
         out: file of results, `.json`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and results.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
-            where), `belief_bars` and `animation`; `none` draws nothing (not given: all but `belief_bars`, if `out` is a
-            folder). If `out` is a file, they are written into a folder of its name.
+            where), `belief_bars` (of a search) and `animation`; `none` draws nothing (not given: all but `belief_bars`,
+            if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are
+            written into a folder of its name.
         report: HTML page to write, in which to step through the looks.
         looks: print every look.
         workers: number of processes that look at several pictures (each takes the memory of a detector).

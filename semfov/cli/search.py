@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, get_args
 
 from semfov.agent import PictureLike
 from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
-from semfov.cli.options import ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
+from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
 from semfov.cli.results import kind_of
 from semfov.cli.sources import PictureSource, start_beside
 from semfov.data.classes import class_index
@@ -25,6 +25,8 @@ class SearchJob(PictureJob):
     Args:
         options: the options.
     """
+
+    drawings = get_args(Drawing)
 
     def __init__(self, options: SearchOptions) -> None:
         check_target(options.target, options)
@@ -59,6 +61,8 @@ class FindJob(PictureJob):
     Raises:
         InputError: an option does not fit.
     """
+
+    every = True
 
     def __init__(self, options: FindOptions) -> None:
         if options.start is not None:

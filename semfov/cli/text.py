@@ -34,7 +34,9 @@ def _headline(record: GazeRecord) -> str:
 
 def decision_text(record: GazeRecord, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    name, probability = record.target_name, f"probability {decision.probability:.2f}"
+    # Beliefs without thresholds are no probabilities in the plain sense, and slices have scores alone.
+    what = {"fovea": "belief", "windows": "score"}[record.how] if record.ending == "detection" else "probability"
+    name, probability = record.target_name, f"{what} {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"
@@ -110,21 +112,18 @@ def regions_lines(scanpath: Scanpath) -> list[str]:
 
 def looks_text(record: GazeRecord) -> str:
     """The looks as a table: where, which part of the picture, what was detected, and how long it took."""
-    width, height = record.size
-    rows = [["look", "at (x, y)", "shows", "detections", "value", "ms"]]
-    for look in record:
-        whole = tuple(look.region) == (0, 0, width, height)
-        rows.append(
-            [
-                str(look.number),
-                f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
-                "the whole picture" if whole else box_text(look.region),
-                detections_in_words(look.detections, record.classes, score=CONFIDENT),
-                "" if look.value is None else f"{look.value:.3f}",
-                "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
-            ]
-        )
-    lines = [f"  {line}" for line in table_lines(rows)]
+    rows = [
+        [
+            str(look.number),
+            f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
+            "the whole picture" if record.is_whole(look.region) else box_text(look.region),
+            detections_in_words(look.detections, record.classes, score=CONFIDENT),
+            "" if look.value is None else f"{look.value:.3f}",
+            "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
+        ]
+        for look in record
+    ]
+    lines = [f"  {line}" for line in table_lines([["look", "at (x, y)", "shows", "detections", "value", "ms"], *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
         lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")

@@ -16,7 +16,7 @@ from semfov.gaze.choice import Greedy, drawn_by
 from semfov.head.belief import SceneBelief, SceneObserver
 from semfov.head.gain import OUT
 from semfov.head.views import Views
-from semfov.head.world import Places, World
+from semfov.head.world import World
 
 Detect = Callable[[int], Detections]
 """Maps an action to its detections, a batch of one with boxes in pixels of the view."""
@@ -182,30 +182,3 @@ def hash_of(numbers: Sequence[int]) -> int:
     import hashlib
 
     return int.from_bytes(hashlib.sha256(repr([*numbers]).encode()).digest()[:8], "big") >> 1
-
-
-def rests_on(views: Views, action: int, places: Places) -> Tensor:
-    """Which objects overlap the cell that an action fixates.
-
-    A cell and an object overlap if one contains a point of the other. 9 × 9 points spread over each are tested.
-
-    Args:
-        views: the possible views and fixations.
-        action: number of the pose and cell.
-        places: regions that the objects cover.
-
-    Returns:
-        `(M,)`, boolean.
-    """
-    pose, cell = divmod(action, views.cells)
-    edges = views.view_grid.edges[cell]
-    share = torch.linspace(0, 1, 9)
-    y, x = torch.meshgrid(share, share, indexing="ij")
-    inside = edges[:2] + torch.stack([x, y], -1).flatten(0, 1) * (edges[2:] - edges[:2]) - 0.5
-    held = places.contain(views.world.to_scene(inside, views.poses[pose])).any(-1)
-    if bool(held.all()):
-        return held
-    samples = places.samples()
-    points, _ = views.world.to_view(samples.flatten(0, 1), views.poses[pose])
-    within = ((points + 0.5 >= edges[:2]) & (points + 0.5 <= edges[2:])).all(-1)
-    return held | within.view(samples.shape[:2]).any(-1)

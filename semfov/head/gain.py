@@ -224,19 +224,3 @@ class Scan(AcquisitionFunction):
         values = torch.full_like(gains, OUT)
         values[rows] = gains[rows]
         return values[None]
-
-
-class Anywhere(AcquisitionFunction):
-    """Baseline: a pose of the head and a fixation of the eye, drawn at random.
-
-    Args:
-        views: the possible views and fixations.
-    """
-
-    def __init__(self, views: Views) -> None:
-        super().__init__()
-        self.views = views
-
-    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """The same value for all actions, `(1, A)`."""
-        return torch.zeros(1, len(self.views.grid))

@@ -71,10 +71,13 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
     if mine and theirs:
         same = mine == theirs or NETWORKS.get(mine, mine) == NETWORKS.get(theirs, theirs)
     if not same:
-        raise InputError(
-            f"detector: the {what} was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
-            f"model for this detector, or use the one it was fitted for"
-        )
+        got, remedy = _describe(detector), "fit a model for this detector, or use the one it was fitted for"
+        if fitted.get("name") == detector.get("name"):
+            known = NETWORKS.get(str(theirs))
+            got = f"the file of {'another network' if known is None else repr(known)} under this name"
+            own = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
+            remedy = own if known is None else f"name the detector {known!r}, with this file as weights="
+        raise InputError(f"detector: the {what} was fitted for {_describe(fitted)}, got {got}; {remedy}")
     check_background(fitted, detector.get("background"), what)
     others = _others(fitted, detector, _ALIKE)
     if others:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.agents.placement import on_cpu
+from semfov.agents.limits import on_cpu
 from semfov.agents.windows import NEW_OBJECTS, ZoomAgent, least_of, window_objects
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import LargePicture, open_large

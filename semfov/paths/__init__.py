@@ -4,9 +4,8 @@ from semfov.paths.base import GazeRecord, Record, RecordedLook, detections_in_wo
 from semfov.paths.endings import Ending
 from semfov.paths.head import HeadPath
 from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
-from semfov.paths.scanpath import Scanpath
+from semfov.paths.scanpath import Scanpath, Trace, trace
 from semfov.paths.stimulus import Stimulus, reduced_copy, sensor_in_words
-from semfov.paths.trace import Trace, trace
 from semfov.paths.windows import ZoomPath
 
 __all__ = [

@@ -98,6 +98,11 @@ class Record(Conversion):
 
     _format: ClassVar[Format]
 
+    def is_whole(self, region: Sequence[float]) -> bool:
+        """Whether a region `(x1, y1, x2, y2)` is the whole picture, up to a pixel."""
+        (x1, y1, x2, y2), (width, height) = region, self.size
+        return x2 - x1 > width - 1 and y2 - y1 > height - 1
+
     @property
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
@@ -145,6 +150,11 @@ class Record(Conversion):
     def confirmed(self) -> Tensor:
         """Which of the objects a closer look or the decision confirmed, `(M,)` boolean."""
         return self._outcome[1]
+
+    @property
+    def confirmable(self) -> bool:
+        """Whether objects can be confirmed: by a decision or by closer looks."""
+        return self.decision is not None or len(self.closer_looks) > 0
 
     @property
     def expected(self) -> dict[str, float]:

@@ -1,8 +1,8 @@
-"""The record of an episode in a photograph: fixations, detections, beliefs and the decision."""
+"""The record of an episode in a photograph: fixations, detections, beliefs and the decision, from its steps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,9 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.detection.objects import Objects
-from semfov.episode import STAGES
+from semfov.belief.observers.base import Observer
+from semfov.detection.objects import LEAST, Objects
+from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
 from semfov.paths.base import GazeRecord
@@ -273,3 +275,103 @@ class Scanpath(GazeRecord):
             "stimulus": stimulus,
             "photograph": shared["photograph"] if stimulus is None else None,
         }
+
+
+class Trace:
+    """Keeps the steps of one episode, and makes scanpaths of them at any time.
+
+    Args:
+        grid: the cells.
+        classes: names of the classes, background first.
+        target: class 1..K that is searched for; None for exploration.
+        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
+            about all classes itself.
+        least: score from which on objects count.
+
+    Attributes:
+        steps: the steps, in order.
+
+    Example::
+
+        trace = Trace(grid, ("background", "cup"), target=1, beside=None)
+        for step in rollout(looks, observer, acquisition, start, choice, most=10):
+            trace.add(step)
+        scanpath = trace.scanpath()
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        classes: tuple[str, ...],
+        target: int | None,
+        beside: Observer | None,
+        least: float = LEAST,
+    ) -> None:
+        self.grid, self.classes, self.target, self.beside, self.least = grid, classes, target, beside, least
+        self.steps: list[Step] = []
+        self._maps: list[Tensor] = []
+        self._belief: Belief | None = None
+
+    def add(self, step: Step) -> None:
+        """Keep a step.
+
+        Args:
+            step: the next step of the episode.
+        """
+        belief = step.belief
+        if self.beside is not None:
+            before = self.beside.start(1, self.grid, step.values) if self._belief is None else self._belief
+            belief = self.beside(before, step.detections, step.fixation, self.grid)
+        self._belief = belief
+        self._maps.append(belief.class_probabilities()[0])
+        self.steps.append(step)
+
+    def scanpath(self) -> Scanpath:
+        """Make the scanpath of the steps so far.
+
+        Returns:
+            The scanpath, without a decision.
+        """
+        steps, target = self.steps, self.target
+        return Scanpath(
+            grid=self.grid,
+            classes=self.classes,
+            target=target,
+            least=self.least,
+            cells=torch.cat([step.cell for step in steps]),
+            fixations=torch.cat([step.fixation for step in steps]),
+            detections=tuple(step.detections for step in steps),
+            probabilities=torch.stack(self._maps),
+            values=torch.stack([step.values[0] for step in steps]),
+            found=False,
+            posterior=None if target is None else torch.stack([step.belief.probability(target)[0] for step in steps]),
+            presence=None if target is None else torch.stack([step.belief.presence(target)[0] for step in steps]),
+            seconds=tuple(step.seconds for step in steps),
+        )
+
+
+def trace(
+    steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
+) -> Scanpath:
+    """Make the scanpath of one episode (`Trace`).
+
+    Args:
+        steps: steps of one episode, from `semfov.episode.rollout`.
+        grid: the cells.
+        classes: names of the classes, background first.
+        target: class 1..K that is searched for; None for exploration.
+        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
+            about all classes itself.
+
+    Returns:
+        The scanpath, without a decision.
+
+    Example::
+
+        steps = rollout(looks, observer, acquisition, start, choice, most=10)
+        scanpath = trace(steps, grid, ("background", "cup"), target=1, beside=None)
+    """
+    episode = Trace(grid, classes, target, beside)
+    for step in steps:
+        episode.add(step)
+    return episode.scanpath()

@@ -173,16 +173,24 @@ class ZoomPath(GazeRecord):
         return "score" if self.unseen is None else "probability"
 
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many are expected in all.
+        """Count the objects, by class where classes were searched for, and say how many are expected.
+
+        That is the number of all objects; where fewer are expected than are counted, it is the number of those counted
+        that are right.
 
         Returns:
-            A phrase such as `41 × person from probability 0.5, about 47 ± 5 in all`.
+            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 in all)`, or `9 × person from probability
+            0.5 (about 8 ± 1 of them right)`.
         """
         text = super().objects_in_words()
         if self.unseen is None:
             return text
         mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
-        return f"{text}, about {mean:.0f} ± {variance**0.5:.0f} in all"
+        of = "in all"
+        if round(mean) < len(self.objects):
+            chances = self.objects.scores.double()
+            mean, variance, of = float(chances.sum()), float((chances * (1 - chances)).sum()), "of them right"
+        return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of})"
 
     def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.

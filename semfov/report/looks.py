@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from semfov.report.curves import table_html
 from semfov.report.episode import Data
 from semfov.report.zoom import LISTED
 from semfov.viz.labels import place_labels
@@ -16,7 +15,7 @@ ABOUT = {
     "detector": "Detector",
     "sensor": "Sensor",
     "passes": "Passes of the detector",
-    "decision": "Decision",
+    "decision": "Outcome",
 }
 """Entries at the head of an episode, by their keys in its data."""
 
@@ -37,11 +36,11 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
     head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'
     looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
     caption = "Windows, numbered in the order of the looks, and objects that were found"
+    confirmed = " Green objects were confirmed by the decision or a closer look." if data["confirmable"] else ""
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
-        f"Click on the number or the border of a window to choose its look. Green objects were confirmed by the "
-        f"decision or a closer look.</p>"
+        f"Click on the number or the border of a window to choose its look.{confirmed}</p>"
         f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data)}</figure>'
         f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
@@ -121,10 +120,11 @@ def _objects(data: Data, count: int) -> str:
     """The table of the objects, most confident first."""
     if not count:
         return "<p>No objects were found.</p>"
-    rows = [["#", "class", "score", "box", "look", "confirmed"]]
+    rows = [["#", "class", "score", "box", "look", *(["confirmed"] if data["confirmable"] else [])]]
     for order, each in enumerate(data["objects"][:LISTED], 1):
-        place, sure = _corners(each["box"]), "yes" if each["confirmed"] else "no"
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), sure])
+        sure = ["yes" if each["confirmed"] else "no"] if data["confirmable"] else []
+        place = _corners(each["box"])
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), *sure])
     caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the look of each box"
     return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
 
@@ -151,3 +151,20 @@ def _framed(box: Sequence[float]) -> str:
 def _rect(box: Sequence[float], kind: str) -> str:
     x1, y1, x2, y2 = box
     return f'<rect class="{kind}" x="{x1:g}" y="{y1:g}" width="{max(x2 - x1, 0):g}" height="{max(y2 - y1, 0):g}"/>'
+
+
+def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
+    """A table whose first row is its head and whose first column names the rows."""
+    kinds = ["", *[' class="number"'] * (len(rows[0]) - 1)]
+    head = "".join(f'<th scope="col"{kind}>{escape(cell)}</th>' for kind, cell in zip(kinds, rows[0], strict=True))
+    body = "".join(
+        f'<tr><th scope="row">{escape(row[0])}</th>'
+        + "".join(f'<td class="number">{escape(cell)}</td>' for cell in row[1:])
+        + "</tr>"
+        for row in rows[1:]
+    )
+    label = escape(caption)
+    return (
+        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )

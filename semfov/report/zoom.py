@@ -112,6 +112,7 @@ def zoom_data(
         "looks": [_look(path, look, view, objects, quality) for look, view in zip(path, views, strict=True)],
         "objects": objects[:DRAWN],
         "count": len(objects),
+        "confirmable": path.confirmable,
     }
 
 
@@ -227,9 +228,8 @@ def _objects(path: Record) -> list[Data]:
 
 def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
-    (x, y), number, (x1, y1, x2, y2) = look.fixation, look.number, look.region
-    width, height = path.size
-    whole = x2 - x1 > width - 1 and y2 - y1 > height - 1
+    (x, y), number, (x1, _, x2, _) = look.fixation, look.number, look.region
+    whole = path.is_whole(look.region)
     magnification = view.across / max(x2 - x1, 1)
     detections = _detections(path, look, view)
     brought = Counter(each["label"] for each in objects if each["look"] == number)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from semfov.errors import DataError, check
 from semfov.io.files import replacing
-from semfov.paths import Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.viz.drawing import photograph_of
 from semfov.viz.fixation import FixationFigure
 from semfov.viz.scanpath import views_of
@@ -133,6 +133,17 @@ def episode_frames(
 
     with rc_context(STYLE):
         return render(figures(), dpi)
+
+
+def film_or_file(
+    record: Record, figures: Iterable[Any], seconds: float, hold: float, file: str | PathLike[str] | None
+) -> Path | Film:
+    """The film of a record, whose frames are figures; with a file it is written there, and the path returned."""
+    from matplotlib import rc_context
+
+    with rc_context(STYLE):
+        film = Film(render(figures), seconds, hold, record.describe())
+    return film if file is None else film.save(file)[0]
 
 
 def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:

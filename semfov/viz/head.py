@@ -16,10 +16,10 @@ from semfov.detection.placement import resize
 from semfov.errors import check
 from semfov.head.scenes import Panorama
 from semfov.paths import HeadPath
-from semfov.viz.animation import Film, render
+from semfov.viz.animation import Film, film_or_file
 from semfov.viz.drawing import draw_image, photograph_of, picture_array
 from semfov.viz.objects import draw_legend, draw_objects, object_entries
-from semfov.viz.style import GAZE, OTHER, STYLE, TARGET, lay_out, make_figure, only, styled
+from semfov.viz.style import GAZE, OTHER, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,12 +139,8 @@ def animate_head(
         path = agent.search(Panorama("street.jpg"), "bicycle")
         animate_head(path, "path.gif")
     """
-    from matplotlib import rc_context
-
     picture = photograph_of(path, None if image is None else as_image(image))
-    with rc_context(STYLE):
-        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
-    return film if file is None else film.save(file)[0]
+    return film_or_file(path, _frames(path, picture), seconds, hold, file)
 
 
 def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:

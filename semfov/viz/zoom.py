@@ -11,11 +11,11 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.paths import FoveaMoment, Record
-from semfov.viz.animation import Film, render
+from semfov.viz.animation import Film, film_or_file
 from semfov.viz.drawing import CONFIDENT, Tag, draw_boxes, draw_cross, draw_image, draw_tags, photograph_of
 from semfov.viz.labels import LabelBox
 from semfov.viz.objects import draw_legend, draw_objects, object_entries
-from semfov.viz.style import GAZE, STYLE, TARGET, lay_out, make_figure, only, styled
+from semfov.viz.style import GAZE, TARGET, lay_out, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,12 +65,11 @@ def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[Labe
     """Draw the windows of looks up to `last` (None: all), numbered; returns the rectangles of the numbers."""
     from matplotlib.patches import Rectangle
 
-    width, height = path.size
     numbers: list[tuple[float, float]] = []
-    room = 0.025 * width
+    room = 0.025 * path.size[0]
     for look in path:
         x1, y1, x2, y2 = look.region
-        if (x2 - x1 > width - 1 and y2 - y1 > height - 1) or (last is not None and look.number > last):
+        if path.is_whole(look.region) or (last is not None and look.number > last):
             continue
         style: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 2.0 if look.number == last else 0.8}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **style))
@@ -150,12 +149,7 @@ def animate_looks(
 
         animate_looks(agent.find_all("harbour.tif", "person"), "harbour.gif")
     """
-    from matplotlib import rc_context
-
-    picture = photograph_of(path, image)
-    with rc_context(STYLE):
-        film = Film(render(_frames(path, picture)), seconds, hold, path.describe())
-    return film if file is None else film.save(file)[0]
+    return film_or_file(path, _frames(path, photograph_of(path, image)), seconds, hold, file)
 
 
 def _frames(path: Record, image: Tensor) -> Iterator[Figure]:

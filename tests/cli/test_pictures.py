@@ -27,7 +27,7 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
                         "--report", tmp_path / "page.html")  # fmt: skip
     assert code == 0
     found = re.search(
-        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, probability [01]\.\d\d\n"
+        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, belief [01]\.\d\d\n"
         r"  \w.*\. \d+ passes in \d+\.\d s\.", printed.out,
     )  # fmt: skip
     assert found
@@ -57,11 +57,33 @@ def test_nothing_is_written_unless_it_is_asked_for(run, photo, tmp_path):
 
 @pytest.mark.parametrize("task", ["search", "explore"])
 def test_only_the_named_figures_are_drawn(run, photo, tmp_path, task):
-    more = ("--target", "red", "--start", 47) if task == "search" else ("--shifts", 1)
-    code, _ = run(task, photo, *more, "--out", tmp_path / "found.json", "--draw", "belief,belief_bars")
+    more, draw = ("--shifts", 1), "belief"
+    if task == "search":
+        more, draw = ("--target", "red", "--start", 47), "belief,belief_bars"
+    code, _ = run(task, photo, *more, "--out", tmp_path / "found.json", "--draw", draw)
     assert code == 0
     wanted = {"belief.png", "belief_bars.png"} if task == "search" else {"map.png"}
     assert {file.name for file in (tmp_path / "found").iterdir()} == wanted
+
+
+@pytest.mark.parametrize(
+    ("words", "refused"),
+    [
+        (
+            ("find", "--draw", "belief"),
+            r"scanpath or animation for \S+a.png, which is looked at by 'windows', got belief",
+        ),
+        (("explore", "--draw", "scanpath,belief_bars"), "views or belief or animation for .* 'fovea', got belief_bars"),
+        (("search", "--target", "red", "--how", "head", "--draw", "views,scanpath"), "by 'head', got views"),
+    ],
+    ids=lambda words: words[0] if isinstance(words, tuple) else "",
+)
+def test_figures_that_the_looks_do_not_have_are_refused_before_the_first_look(run, folder, tmp_path, words, refused):
+    task, *more = words
+    code, printed = run(task, folder, *more, "--out", tmp_path / "out")
+    assert code == 1
+    assert re.search(refused, printed.err)
+    assert (printed.out, (tmp_path / "out").exists()) == ("", False)
 
 
 def test_a_description_is_matched_to_classes_by_word_vectors(run, photo, tmp_path):
@@ -146,24 +168,6 @@ def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp
     assert [each["name"] for each in episodes_of(tmp_path / "page.html")] == ["a.png", "c.png"]
 
 
-def test_an_interrupted_folder_leaves_its_results_and_ends_in_one_line(run, photo, tmp_path, agent, monkeypatch):
-    seen = []
-
-    def stop(*arguments, **options):
-        if seen:
-            raise KeyboardInterrupt
-        seen.append(find_all(*arguments, **options))
-        return seen[0]
-
-    find_all = agent.find_all
-    monkeypatch.setattr(agent, "find_all", stop)
-    code, printed = run("find", photo, photo, "--out", tmp_path / "boxes.json")
-    assert code == 130
-    assert printed.err.splitlines()[-1] == "interrupted"
-    assert len(json.loads((tmp_path / "boxes.json").read_text())["pictures"]) == 1
-    assert written_files(printed) == [str(tmp_path / "boxes.json")]
-
-
 @pytest.fixture
 def folder(photo, tmp_path):
     """Three pictures, each with a red square at another place."""
@@ -198,7 +202,9 @@ def test_a_folder_that_was_interrupted_continues(run, folder, tmp_path, agent, m
     calls.clear()
     stopped = True
     draw = ("--draw", "scanpath")
-    assert run("find", folder, "--out", parts, *draw)[0] == 130
+    code, printed = run("find", folder, "--out", parts, *draw)
+    assert (code, printed.err.splitlines()[-1], len(written_files(printed))) == (130, "interrupted", 3)
+    assert kind != "json" or len(json.loads(parts.read_text())["pictures"]) == 2
     stopped = False
     calls.clear()
     code, printed = run("find", folder, "--out", parts, *draw)

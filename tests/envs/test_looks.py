@@ -5,11 +5,12 @@ import torch
 
 from semfov import Detections, Grid
 from semfov.belief import DirichletBelief, TargetEvidence
-from semfov.belief.observers import Semantic, SemanticLook, Target
-from semfov.envs.looks import SceneLooks
+from semfov.belief.observers import Semantic, Target
+from semfov.envs.cells import SceneLooks
 from semfov.episode import Memory, StoredLooks, attend, rollout
 from semfov.gaze import Given
 from semfov.gaze.acquisition import Uniform
+from tests.small import tensors
 
 SIZES = [(90, 60), (60, 80), (120, 30)]
 CELLS = 6
@@ -40,12 +41,6 @@ OBSERVERS = {
     "soft": lambda dtype: Semantic(4, footprint="soft", tempering=0.5, memory="closest"),
     "target": lambda dtype: Target(evidence(dtype)),
 }
-
-
-def tensors(belief):
-    found = []
-    belief.map(lambda tensor: found.append(tensor) or tensor)
-    return found
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -87,18 +82,6 @@ def test_episodes_in_many_scenes_equal_each_episode_run_alone(kind, dtype):
         count = int(expected.count)
         assert int(seen.count) == count
         assert torch.equal(seen.boxes[0, :count], expected.boxes[0, expected.mask[0]])
-
-
-def test_looks_with_fewer_detections_are_padded_with_detections_in_no_cell():
-    few = SemanticLook(torch.rand(2, 1, 4), torch.ones(2, 1, 6, dtype=torch.bool), torch.zeros(2, 6))
-    many = SemanticLook(torch.rand(1, 3, 4), torch.ones(1, 3, 6, dtype=torch.bool), torch.ones(1, 6))
-    joined = SemanticLook.join([few, many])
-    assert joined.likelihood.shape == (3, 3, 4)
-    assert torch.equal(joined.likelihood[:2, :1], few.likelihood)
-    assert torch.equal(joined.likelihood[2:], many.likelihood)
-    assert joined.footprint.dtype == torch.bool
-    assert not joined.footprint[:2, 1:].any()
-    assert torch.equal(joined.distance, torch.cat([few.distance, many.distance]))
 
 
 def test_put_changes_only_the_given_rows_and_not_the_original_belief():

@@ -5,12 +5,13 @@ from itertools import pairwise
 import pytest
 import torch
 
+from eval.head.run import rests_on
 from semfov.belief.observers import LearnedMap, Target
 from semfov.episode import rollout
 from semfov.errors import InputError
 from semfov.gaze.choice import Given
 from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
-from semfov.head.episode import HeadLooks, live, look_around, rests_on
+from semfov.head.episode import HeadLooks, live, look_around
 from semfov.head.gain import OUT
 
 
@@ -210,6 +211,7 @@ def test_seconds_of_a_path_add_up_those_of_its_movements(views, eye, models):
     assert len({step.action for step in steps}) == len(steps)
 
 
+@pytest.mark.lab
 def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
     """For boxes of the view itself, where cells and boxes are rectangles."""
     boxes = [(10.0, 10.0, 20.0, 20.0), (30.2, 30.3, 30.6, 30.7), (50.0, 0.0, 64.0, 48.0)]

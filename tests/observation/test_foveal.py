@@ -347,10 +347,22 @@ def test_bad_arguments_are_named(call):
 def test_conversions_of_one_checkpoint_count_as_one_detector():
     pair = sorted(digest for digest, name in NETWORKS.items() if name == "yolox-nano")
     check_same_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]}, "model")
-    with pytest.raises(InputError, match="the model was fitted for"):
-        check_same_detector(
-            {"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64}, "model"
-        )
+
+
+@pytest.mark.parametrize(
+    ("digest", "said"),
+    [
+        ("0" * 64, r"got the file of another network under this name; give its own file as weights=, or fit"),
+        (
+            next(digest for digest, name in NETWORKS.items() if name == "nanodet-plus-m-1.5x"),
+            "got the file of 'nanodet-plus-m-1.5x' under this name; name the detector 'nanodet-plus-m-1.5x', with this",
+        ),
+    ],
+)
+def test_the_file_of_another_network_is_named(digest, said):
+    own = next(digest for digest, name in NETWORKS.items() if name == "yolox-nano")
+    with pytest.raises(InputError, match=f"the model was fitted for 'yolox-nano' .*, {said}"):
+        check_same_detector({"name": "yolox-nano", "digest": own}, {"name": "yolox-nano", "digest": digest}, "model")
 
 
 def test_distances_in_pixels_are_refused_with_the_unit():

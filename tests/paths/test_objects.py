@@ -8,9 +8,11 @@ import torch
 
 from semfov import Detections, Grid
 from semfov.decision import CloseUp, Decision
+from semfov.detection import Objects
 from semfov.head import Flat, Panorama, Views
-from semfov.paths import HeadPath
+from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions
+from semfov.zoom import Lattice
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
@@ -83,6 +85,25 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
     assert (rows[0]["x"], rows[0]["y"], rows[0]["look"], rows[0]["confirmed"]) == (60.0, 47.5, 0, False)
     frame = path.to_frame("objects")
     assert frame.to_dict("records") == rows
+
+
+@pytest.mark.parametrize(
+    ("chances", "unseen", "words"),
+    [
+        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 in all)"),
+        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 in all)"),
+        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability 0.5 (about 2 ± 1 of them right)"),
+        ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability 0.5 (about 2 ± 1 of them right)"),
+        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (about 0 ± 0 in all)"),
+    ],
+)
+def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances, unseen, words):
+    """Where fewer are expected in all than are shown, it is told how many of those that are shown are right."""
+    count = len(chances)
+    found = Objects(torch.rand(count, 4), torch.tensor(chances), torch.ones(count).long(), torch.zeros(count).long())
+    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"glances": (), "values": (), "least": 0.5}
+    path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
+    assert path.describe() == f"{words} in 0 passes"
 
 
 def test_looks_are_given_one_by_one():

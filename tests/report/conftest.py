@@ -69,7 +69,8 @@ def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Pa
         scenes=type("Scenes", (list,), {"ids": [7]})([scene]),
     )
     run.config.out.mkdir()
-    monkeypatch.setattr(run_report, "foveated_views", lambda eye, image, fixations: [image] * len(fixations))
+    stimulus = SimpleNamespace(views=lambda fixations: [image] * len(fixations))
+    monkeypatch.setattr(run_report, "Stimulus", SimpleNamespace(of=lambda eye, image: stimulus))
     monkeypatch.setattr(run_report, "replay", lambda run, index, record: scanpath)
     share = np.array([0.0, 0.5, 1.0])
     return run_report.write_run_report(

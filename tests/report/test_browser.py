@@ -137,7 +137,7 @@ def test_the_head_shows_photograph_settings_and_outcome_at_once(opened, hostile)
         "Photograph": hostile,
         "Detector": "none",
         "Sensor": "fovea of 20 px in 640, growth 2",
-        "Decision": f"“{hostile}” found after 2 gaze shifts.",
+        "Outcome": f"“{hostile}” found after 2 gaze shifts.",
     }
     assert opened.locator("#number").inner_text() == "0 of 2"
     opened.locator("#episode").select_option(index=1)

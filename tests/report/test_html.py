@@ -10,9 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from eval.comparison.curves_html import curves_html
 from semfov.decision import Decision
-from semfov.report.curves import curves_html, table_html
 from semfov.report.episode import episode_data
+from semfov.report.looks import table_html
 from semfov.report.page import write_page
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 

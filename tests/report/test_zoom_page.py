@@ -87,6 +87,17 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
     assert "The window of look 1 with 1 detection" in labels
 
 
+@pytest.mark.parametrize("sought", [True, False], ids=["search", "find"])
+def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_path, large_picture, sought):
+    path = zoom_path if sought else replace(zoom_path, decision=None)
+    page = page_html("field", [zoom_data(path, large_picture, name="field")])
+    assert ("Green objects were confirmed" in page) == sought
+    assert ('<th scope="col" class="number">confirmed</th>' in page) == sought
+    (row,) = re.findall(r'<tr><th scope="row">1</th>(?:<td class="number">[^<]*</td>){4,5}</tr>', page)[-1:]
+    assert row.endswith(">yes</td></tr>" if sought else ">1</td></tr>")
+    assert ("confirmed ones green" in path._repr_html_()) == sought
+
+
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
     looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
     assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]

@@ -1,6 +1,5 @@
 """Every figure can be drawn into given axes, and written as PNG, PDF and SVG."""
 
-import inspect
 import re
 from xml.etree import ElementTree as ET
 
@@ -11,23 +10,11 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import Detections, Grid, InputError, viz
+from semfov import InputError, viz
 from semfov.errors import DataError
 from semfov.metrics.calibration import BinarySums
-from tests import small
 
 CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
-
-
-@pytest.fixture
-def scanpath():
-    seen = Detections(
-        torch.tensor([[[10.0, 10, 30, 30], [50, 40, 70, 55]]]),
-        torch.tensor([[[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]]]),
-        torch.ones(1, 2, dtype=torch.bool),
-    )
-    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
-    return small.scanpath(grid, cells, target=2, detections=(seen,) * 3, found=True)
 
 
 def calls(scanpath):
@@ -86,11 +73,6 @@ def test_figures_are_drawn_into_given_axes(name, scanpath):
     if isinstance(place, int):
         with pytest.raises(InputError, match=f"axes: expected {place} axes"):
             function(*arguments, **options, axes=given[:-1])
-
-
-def test_every_function_has_a_parameter_for_axes_or_a_figure():
-    for name in [*NAMES, "plot_zoom_path"]:
-        assert {"ax", "axes", "figure"} & set(inspect.signature(getattr(viz, name)).parameters), name
 
 
 def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):

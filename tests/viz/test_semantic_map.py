@@ -104,7 +104,9 @@ def test_figure_of_marginal_probabilities():
         )
         assert named.images[-1].get_clim() == (0, 1)
         np.testing.assert_allclose(unsure.images[-1].get_array(), cell_entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
+        places = {text.get_text(): text.get_position() for text in named.texts}
         assert sorted(text.get_text() for text in named.texts if text.get_text() in CLASSES) == ["cat", "dog", "dog"]
+        assert places["cat"] in [(x, 15) for x in (15, 25, 35, 45)]  # the middle of one of its cells
 
 
 def test_borders_go_around_regions():

@@ -197,7 +197,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
     number = f"about {sum(path.expected.values()):.0f} ± {variance**0.5:.0f} in all"
-    assert path.describe() == f"{len(path.objects)} objects from probability 0.5, {number} in 4 passes"
+    assert path.describe() == f"{len(path.objects)} objects from probability 0.5 ({number}) in 4 passes"
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eval.comparison.summary import announce, sensing, write_files
+from eval.human.viewing.figures import plot_by_shift, plot_scanpaths_beside
 from eval.human.viewing.rows import MEASURES, PEOPLE, Half, Scored
 from eval.human.viewing.run import ViewingRun
 from eval.human.viewing.sequences import drawn_scanpaths
@@ -130,8 +131,6 @@ def sequences_csv(sequences: Mapping[str, _Array]) -> str:
 
 def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
     """Draw NSS after each gaze shift, for rows with habits."""
-    from semfov.viz.human import plot_by_shift
-
     names = [
         "nearby",
         *run.config.models,
@@ -154,8 +153,6 @@ def draw_shifts(run: ViewingRun, scored: _Table) -> Path:
 
 def draw_viewings(run: ViewingRun, scored: _Table, reported: Half) -> list[Path]:
     """Draw scanpaths of four people, of `landing` and of `nearby` in the same pictures."""
-    from semfov.viz.human import plot_scanpaths_beside
-
     written = []
     for place, index in enumerate(reported.pictures[: run.config.drawings]):
         name = str(run.scenes.ids[index])

@@ -1,8 +1,8 @@
-"""Curves and tables as HTML, in the colours of the page."""
+"""Curves over gaze shifts as an SVG, in the colours of the page of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 
 import numpy as np
@@ -68,26 +68,6 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">{"".join(shapes)}</svg>'
         f'<ul class="legend">{legend}</ul></div>'
     )
-
-
-def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
-    """A table whose first row is its head and whose first column names the rows."""
-    head = "".join(f'<th scope="col"{_number(n)}>{escape(cell)}</th>' for n, cell in enumerate(rows[0]))
-    body = "".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>'
-        + "".join(f'<td class="number">{escape(cell)}</td>' for cell in row[1:])
-        + "</tr>"
-        for row in rows[1:]
-    )
-    label = escape(caption)
-    return (
-        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
-        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-    )
-
-
-def _number(column: int) -> str:
-    return ' class="number"' if column else ""
 
 
 def _line(order: int, count: int) -> str:
