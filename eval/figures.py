@@ -29,7 +29,7 @@ from semfov.gaze.policies import KL, Predictive
 from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.gaze.selection import select_fixation
 from semfov.observation.matching import box_iou
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
 from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import open_at_reference
@@ -345,10 +345,7 @@ FIGURES: dict[str, Callable[[Example], Figure | None]] = {
 """The figures by their labels in the source of the paper."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(figures, FiguresConfig, __doc__, arguments)
-
+main = command(figures, FiguresConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,7 +13,7 @@ Detections are computed once and shared by all experiments. To continue a stoppe
 
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,7 +49,7 @@ from eval.search import search
 from eval.search.config import SearchConfig
 from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from semfov.runs.presets import label
 from semfov.runs.workers import shared_processes
 
@@ -193,10 +193,7 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
 """Tables of one experiment."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(results, ResultsConfig, __doc__, arguments)
-
+main = command(results, ResultsConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -11,16 +11,14 @@ give the same command again.
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.comparison.summary import Curve, collect_records
 from eval.explore.config import ExploreConfig
 from eval.explore.report import success
@@ -40,13 +38,13 @@ from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.presence import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
-from semfov.runs.command import run_command
-from semfov.runs.config import DataConfig, ProtocolConfig, ScenesConfig, SensorConfig
+from semfov.runs.command import command
+from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
-from semfov.runs.setup import plain
 from semfov.runs.tables import percent, table
 
 
@@ -84,7 +82,7 @@ _SCORE, _OVERLAP = 0.1, 0.5
 
 
 @dataclass(frozen=True)
-class SensorsConfig(ScenesConfig):
+class SensorsConfig(LookingConfig):
     """Compare sensors, each with models of its own.
 
     Args:
@@ -134,7 +132,7 @@ def compare_sensors(config: SensorsConfig) -> None:
     head += [f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS]
     text = "\n".join(table([head, *rows])) + "\n"
     write_text(config.out / "summary.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     print(text)
 
 
@@ -210,7 +208,7 @@ def _evidence(config: SensorsConfig, name: str) -> Path:
     return file
 
 
-def _curves(run: Run, name: str, measure: Any) -> dict[str, Curve]:
+def _curves(run: PolicyLooking, name: str, measure: Any) -> dict[str, Curve]:
     """Finish a run, and average its records."""
     finish(run, name)
     curves: dict[str, Curve] = measure(collect_records(run)[0])
@@ -291,10 +289,7 @@ def cost(eye: Eye, image: Tensor, looks: int = 12) -> tuple[int, float]:
         return len(canvases) * canvases.shape[-2] * canvases.shape[-1], min(seconds)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(compare_sensors, SensorsConfig, __doc__, arguments)
-
+main = command(compare_sensors, SensorsConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -14,17 +14,12 @@ Use the prior with `--policies [target-evidence] --belief.context both` and
 """
 
 import sys
-from collections.abc import Sequence
 
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from train.context.fit import fit_context
 from train.context.settings import FitContextConfig
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_context, FitContextConfig, __doc__, arguments)
-
+main = command(fit_context, FitContextConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

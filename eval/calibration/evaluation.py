@@ -1,9 +1,8 @@
 """How well scores, and beliefs about a target, agree with the annotated objects."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import torch
-import yaml
 
 import semfov
 from eval.calibration.beliefs import COUNTS, BeliefCalibrationRun
@@ -16,7 +15,7 @@ from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, ProtocolConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import make_observation, plain
+from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
@@ -40,7 +39,7 @@ def judge_scores(config: CalibrationConfig) -> None:
     predictions = {"raw": samples.scores, "calibrated": calibrated}
     text = "\n".join(calibration_table(model, predictions, samples)) + "\n"
     write_text(config.out / "calibration.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     figure = plot_reliability({name: (p, samples.labels) for name, p in predictions.items()})
     written = [config.out / "calibration.md", config.out / "config.yaml"]
     announce(text, [*written, save_figure(figure, config.out / "reliability.png")])

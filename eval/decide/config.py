@@ -1,18 +1,17 @@
 """Settings of decisions."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Self
 
-from eval.search.config import SearchConfig
 from semfov.decision import MOST_CLOSER
 from semfov.model_folder import ModelFolder
-from semfov.runs.config import PolicyConfig, ProtocolConfig, ScenesConfig
+from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.settings import Range, Share
 
 
 @dataclass(frozen=True)
-class DecideConfig(ScenesConfig):
+class DecideConfig(RunConfig):
     """Search for present and for absent classes, each until a decision.
 
     Args:
@@ -32,21 +31,14 @@ class DecideConfig(ScenesConfig):
             verification.
     """
 
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    unused = ("saliency", "policies")
+    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
     confirm: Share | None = None
     give_up: Share | None = None
     place: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     verification: str | None = None
     out: Path = Path("runs/decide")
-    models: Path | None = None
-
-
-@dataclass(frozen=True)
-class DecisionConfig(DecideConfig, SearchConfig):
-    """Searches that end in a decision. `policies` is ignored."""
-
-    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
 
     def complete(self, folder: ModelFolder) -> Self:
         """The settings with the folder's model of verification, if its agent uses one and none is given explicitly."""

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.comparison.telling import class_frequencies
-from eval.decide.config import DecisionConfig
+from eval.decide.config import DecideConfig
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
@@ -22,16 +21,16 @@ from semfov.belief.verification import Verification
 from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
-from semfov.errors import InputError, check
+from semfov.errors import check
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
-from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.looks import BoxKey, photograph_looks
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import choose_classes, search_steps
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_observation, make_verification
+from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.strategy import Strategy
 
 _Rule = Callable[[Step, int, Grid], Tensor]
@@ -48,7 +47,7 @@ GAZE_SCORE = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
 
 
-class DecisionRun(Run):
+class DecisionRun(PolicyLooking):
     """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
 
     The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
@@ -60,9 +59,9 @@ class DecisionRun(Run):
     """
 
     task: Task = "search"
-    config: DecisionConfig
+    config: DecideConfig
 
-    def __init__(self, config: DecisionConfig) -> None:
+    def __init__(self, config: DecideConfig) -> None:
         context = config.belief.context
         check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
         # The key of the run, which the base makes first, depends on this model.
@@ -74,7 +73,7 @@ class DecisionRun(Run):
         self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
         # The shipped model was fitted with the shipped evidence.
         if config.closer and (config.verification or config.belief.target_model is None):
-            self.verification = make_verification(config.verification, self.eye)
+            self.verification = if_shipped(partial(make_learned, Verification), config.verification, self.eye)
         self.verified = {AGENT, RANDOM} if self.verification is not None else set()
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
@@ -84,7 +83,7 @@ class DecisionRun(Run):
             **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
             RANDOM: (random, self._by_thresholds),
         }
-        model = self._published()
+        model = if_shipped(make_observation, config.belief.model, self.eye)
         if model is not None:
             self.models = replace(self.models, observation=model)
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
@@ -112,16 +111,6 @@ class DecisionRun(Run):
         return Verifier(
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
         )
-
-    def _published(self) -> FovealObservationModel | None:
-        """The observation model of the settings or of the eye; None if the settings name none and none is shipped."""
-        name = self.config.belief.model
-        try:
-            return make_observation(name, self.eye)
-        except InputError:
-            if name is not None:
-                raise
-            return None
 
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.explore.config import ExploreConfig
 from eval.explore.references import sharp_maps
 from semfov.episode import Stopwatch, StoredLooks
@@ -19,10 +18,11 @@ from semfov.runs.exploration_protocol import (
     explore_noise,
     run_explorations,
 )
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 
 
-class ExploreRun(Run):
+class ExploreRun(PolicyLooking):
     """Scene exploration."""
 
     task: Task = "exploration"

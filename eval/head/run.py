@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
@@ -34,7 +35,7 @@ from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
-from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
+from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore
 
 OURS = "ours"
@@ -108,10 +109,8 @@ class HeadRun(SceneRun):
         check(0 < config.prior < 1, "prior", "a probability above 0 and below 1", config.prior)
         self.eye = make_eye(config.detector, SensorConfig())
         self.fovea = SensorConfig().fovea
-        self.target_evidence, self.map_evidence = (
-            make_target_evidence(None, self.eye),
-            make_map_evidence(None, self.eye),
-        )
+        self.target_evidence = make_learned(TargetEvidence, None, self.eye)
+        self.map_evidence = make_learned(MapEvidence, None, self.eye)
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
             raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")

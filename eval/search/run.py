@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import torch
 
-from eval.comparison.run import Run
 from eval.search.config import SearchConfig
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
 
 
-class SearchRun(Run):
+class SearchRun(PolicyLooking):
     """Visual search."""
 
     task: Task = "search"

@@ -16,7 +16,7 @@ from semfov.belief import ContextPrior
 from semfov.belief.look_features import highest_score
 from semfov.errors import DataError, check
 from semfov.io.files import clean, inside
-from semfov.runs.config import ContextKind, PolicyConfig, ProtocolConfig, ScenesConfig
+from semfov.runs.config import ContextKind, LookingConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Seed, Share, Weight
@@ -27,7 +27,7 @@ _SHIFTS = (1, 3, 5, 10, 30)
 
 
 @dataclass(frozen=True)
-class WordsConfig(ScenesConfig):
+class WordsConfig(LookingConfig):
     """Search without context, with context counted from annotations, and with context from tables, each with a control.
 
     Args:
@@ -71,7 +71,7 @@ def words(config: WordsConfig) -> None:
     """Run all arms, and write and print their results and differences."""
     check(config.context != "none", "context", "place, cooccurrence or both", config.context)
     arms = arms_of(config)
-    settings = {each.name: getattr(config, each.name) for each in fields(ScenesConfig)}
+    settings = {each.name: getattr(config, each.name) for each in fields(LookingConfig)}
     run = WordsRun(SearchConfig(**settings, protocol=config.protocol, policies=tuple(arms.values()), scanpaths=0))
     finish(run, "searching")
     records, seconds = collect_records(run)

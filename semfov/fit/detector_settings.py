@@ -8,11 +8,11 @@ from semfov.errors import InputError
 from semfov.fit.evidence import FitSearchConfig
 from semfov.fit.map import FitMapConfig
 from semfov.fit.observation import FitObservationConfig
-from semfov.fit.settings import FovealFitConfig
+from semfov.fit.settings import FitConfig
 from semfov.fit.tempering import FitTemperingConfig
 from semfov.fit.verification import FitVerificationConfig
 from semfov.fit.windows import FitZoomConfig
-from semfov.runs.config import DetectorConfig, WorkConfig
+from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
 FEW = 8
@@ -25,7 +25,7 @@ _FOR_MOSAICS = 360
 
 
 @dataclass(frozen=True)
-class FitDetectorConfig(FovealFitConfig, WorkConfig):
+class FitDetectorConfig(FitConfig):
     """Fit all models that the agent needs to your own detector.
 
     Args:
@@ -49,6 +49,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
     """
 
+    unused = ("name",)
     model: Path | None = None
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     columns: Side = 10

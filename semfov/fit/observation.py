@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 import torch
-import yaml
 from torch import Tensor
 
 from semfov.data.scene import Scenes
@@ -19,7 +18,7 @@ from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.fit.misses import count_misses
 from semfov.fit.outputs import model_path
-from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.fit.settings import FitConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
@@ -27,10 +26,8 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.config import WorkConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
-from semfov.runs.setup import plain
 from semfov.runs.tables import csv_text, table
 from semfov.runs.zoom_samples import MosaicSettings
 from semfov.version import __version__
@@ -40,7 +37,7 @@ from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
-class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
+class FitObservationConfig(FitConfig):
     """Fit p(scores | class, distance to the fovea) on photographs with boxes.
 
     Args:
@@ -259,7 +256,7 @@ def write_report(
     text = report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
     print(text)
     write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     write_text(config.out / "manifest.json", json.dumps(fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
     write_text(config.out / "counts.csv", counts_csv(model))

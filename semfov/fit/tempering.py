@@ -14,9 +14,8 @@ from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
 from semfov.fit.outputs import write_outputs
-from semfov.fit.settings import FovealFitConfig
+from semfov.fit.settings import FitConfig
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.config import WorkConfig
 from semfov.runs.progress import track
 from semfov.runs.samples import Sampler, Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
@@ -25,7 +24,7 @@ from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
-class FitTemperingConfig(FovealFitConfig, WorkConfig):
+class FitTemperingConfig(FitConfig):
     """Find the exponent of the likelihoods.
 
     Args:
@@ -47,6 +46,7 @@ class FitTemperingConfig(FovealFitConfig, WorkConfig):
         cache: folder for the labelled detections (None: `out`).
     """
 
+    unused = ("name",)
     calibrated: bool = False
     footprint: Footprint = "box_centre"
     exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)

@@ -16,13 +16,13 @@ from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
-from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.fit.settings import FitConfig
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Positive, Range, Share, Side
-from semfov.runs.setup import make_eye, make_scenes, make_target_evidence
+from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
 from semfov.runs.tables import mean_or_dash, share, table
 
@@ -47,7 +47,7 @@ SearchEnd = tuple[bool | None, int]
 
 
 @dataclass(frozen=True)
-class FitVerificationConfig(FovealFitConfig, NameConfig):
+class FitVerificationConfig(FitConfig):
     """Fit the verification of targets.
 
     Args:
@@ -70,6 +70,7 @@ class FitVerificationConfig(FovealFitConfig, NameConfig):
         cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
+    unused = ("workers", "scheduler")
     data: DataConfig = field(default_factory=DataConfig)
     target_model: str | None = None
     fitted: Count | None = None
@@ -158,7 +159,7 @@ class VerificationResult:
 def fit_verification(config: FitVerificationConfig) -> None:
     """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
     eye = make_eye(config.detector, config.sensor)
-    evidence = make_target_evidence(config.target_model, eye)
+    evidence = make_learned(TargetEvidence, config.target_model, eye)
     scenes = make_scenes(config.data, eye.detector.classes)
     left_out = set()
     if config.fitted is not None:

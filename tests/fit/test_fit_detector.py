@@ -16,7 +16,7 @@ from scipy import stats
 import semfov
 from eval.comparison.model_folder import with_models
 from eval.decide import main as decide
-from eval.decide.config import DecisionConfig
+from eval.decide.config import DecideConfig
 from eval.explore.config import ExploreConfig
 from eval.search import main as search
 from eval.search.config import SearchConfig
@@ -327,7 +327,7 @@ def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
     agent = ActivePerception.from_pretrained(folder)
     assert agent.verification is None
     assert isinstance(agent.searching.observer, Target)
-    assert with_models(DecisionConfig(models=folder)).verification is None
+    assert with_models(DecideConfig(models=folder)).verification is None
     assert command(["search", str(home / "photographs/0.png"), "--target", "red", "--models", str(folder)]) == 0
 
 
@@ -335,8 +335,8 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, used=True)
     file = str(folder / "verification.safetensors")
-    assert with_models(DecisionConfig(models=folder)).verification == file
-    assert with_models(DecisionConfig(models=folder, verification="other")).verification == "other"
+    assert with_models(DecideConfig(models=folder)).verification == file
+    assert with_models(DecideConfig(models=folder, verification="other")).verification == "other"
     given = ["--models", str(folder), "--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
     out = tmp_path / "decide"
     assert decide([*data(home), *given, "--out", str(out), "--cache", str(home / "cache")]) == 0

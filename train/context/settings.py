@@ -9,13 +9,12 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes, legal_targets
-from semfov.fit.settings import FovealFitConfig
-from semfov.runs.config import WorkConfig
+from semfov.fit.settings import FitConfig
 from semfov.runs.settings import Count, Positive, Range, Share, Side, SingleName, Weight, Whole
 
 
 @dataclass(frozen=True)
-class FitContextConfig(FovealFitConfig, WorkConfig):
+class FitContextConfig(FitConfig):
     """Fit the context of searches.
 
     Args:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import BeliefConfig, PoliciesConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.settings import Count, Positive, Range, Settings
 
 
@@ -28,7 +28,7 @@ class ScreenConfig(Settings):
 
 
 @dataclass(frozen=True)
-class PeopleSearchConfig(PoliciesConfig):
+class PeopleSearchConfig(RunConfig):
     """Comparison of people, models and policies that search for the same targets in the same pictures.
 
     Args:
@@ -49,6 +49,7 @@ class PeopleSearchConfig(PoliciesConfig):
         store: keep detections on disk.
     """
 
+    unused = ("data", "models")
     people: Path = Path("human_scanpaths")
     files: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()

@@ -6,9 +6,6 @@ import json
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
-
-import yaml
 
 from eval.comparison.summary import announce, write_texts
 from eval.human.search.config import PeopleSearchConfig
@@ -16,7 +13,6 @@ from eval.human.search.scores import DIMENSIONS, Beside
 from semfov.data.fixations import Fixations, write_table
 from semfov.io.code import commit
 from semfov.io.files import clean, sha256
-from semfov.runs.setup import plain
 from semfov.runs.tables import csv_text, table
 from semfov.version import __version__
 from semfov.viz.style import save_figure
@@ -44,7 +40,7 @@ def people_report(
         "summary.md": summary,
         "summary.csv": _csv(tables),
         "curves.csv": _curves(tables),
-        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
+        "config.yaml": config.yaml(),
         "manifest.json": json.dumps(_manifest(config), indent=2) + "\n",
     }
     written = write_texts(out, files)

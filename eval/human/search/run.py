@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from eval.comparison.run import Run
 from eval.human.search.config import PeopleSearchConfig
 from eval.human.search.screens import Screens
 from eval.human.search.trials import goal_rectangle, read_searches
@@ -14,11 +13,12 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Episode, looks_of, run_episodes, tie_noise
 
 
-class PeopleSearchRun(Run):
+class PeopleSearchRun(PolicyLooking):
     """Searches for the targets of people, one screen after the other."""
 
     task: Task = "search"

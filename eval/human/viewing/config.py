@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import PoliciesConfig, PolicyConfig, SaliencyConfig, SaliencyModel
+from semfov.runs.config import PolicyConfig, RunConfig, SaliencyConfig, SaliencyModel
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole
 
 
@@ -43,7 +43,7 @@ class DensityConfig(Settings):
 
 
 @dataclass(frozen=True)
-class ViewingConfig(PoliciesConfig):
+class ViewingConfig(RunConfig):
     """Comparison of people and policies that view the same pictures without a task.
 
     Args:
@@ -69,7 +69,7 @@ class ViewingConfig(PoliciesConfig):
     """
 
     people: Path = Path("fixations.json")
-    data: PicturesConfig = field(default_factory=PicturesConfig)
+    data: PicturesConfig = field(default_factory=PicturesConfig)  # type: ignore[assignment]
     saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture"))
     density: DensityConfig = field(default_factory=DensityConfig)
     policies: tuple[str | PolicyConfig, ...] = (
@@ -81,7 +81,7 @@ class ViewingConfig(PoliciesConfig):
         "expected-gain-learned",
         "objects-calibrated",
     )
-    models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")
+    models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")  # type: ignore[assignment]
     swap: bool = False
     sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "kl-calibrated", "landing")
     files: tuple[Path, ...] = ()

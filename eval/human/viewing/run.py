@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from eval.comparison.run import Run
 from eval.human.viewing.config import ViewingConfig
 from eval.human.viewing.follow import FineLooks, MapStore, evaluate_along
 from eval.human.viewing.raster import Events, enlarged, events_of
@@ -29,6 +28,7 @@ from semfov.gaze.policies import ObjectSeeking, Task
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.scene_run import digest_of, store_folder
@@ -43,7 +43,7 @@ def read_people(path: Path) -> list[Fixations]:
     return read_table(path) if path.suffix == ".csv" else read_osie(path)
 
 
-class ViewingRun(Run):
+class ViewingRun(PolicyLooking):
     """Free viewing, one picture after the other: computes the maps of policies along people's scanpaths."""
 
     task: Task = "exploration"
