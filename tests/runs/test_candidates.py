@@ -112,13 +112,14 @@ def test_saliency_does_not_change_which_models_a_policy_needs():
 def loaded(monkeypatch):
     """The models that a run loads, as pairs of kind and name."""
     loaded = []
-    for kind in ("observation", "target_evidence", "map_evidence", "context"):
 
-        def make(name, eye, kind=kind):
-            loaded.append((kind, name))
-            return kind
+    def make(kind, name):
+        loaded.append((kind, name))
+        return kind
 
-        monkeypatch.setattr(candidates, f"make_{kind}", make)
+    for kind in ("observation", "context"):
+        monkeypatch.setattr(candidates, f"make_{kind}", lambda name, eye, kind=kind: make(kind, name))
+    monkeypatch.setattr(candidates, "make_learned", lambda kind, name, eye: make(kind, name))
     return loaded
 
 
@@ -128,8 +129,8 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
     assert loaded == []
     learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
-    assert load_models(learned, "exploration", eye) == Models(map="map_evidence")
-    assert loaded == [("map_evidence", "everything")]
+    assert load_models(learned, "exploration", eye) == Models(map=MapEvidence)
+    assert loaded == [(MapEvidence, "everything")]
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
     every = SearchConfig(
@@ -137,12 +138,8 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
         belief=BeliefConfig(model="mine", target_model="sought", context_model="cooccurrence"),
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", "target_evidence", {"cooccurrence": "context"})
-    assert sorted(loaded) == [
-        ("context", "cooccurrence"),
-        ("observation", "mine"),
-        ("target_evidence", "sought"),
-    ]
+    assert models == Models("observation", TargetEvidence, {"cooccurrence": "context"})
+    assert set(loaded) == {("context", "cooccurrence"), ("observation", "mine"), (TargetEvidence, "sought")}
 
 
 def test_context_is_loaded_when_a_policy_or_the_run_uses_it(loaded):

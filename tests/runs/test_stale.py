@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval.comparison import run as run_module
 from eval.search import main
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
 from semfov.errors import InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
-from semfov.runs import scene_run
+from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import finish, gather
@@ -75,7 +74,7 @@ def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, 
         chosen = replace(config, policies=(PolicyConfig("own-of-a-test"),))
         key = SearchRun(chosen).key
         assert SearchRun(chosen).key == key
-        monkeypatch.setattr(run_module, "class_digest", lambda kind: "changed")
+        monkeypatch.setattr(policy_looking, "class_digest", lambda kind: "changed")
         assert SearchRun(chosen).key != key
         assert SearchRun(config).settings_key != SearchRun(chosen).settings_key
     finally:
