@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from os import fspath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from semfov.fit.comparison import Difference
-from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.base import PartResult
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking
 from semfov.runs.tables import percent, table
+
+if TYPE_CHECKING:
+    from semfov.fit.detector_settings import FitDetectorConfig
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
@@ -76,7 +78,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
 def detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, PartResult], seconds: float) -> str:
     """Write the report as Markdown."""
     photographs = len(run.scenes)
-    holdout = config.observation.holdout
+    holdout = config.holdout or 5
     held_out = [index for index in range(photographs) if index % holdout == 0]
     counts = class_counts(run, (index for index in range(photographs) if index % holdout))
     rows = [["part", "used", "result on held-out photographs"]]

@@ -25,13 +25,13 @@ from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
+from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
-from semfov.fit.parts.verification import VerificationFit, scores
-from semfov.fit.verification import VerifiedSearch
+from semfov.fit.verification import VerificationFit, VerifiedSearch, scores
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
@@ -163,14 +163,14 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
-    "windows": "fit_mosaics",
+    "parts.windows": "fit_mosaics",
 }
 
 
 def forbid(monkeypatch, *parts):
     """Make the fit of parts fail."""
     for part in parts:
-        monkeypatch.setattr(f"semfov.fit.parts.{part}.{FITS[part]}", None)
+        monkeypatch.setattr(f"semfov.fit.{part}.{FITS[part]}", None)
 
 
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
@@ -364,7 +364,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.parts.verification.fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.verification.fit_in_folds", fail)
     assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
@@ -536,5 +536,6 @@ def test_fitting_uses_targets_of_all_sizes():
     config = FitDetectorConfig(model=Path("a.onnx"), data=DataConfig(max_target_area=0.1)).named()
     assert config.data.max_target_area is None
     assert config.detector.background is None
-    assert config.evidence(3).absent == 2
-    assert config.evidence(80).absent is None
+    for classes, absent in ((("cat", "cup", "dog"), 2), (COCO_CLASSES, None)):
+        run = SimpleNamespace(scenes=EmbeddedScenes(classes, count=2))
+        assert PartInputs(config, run).absent == absent

@@ -15,8 +15,7 @@ from semfov.belief.observers import LearnedMap
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
 from semfov.fit.examples import ExampleLooks
-from semfov.fit.map import FitMapConfig, frequencies, map_objective, train_gain, train_map
-from semfov.fit.map_examples import make_map_examples
+from semfov.fit.map import FitMapConfig, frequencies, make_map_examples, map_objective, train_gain, train_map
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
 from tests.small import scattered

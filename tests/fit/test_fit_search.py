@@ -22,10 +22,10 @@ from semfov.fit.evidence import (
     choose_thresholds,
     evidence_objective,
     judge_evidence,
+    make_examples,
     searches,
     train_evidence,
 )
-from semfov.fit.evidence_examples import make_examples
 from semfov.fit.examples import ExampleLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given

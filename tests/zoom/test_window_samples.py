@@ -7,7 +7,7 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.misses import count_misses
+from semfov.fit.observation import count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows

@@ -9,13 +9,13 @@ from typing import Any
 
 from semfov.errors import DataError, InputError
 from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.evidence import EvidenceFit
+from semfov.fit.map import MapFit
+from semfov.fit.observation import ObservationFit
 from semfov.fit.parts.base import PartFit, PartInputs, PartResult
-from semfov.fit.parts.evidence import EvidenceFit
-from semfov.fit.parts.map import MapFit
-from semfov.fit.parts.observation import ObservationFit
-from semfov.fit.parts.tempering import TemperingFit
-from semfov.fit.parts.verification import VerificationFit
 from semfov.fit.parts.windows import WindowsFit
+from semfov.fit.tempering import TemperingFit
+from semfov.fit.verification import VerificationFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
 from semfov.runs.config import WHERE
