@@ -19,11 +19,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.config import CalibrationConfig
-from eval.calibration.evaluation import judge_beliefs
+from eval.calibration.evaluation import CalibrationConfig, judge_beliefs
 from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
-from eval.decide.config import DecideConfig
+from eval.decide.run import DecideConfig
 from eval.explore import explore
 from eval.explore.config import ExploreConfig
 from eval.page.curves import OBJECTS

@@ -12,8 +12,7 @@ and by distance from the closest fixation. The beliefs use raw scores, calibrate
 and learned evidence. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
-from eval.calibration.config import CalibrationConfig
-from eval.calibration.evaluation import judge_calibration
+from eval.calibration.evaluation import CalibrationConfig, judge_calibration
 from semfov.runs.command import command
 
 main = command(judge_calibration, CalibrationConfig, __doc__)

@@ -27,8 +27,7 @@ from semfov.runs.looking import CellLooks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import choose_classes
-from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.search_protocol import DrawnSearch, drawn_searches
 from semfov.runs.setup import Learned, make_learned
 
 COUNTS = (1, 5, 15)
@@ -108,35 +107,31 @@ class BeliefCalibrationRun(PolicyLooking):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run both searches of a scene; returns their records, and the seconds that each stage took."""
-        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
-        watch = Stopwatch()
+        watch, grid = Stopwatch(), self.grid(index)
         area = self.config.data.max_target_area or 1.0
-        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
-        if not classes:
+        searches = drawn_searches(self.scenes, index, grid, self.config.protocol, 1, area)
+        if not searches:
             return [], watch.seconds
-        covered = grid.footprint(annotation.boxes)
         detections = self.detections(index)
         watch.lap("look")
         records: list[ResultRecord] = []
-        for target in classes:
-            scene = self.scenes.ids[index]
-            start = torch.randint(len(grid), (1,), generator=generator_for("start", protocol.seed, scene, target))
-            noise = noise_for(protocol, len(grid), scene, target, 0)[None]
-            goal = covered[annotation.labels == target].any(0)
+        for search in searches:
             with torch.inference_mode():
-                looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, target)
-                search = self._search(target, start, noise, goal, looks)
-            records.append({"scene": scene, "target": target, "present": bool(goal.any()), **search})
+                looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, search.target)
+                beliefs = self._search(search, looks)
+            present = bool(search.goal.any())
+            records.append({"scene": self.scenes.ids[index], "target": search.target, "present": present, **beliefs})
         watch.lap("believe")
         return records, watch.seconds
 
-    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: CellLooks) -> ResultRecord:
+    def _search(self, search: DrawnSearch, looks: CellLooks) -> ResultRecord:
+        target, goal = search.target, search.goal
         most = min(self.config.protocol.shifts + 1, COUNTS[-1])
 
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
-            return list(rollout(looks, self.observers[name], acquisition, start, choice, most=most))
+            return list(rollout(looks, self.observers[name], acquisition, search.start, choice, most=most))
 
-        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(noise)))
+        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(search.noise)))
         path = torch.cat([step.cell for step in led])
         beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:

@@ -11,9 +11,8 @@ whole photograph. Detections from every cell are stored and shared with `python 
 
 from eval.comparison.model_folder import with_models
 from eval.comparison.summary import announce, sensing, write_files
-from eval.decide.config import DecideConfig
 from eval.decide.report import decision_summary, probabilities
-from eval.decide.run import DecisionRun
+from eval.decide.run import DecideConfig, DecisionRun
 from semfov.errors import DataError
 from semfov.runs.command import command
 from semfov.runs.scene_run import finish, gather

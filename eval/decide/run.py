@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Self
 
 import torch
 from torch import Tensor
 
 from eval.comparison.telling import class_frequencies
-from eval.decide.config import DecideConfig
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
+from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
 from semfov.errors import check
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
+from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
+from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import choose_classes, search_steps
-from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.search_protocol import drawn_searches, search_steps
+from semfov.runs.settings import Range, Share
 from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.strategy import Strategy
 
@@ -45,6 +47,43 @@ likelihood, or with one that is trained for the posterior of the class."""
 
 GAZE_SCORE = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
+
+
+@dataclass(frozen=True)
+class DecideConfig(RunConfig):
+    """Search for present and for absent classes, each until a decision.
+
+    Args:
+        belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
+        protocol: the protocol; `shifts` and `seed` are used.
+        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
+            in the image for a search without closer looks (None: the model's own threshold).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (None: the model's own threshold).
+        place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
+            for a find (None: the model's own threshold).
+        closer: largest number of closer looks in a search; 0 decides without them.
+        verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
+            one that is shipped for detector and sensor, if there is one).
+        out: folder for tables, records and the figure.
+        models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
+            verification.
+    """
+
+    unused = ("saliency", "policies")
+    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
+    confirm: Share | None = None
+    give_up: Share | None = None
+    place: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
+    verification: str | None = None
+    out: Path = Path("runs/decide")
+
+    def complete(self, folder: ModelFolder) -> Self:
+        """The settings with the folder's model of verification, if its agent uses one and none is given explicitly."""
+        if self.verification is not None or not folder.used("verification"):
+            return self
+        return replace(self, verification=str(folder.file("verification")))
 
 
 class DecisionRun(PolicyLooking):
@@ -120,13 +159,12 @@ class DecisionRun(PolicyLooking):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
-        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
+        annotation, grid = self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
-        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
-        covered = grid.footprint(annotation.boxes)
+        searches = drawn_searches(self.scenes, index, grid, self.config.protocol, 1, area)
         records: list[ResultRecord] = []
-        if not classes:
+        if not searches:
             return records, watch.seconds
         detections = self.detections(index)
         with torch.inference_mode():
@@ -137,11 +175,8 @@ class DecisionRun(PolicyLooking):
         closer: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid)
         )
-        for target in classes:
-            goal = covered[annotation.labels == target].any(0)
-            start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
-            cell = torch.randint(len(grid), (1,), generator=start)
-            noise = noise_for(protocol, len(grid), self.scenes.ids[index], target, 0)[None]
+        for search in searches:
+            target, goal = search.target, search.goal
             common = {
                 "scene": self.scenes.ids[index],
                 "target": target,
@@ -159,7 +194,7 @@ class DecisionRun(PolicyLooking):
 
                 verifier = self._verifier(closer, grid, target) if name in self.verified else None
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
+                    steps = search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
                         decision = verifier.conclude()

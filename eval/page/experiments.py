@@ -6,9 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.config import CalibrationConfig
+from eval.calibration.evaluation import CalibrationConfig
 from eval.comparison.thresholds import ThresholdLooksConfig
-from eval.decide.config import DecideConfig
+from eval.decide.run import DecideConfig
 from eval.explore.config import ExploreConfig
 from eval.search.config import SearchConfig
 from semfov.runs.config import (

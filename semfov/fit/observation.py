@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
-from semfov.fit.outputs import model_path
+from semfov.fit.outputs import model_path, split
 from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.code import commit
@@ -30,10 +29,10 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.samples import CellsOfLook, Samples, SampleSettings, collect_samples, whole_photograph
+from semfov.runs.samples import CellsOfLook, Sampler, Samples, SampleSettings, collect_samples, whole_photograph
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import csv_text, table
-from semfov.runs.zoom_samples import MosaicSettings
+from semfov.runs.zoom_samples import MosaicSampler
 from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
@@ -102,17 +101,10 @@ class FitObservationConfig(FitConfig):
 
 def fit_fom(config: FitObservationConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    kind = MosaicSettings if config.mosaics else SampleSettings
-    settings = kind.of(config)
-    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
+    sampler = collect_samples(SampleSettings.of(config), folder, config.where, "looking", kind)
     samples = sampler.drawn(config.most)
-    held_out = samples.scene % config.holdout == 0
-    if not held_out.any() or held_out.all():
-        raise DataError(
-            f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
-            "detections in all; give more photographs"
-        )
+    held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
     statistics = statistics_of(config, sampler, training)
     model = fit_model(config, sampler, statistics, samples[~held_out])
@@ -426,13 +418,8 @@ class ObservationFit(PartFit):
     def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
         config, run, samples = self.settings, self.run, self.inputs.samples
-        held_out = samples.scene % config.holdout == 0
+        held_out = split(samples.scene, config.holdout)
         judged = samples[held_out]
-        if not len(judged) or len(judged) == len(samples):
-            raise DataError(
-                f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
-                "detections in all; give more photographs"
-            )
         model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = whole_photograph(self.config.columns, self.config.rows)

@@ -99,8 +99,8 @@ def split(scene: Tensor, holdout: int) -> Tensor:
     held_out = scene % holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(
-            "data: expected examples both to train on and to hold out, got all of one kind "
-            f"({len(scene)} examples); give more photographs"
+            f"data: expected examples both to train on and to hold out, got {len(scene)}, all of one kind; give more "
+            "photographs"
         )
     return held_out
 

@@ -70,7 +70,6 @@ class FitTemperingConfig(FitConfig):
 
 def fit_tempering(config: FitTemperingConfig) -> None:
     """Collect looks, try every exponent, and write the report."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
     settings = SampleSettings.of(config)
     sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")

@@ -60,7 +60,7 @@ class PolicyLooking(Looking):
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
         size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency, sensor, size)
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, size)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }
@@ -124,9 +124,9 @@ class PolicyLooking(Looking):
         digest, store = self.digest(index), self.saliency_stores[name]
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
-            image = self.scenes[index].image
-            reference = self.config.sensor.reference
-            saliency = saliency_table(name, self.config.saliency, self.eye.sensor, reference, image, self.grid(index))
+            image, how = self.scenes[index].image, self.config.saliency
+            seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
+            saliency = saliency_table(name, how.view, how.reduction, *seen)
             if self.config.store:
                 store.save(digest, saliency)
         return saliency

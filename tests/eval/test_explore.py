@@ -15,7 +15,7 @@ from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import closure
 from semfov.runs import saliency_store
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SaliencyConfig
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 
 pytestmark = pytest.mark.weights
@@ -124,7 +124,7 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     peak = divmod(int(seen.argmax()), seen.shape[-1])
     peak_cell = int(peak[0] * 3 / seen.shape[0]) * 4 + int(peak[1] * 4 / seen.shape[1])
     assert stored[5].argmax() == peak_cell
-    picture = saliency_table("vocus2", SaliencyConfig(view="picture", reduction="mean"), sensor, 640.0, image, grid)
+    picture = saliency_table("vocus2", "picture", "mean", sensor, 640.0, image, grid)
     assert picture.shape == (1, 12)
     expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
     torch.testing.assert_close(picture, expected)
@@ -151,7 +151,7 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     settings = run.eye.settings()["sensor"]
 
     def key(name="vocus2", view="foveated", reduction="max", sensor=settings, grid=(4, 3)):
-        return SaliencyStore(folder, name, SaliencyConfig(view, reduction), sensor, grid).key
+        return SaliencyStore(folder, name, view, reduction, sensor, grid).key
 
     other = {**settings, "sigma": 50.0}
     keys = [

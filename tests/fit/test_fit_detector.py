@@ -16,7 +16,7 @@ from scipy import stats
 import semfov
 from eval.comparison.model_folder import with_models
 from eval.decide import main as decide
-from eval.decide.config import DecideConfig
+from eval.decide.run import DecideConfig
 from eval.explore.config import ExploreConfig
 from eval.search import main as search
 from eval.search.config import SearchConfig

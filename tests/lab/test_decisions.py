@@ -7,8 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eval.decide.config import DecideConfig
-from eval.decide.run import DecisionRun, landing, overlap, quarters, sharp_place
+from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarters, sharp_place
 from semfov import DataError, Detections, DirichletBelief, Grid, InputError
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, Target
