@@ -1,6 +1,7 @@
 """Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
 import hashlib
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,7 @@ from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvid
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
 from semfov.data.scene import Annotation, Scene
+from semfov.data.scenes import EmbeddedScenes
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import NonPredictive, Random
 
@@ -40,6 +42,14 @@ def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections
     boxes = torch.cat([corner, corner + 20 + torch.rand(cells, most, 2, generator=generator) * 150], -1)
     scores = (3 * torch.rand(cells, most, classes + 1, generator=generator)).softmax(-1)
     return Detections(boxes, scores, torch.rand(cells, most, generator=generator) < 0.6)
+
+
+def looking(classes: tuple[str, ...], grid: Grid, count: int) -> SimpleNamespace:
+    """A stand-in for a run with stored looks at embedded scenes, whose detections are random."""
+    scenes = EmbeddedScenes(classes, count=count)
+    return SimpleNamespace(
+        scenes=scenes, grid=lambda index: grid, detections=lambda index: scattered(index, grid, len(classes))
+    )
 
 
 def values_of(acquisition: nn.Module, beta: Tensor) -> Tensor:

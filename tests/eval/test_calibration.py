@@ -73,12 +73,3 @@ def test_sums_in_the_file_add_up_to_the_figures(finished):
         parts = [s for s in written["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
         if each["cells"] == "all":
             assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2
-
-
-@pytest.mark.slow
-@pytest.mark.weights
-def test_scores_can_be_evaluated_without_beliefs(arguments, tmp_path, capsys):
-    assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0
-    assert "classwise ECE" in capsys.readouterr().out
-    assert not list(tmp_path.glob("beliefs*"))
-    assert not (tmp_path / "parts").exists()

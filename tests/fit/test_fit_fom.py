@@ -93,6 +93,8 @@ def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
     counts = [int(row[3]) for row in rows if row[2].strip() == "raw"]
     assert len(counts) == 9
     assert sum(counts[:-1]) == counts[-1]
+    assert not list(tmp_path.glob("beliefs*"))
+    assert not (tmp_path / "parts").exists()
 
 
 def test_samples_match_looks_at_random_fixations(tmp_path):
