@@ -31,10 +31,10 @@ from semfov.gaze.selection import select_fixation
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
-from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import open_at_reference
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
+from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor
 from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
 from semfov.viz.drawing import (

@@ -27,9 +27,9 @@ from semfov.runs.config import BeliefConfig, DetectorConfig, LookingConfig, Prot
 from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.remembered import RememberedLooks
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Share
+from semfov.runs.store import RememberedLooks
 from semfov.runs.tables import percent, table
 
 _RULES = ("kaplan", "semba")

@@ -45,7 +45,7 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import percent, plus_minus, table
 
 
 class SensorChoice(NamedTuple):
@@ -162,7 +162,7 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
         f"{pixels:,}",
         f"{1e3 * seconds:.0f}",
         *(percent(*_at(performances[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
-        *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(five.value, five.error, strict=True)),
+        *(plus_minus(float(value), float(error), 3) for value, error in zip(five.value, five.error, strict=True)),
         *(percent(*_at(map_curves[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
     ]
 

@@ -28,11 +28,11 @@ from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import drawn_searches, search_steps
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import if_shipped, make_learned, make_observation
+from semfov.runs.store import RememberedLooks
 from semfov.strategy import Strategy
 
 _Rule = Callable[[Step, int, Grid], Tensor]

@@ -12,7 +12,7 @@ from semfov.fit.parts.base import PartResult
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import percent, plus_minus, table
 
 if TYPE_CHECKING:
     from semfov.fit.detector_settings import FitDetectorConfig
@@ -22,7 +22,7 @@ def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
     """Format a paired difference, times `scale`, with its unit, its standard error and its number of photographs."""
     digits = 1 if scale > 1 else 3
     return (
-        f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
+        f"{plus_minus(scale * gain.mean, scale * gain.error, digits, sign='+')} {unit} "
         f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
     )
 

@@ -26,10 +26,9 @@ from semfov.gaze.choice import Greedy, drawn_by
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.remembered import RememberedLooks
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for
-from semfov.runs.store import DetectionStore
+from semfov.runs.store import DetectionStore, RememberedLooks
 
 
 class TargetSearch(ABC, Generic[LookType]):

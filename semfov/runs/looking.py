@@ -15,11 +15,10 @@ from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.transfer import pack_tensors, unpack_tensors
 from semfov.runs.config import BeliefConfig, LookingConfig
-from semfov.runs.remembered import look_everywhere
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
-from semfov.runs.store import cell_store
+from semfov.runs.store import cell_store, look_everywhere
 
 
 class Looking(SceneRun):

@@ -9,8 +9,7 @@ import torch
 
 from eval.explore import explore
 from eval.explore.config import ExploreConfig
-from eval.explore.references import FUSED, PAINTED
-from eval.explore.run import ExploreRun
+from eval.explore.run import FUSED, PAINTED, ExploreRun
 from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import closure
