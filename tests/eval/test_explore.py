@@ -14,8 +14,9 @@ from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import closure
 from semfov.runs import saliency_store
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig
+from semfov.runs.config import DetectorConfig
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -23,16 +24,8 @@ pytestmark = pytest.mark.weights
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):
     """A run of two scenes on 4 × 3 cells."""
-    folder = tmp_path_factory.mktemp("explore")
-    return ExploreConfig(
-        data=DataConfig(limit=2),
-        belief=BeliefConfig(columns=4, rows=3),
-        protocol=ProtocolConfig(starts=2, shifts=4),
-        policies=("random-raw", "kl-calibrated", "vocus2-raw"),
-        cache=folder / "cache",
-        out=folder / "out",
-        workers=1,
-    )
+    settings = run_settings(tmp_path_factory.mktemp("explore"), 2, starts=2, shifts=4)
+    return ExploreConfig(**settings, policies=("random-raw", "kl-calibrated", "vocus2-raw"))
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,8 @@ from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap
 from semfov.episode import rollout
 from semfov.runs import exploration_protocol, search_protocol
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -31,15 +32,7 @@ WITH_CONTEXT = PolicyConfig(SOUGHT, context="both")
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("replay")
-    return {
-        "data": DataConfig(limit=1),
-        "belief": BeliefConfig(columns=4, rows=3),
-        "protocol": ProtocolConfig(starts=2, shifts=5),
-        "cache": folder / "cache",
-        "out": folder / "out",
-        "workers": 1,
-    }
+    return run_settings(tmp_path_factory.mktemp("replay"), starts=2, shifts=5)
 
 
 @pytest.fixture(scope="module")

@@ -14,22 +14,14 @@ from eval.explore.run import ExploreRun
 from eval.search import report as search_report
 from eval.search.config import SearchConfig
 from eval.search.run import SearchRun
-from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    return {
-        "data": DataConfig(limit=2),
-        "belief": BeliefConfig(columns=4, rows=3),
-        "protocol": ProtocolConfig(starts=2, shifts=5),
-        "cache": folder / "cache",
-        "out": folder / "out",
-        "workers": 1,
-    }
+    return run_settings(tmp_path_factory.mktemp("report"), 2, starts=2, shifts=5)
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,10 @@ from semfov.errors import InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import policy_looking, scene_run
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.config import PolicyConfig
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import finish, gather
+from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
 
@@ -30,15 +31,7 @@ pytestmark = pytest.mark.weights
 
 @pytest.fixture
 def config(tmp_path):
-    return SearchConfig(
-        data=DataConfig(limit=1),
-        belief=BeliefConfig(columns=3, rows=2),
-        protocol=ProtocolConfig(starts=2, shifts=3),
-        policies=("random",),
-        cache=tmp_path / "cache",
-        out=tmp_path / "out",
-        workers=1,
-    )
+    return SearchConfig(**run_settings(tmp_path, 1, 3, 2, starts=2, shifts=3), policies=("random",))
 
 
 @pytest.mark.slow
