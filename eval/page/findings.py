@@ -220,96 +220,45 @@ class Finding:
 
 SEARCH, EXPLORE = paper.TABLE_SHIFTS, (1, 5, 15)
 
+_CALIBRATED = "calibrated less raw at 5 / 15 / 30 shifts"
+
 TESTED = (
-    Finding(
-        "Calibration is considerably beneficial for non-predictive search.",
-        "search",
-        "calibrated less raw at 5 / 15 / 30 shifts",
-        Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH),
-    ),
-    Finding(
-        "Calibration does not influence predictive search.",
-        "search",
-        "calibrated less raw at 5 / 15 / 30 shifts",
-        Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0),
-    ),
-    Finding(
-        "Predictive search comfortably outperforms non-predictive search on raw scores",
-        "search",
-        "predictive less non-predictive at 5 / 15 / 30 shifts",
-        Advantage("predictive-raw", "non-predictive-raw", SEARCH),
-    ),
-    Finding(
-        "… and on calibrated scores.",
-        "search",
-        "the same",
-        Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH),
-    ),
-    Finding(
-        "Calibrated predictive search leads random gaze at first and is overtaken",
-        "search",
-        "gaze shifts",
-        Overtaken("predictive-calibrated", "random", "ahead to the 13th"),
-    ),
-    Finding(
-        "… calibrated non-predictive search too,",
-        "search",
-        "gaze shifts",
-        Overtaken("non-predictive-calibrated", "random", "ahead to the 10th"),
-    ),
-    Finding(
-        "… and raw non-predictive search.",
-        "search",
-        "gaze shifts",
-        Overtaken("non-predictive-raw", "random", "ahead initially"),
-    ),
-    Finding(
-        "KL divergence leads random gaze at first; random gaze overtakes it (calibrated).",
-        "explore",
-        "gaze shifts",
-        Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th"),
-    ),
-    Finding(
-        "The same with raw scores.",
-        "explore",
-        "gaze shifts",
-        Overtaken("kl-raw", "random-raw", "ahead to about the 4th"),
-    ),
-    Finding(
-        "Exploration has no particular advantage from calibration.",
-        "explore",
-        "KL, calibrated less raw at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0),
-    ),
-)
+    Finding("Calibration is considerably beneficial for non-predictive search.", "search", _CALIBRATED,
+            Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH)),
+    Finding("Calibration does not influence predictive search.", "search", _CALIBRATED,
+            Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0)),
+    Finding("Predictive search comfortably outperforms non-predictive search on raw scores", "search",
+            "predictive less non-predictive at 5 / 15 / 30 shifts",
+            Advantage("predictive-raw", "non-predictive-raw", SEARCH)),
+    Finding("… and on calibrated scores.", "search", "the same",
+            Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH)),
+    Finding("Calibrated predictive search leads random gaze at first and is overtaken", "search", "gaze shifts",
+            Overtaken("predictive-calibrated", "random", "ahead to the 13th")),
+    Finding("… calibrated non-predictive search too,", "search", "gaze shifts",
+            Overtaken("non-predictive-calibrated", "random", "ahead to the 10th")),
+    Finding("… and raw non-predictive search.", "search", "gaze shifts",
+            Overtaken("non-predictive-raw", "random", "ahead initially")),
+    Finding("KL divergence leads random gaze at first; random gaze overtakes it (calibrated).", "explore",
+            "gaze shifts", Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th")),
+    Finding("The same with raw scores.", "explore", "gaze shifts",
+            Overtaken("kl-raw", "random-raw", "ahead to about the 4th")),
+    Finding("Exploration has no particular advantage from calibration.", "explore",
+            "KL, calibrated less raw at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
+)  # fmt: skip
 """Findings that are tested at every score threshold."""
 
 BASELINES = (
-    Finding(
-        "VOCUS2 is far below random gaze in search.",
-        "search",
-        "random less VOCUS2 at 5 / 15 / 30 shifts",
-        Advantage("random", "vocus2", SEARCH),
-    ),
-    Finding(
-        "KL divergence consistently outperforms negative entropy (calibrated).",
-        "explore",
-        "KL less negative entropy at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE),
-    ),
-    Finding(
-        "KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
-        "explore",
-        "KL less two-peak at 1 / 2 / 4 shifts",
-        Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4)),
-    ),
-    Finding(
-        "KL divergence outperforms VOCUS2 in exploration (calibrated).",
-        "explore",
-        "KL less VOCUS2 at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE),
-    ),
-)
+    Finding("VOCUS2 is far below random gaze in search.", "search", "random less VOCUS2 at 5 / 15 / 30 shifts",
+            Advantage("random", "vocus2", SEARCH)),
+    Finding("KL divergence consistently outperforms negative entropy (calibrated).", "explore",
+            "KL less negative entropy at 1 / 5 / 15 shifts",
+            Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE)),
+    Finding("KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
+            "explore", "KL less two-peak at 1 / 2 / 4 shifts",
+            Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4))),
+    Finding("KL divergence outperforms VOCUS2 in exploration (calibrated).", "explore",
+            "KL less VOCUS2 at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE)),
+)  # fmt: skip
 """Findings that are tested at the default threshold alone."""
 
 FINDINGS = (*TESTED[:7], *BASELINES, *TESTED[7:])
