@@ -24,7 +24,7 @@ from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
 from eval.decide.run import DecideConfig
 from eval.explore import explore
-from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreConfig
 from eval.page.curves import OBJECTS
 from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
@@ -45,7 +45,7 @@ from eval.page.tables import (
 )
 from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
 from eval.search import search
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
 from semfov.runs.command import command

@@ -20,12 +20,10 @@ import torch
 from torch import Tensor
 
 from eval.comparison.summary import Curve, collect_records
-from eval.explore.config import ExploreConfig
 from eval.explore.report import success
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.report import performance
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup

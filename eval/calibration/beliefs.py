@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from eval.decide.run import detected_on_landing, landing
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.episode import Step, Stopwatch, rollout

@@ -11,7 +11,7 @@ import semfov
 from eval.calibration.beliefs import COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import write_belief_report
 from eval.comparison.summary import announce
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig, SensorConfig, WorkConfig

@@ -9,9 +9,8 @@ command again.
 """
 
 from eval.comparison.model_folder import with_models
-from eval.explore.config import ExploreConfig
 from eval.explore.report import exploration_report
-from eval.explore.run import ExploreRun
+from eval.explore.run import ExploreConfig, ExploreRun
 from semfov.runs.command import command
 from semfov.runs.scene_run import finish
 

@@ -10,9 +10,8 @@ To continue a stopped run, give the same command again.
 """
 
 from eval.comparison.model_folder import with_models
-from eval.search.config import SearchConfig
 from eval.search.report import search_report
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.runs.command import command
 from semfov.runs.scene_run import finish
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from eval.comparison.summary import Curve, announce, collect_records, curve_of, sensing, write_files
-from eval.search.config import SearchConfig
 from eval.search.report import found
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.belief import ContextPrior
 from semfov.belief.look_features import highest_score
 from semfov.errors import DataError, check

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from eval.explore import explore
-from eval.explore.config import ExploreConfig
-from eval.explore.run import FUSED, PAINTED, ExploreRun
+from eval.explore.run import FUSED, PAINTED, ExploreConfig, ExploreRun
 from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import closure

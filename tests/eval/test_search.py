@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from eval.search import search
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
 from tests.small import run_settings

@@ -17,9 +17,9 @@ import semfov
 from eval.comparison.model_folder import with_models
 from eval.decide import main as decide
 from eval.decide.run import DecideConfig
-from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreConfig
 from eval.search import main as search
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov import ActivePerception, DataError, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target

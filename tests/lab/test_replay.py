@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from eval.comparison.replay import replay
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.explore.run import ExploreConfig, ExploreRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov import ActivePerception
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap

@@ -5,10 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.explore.run import ExploreConfig, ExploreRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
 from semfov.runs.config import DataConfig, PolicyConfig, ProtocolConfig, SaliencyConfig
 from tests.small import run_settings

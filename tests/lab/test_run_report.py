@@ -9,11 +9,9 @@ import pytest
 import eval.comparison.report_page as module
 from eval.comparison.report_page import choose_episodes, write_run_report
 from eval.explore import report as explore_report
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
+from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import report as search_report
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from tests.small import run_settings
 
 pytestmark = pytest.mark.weights

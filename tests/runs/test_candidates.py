@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from eval.explore.config import ExploreConfig
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig
+from eval.search.run import SearchConfig
 from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
 from semfov.belief import ContextPrior, MapEvidence
 from semfov.errors import InputError

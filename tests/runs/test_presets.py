@@ -6,8 +6,8 @@ from typing import get_args
 
 import pytest
 
-from eval.explore.config import ExploreConfig
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig
+from eval.search.run import SearchConfig
 from semfov.errors import InputError
 from semfov.gaze.policies import Task, policy_names
 from semfov.runs.command import run_command

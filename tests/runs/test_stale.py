@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from eval.search import main
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
