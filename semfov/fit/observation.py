@@ -20,7 +20,7 @@ from semfov.eye import Eye
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
 from semfov.fit.outputs import model_path, split
-from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.parts.base import IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
@@ -81,7 +81,7 @@ class FitObservationConfig(FitConfig):
     shrinkage: Weight = 10.0
     enough: Whole | None = None
     holdout: Annotated[int, Range(2, 10**9)] = 10
-    iou: Share = 0.5
+    iou: Share = IOU
     most: Count = 1_000_000
     shard: Count = 32
     out: Path = Path("runs/fit_fom")

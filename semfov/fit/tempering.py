@@ -18,7 +18,7 @@ from semfov.errors import DataError, check
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, percent_of, section
 from semfov.fit.outputs import write_outputs
-from semfov.fit.parts.base import FOOTPRINT, PartFit, PartResult
+from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
 from semfov.observation.foveal import FovealObservationModel
@@ -58,7 +58,7 @@ class FitTemperingConfig(FitConfig):
     exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
     photographs: Count | None = None
     fixations: Count = 8
-    iou: Share = 0.5
+    iou: Share = IOU
     shard: Count = 32
     columns: Side = 10
     rows: Side = 10
