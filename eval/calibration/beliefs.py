@@ -119,8 +119,8 @@ class BeliefCalibrationRun(PolicyLooking):
             with torch.inference_mode():
                 looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, search.target)
                 beliefs = self._search(search, looks)
-            present = bool(search.goal.any())
-            records.append({"scene": self.scenes.ids[index], "target": search.target, "present": present, **beliefs})
+            common = {"scene": self.scenes.ids[index], "target": search.target, "present": search.present}
+            records.append({**common, **beliefs})
         watch.lap("believe")
         return records, watch.seconds
 

@@ -180,7 +180,7 @@ class DecisionRun(PolicyLooking):
             common = {
                 "scene": self.scenes.ids[index],
                 "target": target,
-                "present": bool(goal.any()),
+                "present": search.present,
                 "sharp": float(highest_score(sharp, target)),
                 "frequency": float(self.frequencies[index][target]),
                 "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)),

@@ -151,6 +151,11 @@ class DrawnSearch:
     start: Tensor
     noise: Tensor
 
+    @property
+    def present(self) -> bool:
+        """Whether the photograph holds the class."""
+        return bool(self.goal.any())
+
 
 def drawn_searches(
     scenes: Scenes,
