@@ -27,7 +27,7 @@ from semfov.runs.looking import CellLooks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import DrawnSearch, drawn_searches
+from semfov.runs.search_protocol import DrawnSearch, choose_searches
 from semfov.runs.setup import Learned, make_learned
 
 COUNTS = (1, 5, 15)
@@ -109,7 +109,7 @@ class BeliefCalibrationRun(PolicyLooking):
         """Run both searches of a scene; returns their records, and the seconds that each stage took."""
         watch, grid = Stopwatch(), self.grid(index)
         area = self.config.data.max_target_area or 1.0
-        searches = drawn_searches(self.scenes, index, grid, self.config.protocol, 1, area)
+        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
         if not searches:
             return [], watch.seconds
         detections = self.detections(index)

@@ -29,7 +29,7 @@ from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import drawn_searches, search_steps
+from semfov.runs.search_protocol import choose_searches, search_steps
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.runs.store import RememberedLooks
@@ -162,7 +162,7 @@ class DecisionRun(PolicyLooking):
         annotation, grid = self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
-        searches = drawn_searches(self.scenes, index, grid, self.config.protocol, 1, area)
+        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
         records: list[ResultRecord] = []
         if not searches:
             return records, watch.seconds

@@ -24,7 +24,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import drawn_searches, episodes_of, looks_of, run_episodes, search_steps, tie_noise
+from semfov.runs.search_protocol import choose_searches, episodes_of, looks_of, run_episodes, search_steps, tie_noise
 from semfov.strategy import Strategy
 
 Ways = Mapping[str, Strategy]
@@ -190,7 +190,7 @@ def decisions(
     results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
     for index in track(scenes, "deciding", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
-        searches = drawn_searches(run.scenes, index, grid, protocol, classes, max_area, classes)
+        searches = choose_searches(run.scenes, index, grid, protocol, classes, max_area, classes)
         if not searches:
             continue
         detections = run.detections(index)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from os import fspath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from semfov.fit.comparison import Difference
+from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.base import PartResult
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking
 from semfov.runs.tables import percent, plus_minus, table
-
-if TYPE_CHECKING:
-    from semfov.fit.detector_settings import FitDetectorConfig
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:

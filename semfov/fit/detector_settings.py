@@ -6,15 +6,11 @@ from typing import Annotated
 
 from semfov.errors import InputError
 from semfov.fit.settings import FitConfig
-from semfov.fit.windows import FitZoomConfig
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
 MANY = 100
 """With at least this many photographs, one in five is held out and training takes all its steps."""
-
-_FOR_MOSAICS = 360
-"""The number of mosaics grows up to this number of photographs to learn from."""
 
 
 @dataclass(frozen=True)
@@ -88,40 +84,4 @@ class FitDetectorConfig(FitConfig):
             holdout=self.holdout or (3 if few else 5),
             steps=self.steps or max(250, round(500 * share)),
             map_steps=self.map_steps or max(300, round(1000 * share)),
-        )
-
-    def mosaics(self, photographs: int, tile: int) -> FitZoomConfig:
-        """Return the settings of the evidence for large pictures, with mosaics for so many photographs.
-
-        Args:
-            photographs: number of photographs, held-out ones included.
-            tile: width in pixels of the slot of a photograph.
-
-        Returns:
-            The settings. Each photograph to learn from is in about four mosaics, unless there are very many.
-        """
-        holdout = self.holdout or 5
-        held_out = -(-photographs // holdout)
-        training = min(photographs - held_out, _FOR_MOSAICS)
-        return FitZoomConfig(
-            data=self.data,
-            detector=self.detector,
-            holdout=holdout,
-            mosaics=max(1, training // 5),
-            far=max(1, training // 60),
-            crowded=max(1, training // 10),
-            judged=max(8, min(held_out // 3, 30)),
-            judged_far=1,
-            kinds=(),
-            searched=max(8, training // 12),
-            sought=3,
-            passes=16,
-            tile=tile,
-            steps=self.window_steps,
-            survey_steps=self.window_steps,
-            seed=self.seed,
-            out=self.out,
-            cache=self.cache,
-            workers=self.workers,
-            scheduler=self.scheduler,
         )

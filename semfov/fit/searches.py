@@ -27,7 +27,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import DrawnSearch, choose_classes, drawn_searches
+from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
 
 
@@ -195,7 +195,7 @@ def open_photographs(
         held = set(annotation.labels.tolist())
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
-        wide = drawn_searches(scenes, index, grid, protocol, classes, max_area, more)
+        wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
         search_targets = tuple(
             SearchTarget(**vars(search), spare=number >= len(targets)) for number, search in enumerate(wide)
         )

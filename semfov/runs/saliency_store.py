@@ -26,7 +26,7 @@ _SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
 SALIENCY_CLASSES: dict[str, Callable[[], SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
 
-View = Literal["foveated", "picture"]
+SaliencyView = Literal["foveated", "picture"]
 """What saliency is computed of: the foveated view from each fixation, or the whole photograph once."""
 
 
@@ -46,7 +46,7 @@ class SaliencyStore(SceneStore):
         self,
         folder: Path,
         name: str,
-        view: View,
+        view: SaliencyView,
         reduction: Reduction,
         sensor: Mapping[str, Any],
         grid: tuple[int, int],
@@ -74,7 +74,7 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_table(
-    name: str, view: View, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
+    name: str, view: SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
     """Saliency of every cell of a photograph.
 

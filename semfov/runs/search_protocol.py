@@ -157,7 +157,7 @@ class DrawnSearch:
         return bool(self.goal.any())
 
 
-def drawn_searches(
+def choose_searches(
     scenes: Scenes,
     index: int,
     grid: Grid,

@@ -6,12 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Observer, Semantic
+from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.gaze.policies import Policy
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
@@ -22,9 +23,6 @@ from semfov.runs.looking import Looking
 from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
-
-if TYPE_CHECKING:
-    from semfov.fit.detector_settings import FitDetectorConfig
 
 FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
