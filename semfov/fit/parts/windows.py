@@ -85,7 +85,7 @@ class WindowsFit(PartFit):
         return self.mosaics(photographs)
 
     def mosaics(self, photographs: int) -> FitZoomConfig:
-        """Return the settings, with mosaics for so many photographs: each to learn from is in about four, if not very many."""
+        """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
         own, held_out = self.config, -(-photographs // self.inputs.holdout)
         training = min(photographs - held_out, _FOR_MOSAICS)
         return FitZoomConfig(
@@ -146,9 +146,9 @@ class WindowsFit(PartFit):
 
     def _fit(self, config: FitZoomConfig) -> PartResult:
         eye = WindowEye(self.run.eye.detector).eval().requires_grad_(False)
-        mosaics = makemosaics(config, eye.detector.classes)
+        mosaics = make_mosaics(config, eye.detector.classes)
         store = make_store(config, eye)
-        model, figures = fitmosaics(config, eye, mosaics, store)
+        model, figures = fit_mosaics(config, eye, mosaics, store)
         judged = mosaics["judged"]
         opened = open_all(eye, judged, store)
         curves = {
@@ -176,7 +176,7 @@ class WindowsFit(PartFit):
         return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
 
 
-def fitmosaics(
+def fit_mosaics(
     config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, str]:
     """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers.
