@@ -1,6 +1,6 @@
 """Do word vectors find the class that a description means? `python -m benchmarks.descriptions --embeddings FILE`.
 
-Other names of COCO's classes (`semfov.data.synonyms`) serve as descriptions whose class is known. The first table gives
+Other names of COCO's classes (`semfov.data.classes`) serve as descriptions whose class is known. The first table gives
 how often the class is among the nearest ones. The second gives the mean log probability of the right class by the
 temperature of `semfov.data.spread`. Names that share a word with their class and names with several classes are left
 out.
@@ -12,10 +12,9 @@ from pathlib import Path
 import torch
 
 from benchmarks.tables import table
-from semfov.data.naming import alike
-from semfov.data.synonyms import names_of
+from semfov.data.classes import alike, names_of
 from semfov.data.word_vectors import TEMPERATURE, WordVectors, words_of
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 
 NEAREST = (1, 3, 5, 10)
 TEMPERATURES = (0.04, 0.06, 0.08, 0.1, 0.15)

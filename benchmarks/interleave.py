@@ -41,7 +41,7 @@ from semfov.detection.load import load_yolo
 from semfov.detection.onnx import OnnxDetector, load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.eye import Eye, View
-from semfov.gaze.selection import select_fixation
+from semfov.gaze.choice import select_fixation
 from semfov.strategy import Strategy
 
 COLUMNS, ROWS, TARGET = 10, 10, 1

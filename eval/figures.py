@@ -25,9 +25,9 @@ from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
+from semfov.gaze.choice import select_fixation
 from semfov.gaze.policies import KL, Predictive
 from semfov.gaze.saliency import VOCUS2, cell_saliency
-from semfov.gaze.selection import select_fixation
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig

@@ -22,7 +22,7 @@ from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside
 from semfov.io.manifest import PARTS, Manifest, find_file
-from semfov.io.shipped import fit_command
+from semfov.io.pretrained import fit_command
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.base import Sensor
 from semfov.sensor.named import SENSORS

@@ -18,7 +18,7 @@ from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.compatibility import check_shipped_sensor, learned_for
-from semfov.io.shipped import shipped_model
+from semfov.io.pretrained import shipped_model
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.foveation import Foveation

@@ -97,20 +97,6 @@ def observing() -> Semantic:
     return Semantic(4, model().requires_grad_(False))
 
 
-def score_evidence(kind: type[MapEvidence] | type[TargetEvidence]) -> MapEvidence | TargetEvidence:
-    """A model whose evidence is the clipped score of a class, and nothing else: no correction of cell or image."""
-    model = kind(4, 4, components=4).requires_grad_(False).eval()
-    for parameter in model.parameters():
-        parameter.zero_()
-    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
-    model.look[0].weight[0, 1] = 100
-    model.look[0].bias[0] = -60
-    model.look[2].weight[0, 0] = 1
-    model.look[4].weight[0, 0] = 0.25
-    model.look[4].bias[0] = -4
-    return model
-
-
 class FixedLook(Semantic):
     """An observer that returns a given look, whatever is detected."""
 

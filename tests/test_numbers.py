@@ -22,7 +22,7 @@ from semfov.agents.head import CONFIRM
 from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
@@ -37,13 +37,16 @@ ROOT = Path(__file__).parents[1]
 
 STRICT = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("results", "tables", "zoom", "head", "human", "detectors", "words")),
+    *(f"docs/{name}.md" for name in ("results", "tables", "zoom", "head", "human", "detectors")),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/decisions/*.md")),
 ]
 """Pages whose sentences repeat what tables say."""
 
 OTHERS = [
-    *(f"docs/{name}.md" for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method")),
+    *(
+        f"docs/{name}.md"
+        for name in ("searchers", "sensors", "pan-tilt", "testing", "command", "glossary", "method", "words")
+    ),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/measurements/*.md")),
     *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/guides/*.md")),
 ]
@@ -61,7 +64,6 @@ COMPANIONS = {
     "docs/head.md": ["docs/measurements/head.md"],
     "docs/human.md": ["docs/measurements/human.md"],
     "docs/detectors.md": ["docs/measurements/detectors.md"],
-    "docs/words.md": ["docs/measurements/words.md"],
 }
 """Pages with the tables of a page."""
 
@@ -97,7 +99,7 @@ _OBJECTS, _DETECTIONS = _COUNTS[1:].sum(0).tolist(), _COUNTS.sum(0).tolist()
 
 KNOWN = {
     "README.md": {
-        "Python 3.11": "pyproject.toml; test_habits.py compares the workflows with it",
+        "Python 3.11": "pyproject.toml; test_project.py compares the workflows with it",
         "probability 0.94": "what python -m eval.readme_picture draws",
         "6.8 GB": "size of an installation",
         f"COCO's {len(COCO_CLASSES)} classes": "code",
@@ -225,7 +227,6 @@ SHARES = {
         "a fifth of the NSS difference": ("0.365", "1.739"),
         "a quarter together with VOCUS2": ("0.446", "1.739"),
     },
-    "docs/measurements/words.md": {"a tenth of the gain": ("0.023", "0.217"), "A tenth of the weights": "a setting"},
     "docs/measurements/zoom.md": {"One of four boxes": ("0.250", 1)},
 }
 """What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""

@@ -15,13 +15,12 @@ from torch import Tensor
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov import DirichletStatistics, FovealObservationModel
 from semfov.belief import ContextPrior, TargetEvidence
-from semfov.detection.darknet import Darknet
+from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import read_cfg
-from semfov.detection.darknet_weights import read_weights
 from semfov.errors import DataError
 from semfov.io import storage
-from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.pretrained import Pretrained
+from semfov.io.storage import read_tensors, write_tensors
 
 CFG = """[net]
 width=32

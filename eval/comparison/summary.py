@@ -107,17 +107,15 @@ def write_files(
     tables: dict[str, str],
     records: list[ResultRecord],
     seconds: dict[str, float],
-    config: Any = None,
 ) -> list[Path]:
-    """Write tables (text by file name), records, settings (None: the run's own) and manifest; returns the paths."""
-    config = run.config if config is None else config
+    """Write tables (text by file name), records, settings and manifest; returns the paths."""
     files = {
         **tables,
         "episodes.jsonl": json_lines(records),
-        "config.yaml": config.yaml(),
+        "config.yaml": run.config.yaml(),
         MANIFEST: manifest(run, program, seconds),
     }
-    return write_texts(config.out, files)
+    return write_texts(run.config.out, files)
 
 
 def announce(summary: str, written: Iterable[Path]) -> None:

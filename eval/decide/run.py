@@ -21,7 +21,6 @@ from semfov.belief.verification import Verification
 from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
-from semfov.errors import check
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
@@ -101,8 +100,6 @@ class DecisionRun(PolicyLooking):
     config: DecideConfig
 
     def __init__(self, config: DecideConfig) -> None:
-        context = config.belief.context
-        check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
         # The key of the run, which the base makes first, depends on this model.
         self.verification: Verification | None = None
         super().__init__(config)

@@ -16,11 +16,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from eval.human.search.compare import compare
-from eval.human.search.config import PeopleSearchConfig
-from eval.human.viewing.config import ViewingConfig
+from eval.human.search.run import PeopleSearchConfig
 from eval.human.viewing.report import viewing_report
-from eval.human.viewing.run import ViewingRun
-from eval.human.viewing.scores import halves, score_all
+from eval.human.viewing.rows import halves, score_all
+from eval.human.viewing.run import ViewingConfig, ViewingRun
 from eval.human.viewing.sequences import score_sequences
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import finish

@@ -181,7 +181,7 @@ def agreement(folder: Path) -> list[str]:
 
 def photographs(runs: Runs) -> list[str]:
     """Table of the photographs of the page: their number, their objects and targets, and how many show a person."""
-    from semfov.detection.coco_classes import COCO_CLASSES
+    from semfov.detection.class_names import COCO_CLASSES
     from semfov.runs.setup import make_scenes
 
     run = runs["search-published-nano"]

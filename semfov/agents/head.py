@@ -24,7 +24,7 @@ from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
-from semfov.io.shipped import shipped_model
+from semfov.io.pretrained import shipped_model
 from semfov.paths import Ending, HeadPath, reduced_copy
 from semfov.sensor.foveation import Foveation
 

@@ -1,7 +1,5 @@
 """Context: the usual places of a class in the image, and the classes that it usually occurs with."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -20,6 +18,9 @@ from semfov.io.files import sha256
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Array, Field, Number, Object, Pair, Schema
 
+TABLE_WEIGHTS = (0.1, 0.2)
+"""Weights of place and co-occurrence in a context from a table: the better of two pairs on 40 photographs."""
+
 
 class ContextPrior(Pretrained):
     r"""Log odds that context adds to a belief about a target t in each cell x; learned from annotations alone.
@@ -34,8 +35,8 @@ class ContextPrior(Pretrained):
 
     says how much likelier t is in a cell with j at that distance; :math:`q_{jn}(x)` is the probability that the nearest
     j lies in band n (`reaches`). The sum treats classes as independent, which they are not. The weights w compensate
-    for it: they are fitted together with the belief that the context is added to. (Context by place and by
-    co-occurrence: Torralba, 2003; Galleguillos and Belongie, 2010.)
+    for it, and suit one kind of belief. (Context by place and by co-occurrence: Torralba, 2003; Galleguillos and
+    Belongie, 2010.)
 
     Args:
         classes: names of the K classes, without background.
@@ -144,7 +145,7 @@ class ContextPrior(Pretrained):
         return F.interpolate(self.place[:, None], size, mode="bilinear", align_corners=False).flatten(1)
 
     def weights_for(self, kind: str) -> tuple[float, float]:
-        """Fitted weights of place and co-occurrence for a kind of belief.
+        """Weights of place and co-occurrence for a kind of belief.
 
         Args:
             kind: `evidence` or `map`.
@@ -153,7 +154,7 @@ class ContextPrior(Pretrained):
             The two weights.
 
         Raises:
-            InputError: no weights were fitted for this kind.
+            InputError: there are no weights for this kind.
         """
         return self.weights[lookup(kind, self.weights, "kind of belief")]
 
@@ -167,16 +168,6 @@ class ContextPrior(Pretrained):
             InputError: the names differ.
         """
         compatibility.check_classes(self.classes, classes, self.title)
-
-    def digest(self) -> str:
-        """Checksum of everything that the results depend on: tables, classes, edges, weights and metadata.
-
-        Returns:
-            The sha256 in hexadecimal.
-        """
-        what = json.dumps([self.classes, self.edges, self.weights, self.metadata], sort_keys=True).encode()
-        tensors = [tensor.cpu().contiguous().view(torch.uint8).numpy().tobytes() for tensor in self.buffers()]
-        return hashlib.sha256(b"".join([what, *tensors])).hexdigest()
 
     def _record(self) -> dict[str, Any]:
         """The classes, the bands and the weights."""
@@ -192,23 +183,6 @@ class ContextPrior(Pretrained):
         tables = tensors["place"].float(), tensors["cooccurrence"].float()
         settings = {"weights": record["weights"], "metadata": record["metadata"]}
         return cls(record["classes"], *tables, record["edges"], **settings)
-
-    def permuted(self, seed: int = 0) -> "ContextPrior":
-        """Permute the classes at random: a control with the same amount of information, about the wrong classes.
-
-        Args:
-            seed: seed of the random permutation.
-
-        Returns:
-            A new prior.
-        """
-        generator = torch.Generator().manual_seed(seed)
-        order = torch.cat(
-            [torch.zeros(1, dtype=torch.long), 1 + torch.randperm(len(self.classes), generator=generator)]
-        )
-        tables = self.place[order], self.cooccurrence[order][:, order]
-        metadata = {**self.metadata, "permuted": seed}
-        return ContextPrior(self.classes, *tables, self.edges, weights=self.weights, metadata=metadata)
 
     @classmethod
     def from_table(
@@ -228,14 +202,14 @@ class ContextPrior(Pretrained):
 
         The value v of a target t and another class j may have any scale; larger values mean that the classes belong
         together. Only differences count: a value is compared with the other values of either class, and a place with
-        the other places of its class. Unknown values count as 0 after this comparison. The weights are 1;
-        `train.fit_context` fits them.
+        the other places of its class. Unknown values count as 0 after this comparison. The weights of place and
+        co-occurrence are `TABLE_WEIGHTS`.
 
         Args:
             path: CSV file with the names of other classes in the first row and of targets in the first column; an
                 empty cell is unknown.
             classes: names of the detector's classes; names in the table are matched to them in any spelling, or by
-                their synonyms (`semfov.data.naming.alike`).
+                their synonyms (`semfov.data.classes.alike`).
             source: where the table comes from; it is saved in the metadata, with the sha256 of the table.
             places: CSV file with the names of classes in the first column, and the log odds of the class at each
                 height of a picture, from the top row to the bottom row; None uses no places.
@@ -259,7 +233,7 @@ class ContextPrior(Pretrained):
         if places is not None:
             place = places_from(read_named_table(places), classes)
             origin["places_sha256"] = _digest(places)
-        weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
+        weights = dict.fromkeys(("evidence", "map"), TABLE_WEIGHTS)
         return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": origin})
 
     @classmethod

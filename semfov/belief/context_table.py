@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.data.naming import alike
+from semfov.data.classes import alike
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 

@@ -1,4 +1,4 @@
-"""Class names, matched between annotation files and detectors."""
+"""Class names, matched between annotation files, detectors and other tables by spelling, number and synonyms."""
 
 import re
 from collections.abc import Sequence
@@ -7,8 +7,111 @@ from numbers import Integral
 
 from torch import Tensor
 
-from semfov.data.synonyms import SYNONYMS
 from semfov.errors import InputError, check
+
+_TABLE = """
+person: man, men, woman, women, boy, girl, child, children, kid, baby, human, pedestrian, face, player, rider
+bicycle: bike, cycle, push bike, mountain bike, tricycle
+motorcycle: motor bike, bike, scooter, moped, vespa
+car: automobile, auto, taxi, cab, suv, sedan, jeep, vehicle, minivan
+truck: lorry, pickup, pickup truck, van, trailer, fire engine, vehicle
+bus: coach, minibus, double decker, school bus, vehicle
+airplane: plane, aircraft, jet, airliner, jumbo
+train: tram, locomotive, railway, subway, metro, streetcar
+boat: ship, sailboat, yacht, canoe, kayak, ferry, rowboat, vessel
+traffic light: traffic signal, stop light, signal, traffic lamp
+fire hydrant: hydrant
+stop sign: traffic sign, road sign, sign
+parking meter: meter
+bench: park bench, pew
+bird: pigeon, seagull, gull, duck, goose, parrot, eagle, crow, chicken, swan, sparrow, owl
+cat: kitten, kitty
+dog: puppy, hound, doggy
+horse: pony, foal, mare, stallion
+sheep: lamb, goat, ram, ewe
+cow: cattle, bull, calf, ox, bison
+bear: polar bear, grizzly, panda
+backpack: rucksack, knapsack, bag, school bag
+umbrella: parasol, sunshade
+handbag: purse, bag, tote, shopping bag, clutch
+tie: necktie, bow tie
+suitcase: luggage, baggage, trunk, bag, briefcase
+frisbee: disc, flying disc
+sports ball: ball, football, soccer ball, tennis ball, basketball, baseball, volleyball
+tennis racket: racket, racquet, tennis racquet
+baseball glove: glove, mitt, baseball mitt
+baseball bat: bat
+bottle: water bottle, wine bottle, beer bottle, flask
+wine glass: glass, goblet, champagne glass, flute
+cup: mug, coffee cup, coffee mug, tea cup, glass, tumbler, beaker, paper cup
+knife: blade, cutlery
+fork: cutlery
+spoon: ladle, teaspoon, cutlery
+bowl: dish, basin
+sandwich: burger, hamburger, toast, sub
+orange: mandarin, tangerine, clementine
+hot dog: sausage, frankfurter, wiener
+donut: doughnut
+cake: cupcake, muffin, pie, gateau, birthday cake
+chair: seat, stool, armchair, office chair
+couch: settee, loveseat, divan, sofa bed
+potted plant: plant, house plant, flower pot, pot plant, flower
+bed: mattress, bunk
+dining table: table, desk, kitchen table, coffee table
+toilet: lavatory, loo, wc, commode
+tv: television, telly, monitor, screen, display, television set
+laptop: notebook, computer, notebook computer, macbook
+mouse: computer mouse
+remote: remote control, clicker, game controller
+keyboard: computer keyboard
+cell phone: phone, mobile, mobile phone, smartphone, iphone, telephone, handy
+microwave: microwave oven
+oven: stove, cooker, range
+sink: washbasin, basin, wash basin, tap, faucet
+refrigerator: fridge, freezer, icebox
+book: magazine, novel, paperback, notebook
+clock: watch, wall clock, alarm clock
+vase: urn, jar
+scissors: shears
+teddy bear: teddy, stuffed animal, plush, soft toy, toy
+hair drier: hair dryer, blow dryer, hairdryer, dryer
+"""
+
+
+def _read(table: str) -> dict[str, tuple[str, ...]]:
+    """Classes by each of their synonyms, which are written without spaces."""
+    classes: dict[str, tuple[str, ...]] = {}
+    for line in table.strip().splitlines():
+        name, _, others = line.partition(": ")
+        for other in others.split(", "):
+            key = other.replace(" ", "")
+            classes[key] = (*classes.get(key, ()), name)
+    return classes
+
+
+SYNONYMS = _read(_TABLE)
+"""Names of COCO's classes by their synonyms, in lower case and without spaces.
+
+>>> SYNONYMS["mug"], SYNONYMS["glass"]
+(('cup',), ('wine glass', 'cup'))
+"""
+
+
+def names_of(name: str) -> tuple[str, ...]:
+    """List the synonyms of a class, with spaces.
+
+    Args:
+        name: name of the class in COCO's spelling.
+
+    Returns:
+        The synonyms.
+
+    >>> names_of("fork"), names_of("kite")
+    (('cutlery',), ())
+    """
+    lines = (line.partition(": ") for line in _TABLE.strip().splitlines())
+    return next((tuple(others.split(", ")) for word, _, others in lines if word == name), ())
+
 
 # Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
 ALIASES = {
@@ -171,3 +274,29 @@ def other_numbers(key: str) -> set[str]:
         if key.endswith(end):
             forms.add(key.removesuffix(end) + plural)
     return forms
+
+
+def alike(name: str, names: Sequence[str]) -> list[int]:
+    """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms.
+
+    Args:
+        name: name of the class.
+        names: names to search in.
+
+    Returns:
+        Positions of the matching names, from 0.
+
+    >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
+    ([1], [0, 1], [0])
+    """
+    name_key, keys = plain_key(name), [plain_key(other) for other in names]
+    forms = {name_key, *other_numbers(name_key)}
+    same = [place for place, key in enumerate(keys) if key in forms or name_key in other_numbers(key)]
+    if same:
+        return same
+    return [place for place, key in enumerate(keys) if _calls(key, name_key) or _calls(name_key, key)]
+
+
+def _calls(other: str, key: str) -> bool:
+    """Whether `other` is a synonym of a class."""
+    return key in map(plain_key, SYNONYMS.get(other, ()))

@@ -1,26 +1,166 @@
-"""Data sets in COCO's format as scenes for visual search.
+"""Data sets in COCO's format as scenes for visual search; every entry of their files is checked before it is used.
 
 Run as a program, it fetches the official files: `python -m semfov.data.coco val2017 --root DIR`.
 """
 
+import contextlib
 import hashlib
+import io
 import json
 import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
-from semfov.data.annotations import read_annotations
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_sized
 from semfov.data.scene import Annotation, Coverage, Scene, legal_targets
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, sha256
+from semfov.io.files import check_regular, json_sha256, sha256
+from semfov.io.schema import excerpt, is_number, is_plain
+
+_LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
+
+
+def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
+    """Read and check a COCO instances file.
+
+    Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
+    `height`. Every category needs `id` and `name`. Every annotation needs `id`, `image_id`, `category_id` and `bbox` =
+    `[x, y, width, height]`, and may have `iscrowd`. Other keys are ignored.
+
+    Args:
+        path: the file.
+
+    Returns:
+        A `pycocotools.coco.COCO` index, and the sha256 of the file.
+
+    Raises:
+        DataError: the file is missing or not JSON, or an entry lacks a key, has a value of the wrong type, repeats an
+            id or refers to an id that does not exist.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "instances.json")
+    ...     _ = path.write_text('{"images": [], "annotations": [], "categories": []}')
+    ...     coco, digest = read_annotations(path)
+    >>> coco.getImgIds()
+    []
+    """
+    name = f"annotations {Path(path)}"
+    raw = _read(path, name)
+    try:
+        data = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{name}: not a JSON file ({error}); fetch it again") from None
+    if not isinstance(data, dict):
+        raise DataError(f"{name}: expected an object with images, annotations and categories, got {_kind(data)}")
+    try:
+        _check(data)
+    except _Fault as fault:
+        raise DataError(f"{name}: {fault}; correct or replace the file") from None
+    return _index(data), hashlib.sha256(raw).hexdigest()
+
+
+class _Fault(Exception):
+    """An error in an entry; the message describes it."""
+
+
+def _read(path: str | PathLike[str], name: str) -> bytes:
+    check_regular(path, name)
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise DataError(
+            f"{name}: no such file; check data.annotations, or fetch COCO with python -m semfov.data.coco"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{name}: cannot be read ({error})") from None
+
+
+def _index(data: dict[str, Any]) -> Any:
+    from pycocotools.coco import COCO
+
+    coco = COCO()
+    coco.dataset = data
+    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
+        coco.createIndex()
+    return coco
+
+
+def _check(data: dict[str, Any]) -> None:
+    categories = _ids(data, "categories", {"name": str})
+    images = _ids(data, "images", {"file_name": str})
+    if len({type(i) for i in images}) > 1:
+        raise _Fault("images: expected ids of one kind, got integers and strings")
+    for where, image in _entries(data, "images"):
+        for key in ("width", "height"):
+            if not (is_number(image.get(key)) and 1 <= image[key] <= _LARGEST and image[key] == int(image[key])):
+                raise _Fault(f"{where}: expected {key} to be a whole number of pixels, got {_show(image, key)}")
+    _ids(data, "annotations", {})
+    for where, annotation in _entries(data, "annotations"):
+        _check_reference(where, annotation, "image_id", images, "images")
+        _check_reference(where, annotation, "category_id", categories, "categories")
+        box = annotation.get("bbox")
+        if not (isinstance(box, list) and len(box) == 4 and all(map(is_number, box)) and min(box[2:]) >= 0):
+            raise _Fault(
+                f"{where}: expected bbox to be [x, y, width, height] with finite numbers and a size of at least 0, "
+                f"got {_show(annotation, 'bbox')}"
+            )
+        if annotation.get("iscrowd", 0) not in (0, 1):
+            raise _Fault(f"{where}: expected iscrowd to be 0 or 1, got {_show(annotation, 'iscrowd')}")
+
+
+def _entries(data: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    entries = data.get(key)
+    if not isinstance(entries, list):
+        raise _Fault(f"expected {key} to be a list, got {_kind(entries) if key in data else 'nothing'}")
+    for position, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise _Fault(f"{key}[{position}]: expected an object, got {_kind(entry)}")
+        yield f"{key}[{position}]", entry
+
+
+def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | str]:
+    """Ids of the entries, checked to be unique; further fields are checked to have their type and not to be empty."""
+    ids: set[int | str] = set()
+    for where, entry in _entries(data, key):
+        identity = entry.get("id")
+        if not isinstance(identity, int | str) or isinstance(identity, bool):
+            raise _Fault(f"{where}: expected id to be an integer or a string, got {_show(entry, 'id')}")
+        if isinstance(identity, str) and not is_plain(identity):
+            raise _Fault(f"{where}: expected id to have no control characters, got {_show(entry, 'id')}")
+        if identity in ids:
+            raise _Fault(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once")
+        ids.add(identity)
+        for field, kind in fields.items():
+            if not isinstance(entry.get(field), kind) or not entry[field]:
+                raise _Fault(f"{where}: expected {field} to be a string, got {_show(entry, field)}")
+            if not is_plain(entry[field]):
+                raise _Fault(f"{where}: expected {field} to have no control characters, got {_show(entry, field)}")
+    return ids
+
+
+def _check_reference(where: str, entry: dict[str, Any], key: str, ids: set[int | str], what: str) -> None:
+    value = entry.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | str) or value not in ids:
+        raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {_show(entry, key)}")
+
+
+def _kind(value: object) -> str:
+    names = {dict: "an object", list: "a list", str: "a string", type(None): "null"}
+    return names.get(type(value), "a number" if is_number(value) else type(value).__name__)
+
+
+def _show(entry: dict[str, Any], key: str) -> str:
+    """A value as error messages print it: on one line and short."""
+    return excerpt(entry[key]) if key in entry else "nothing"
+
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +253,8 @@ class CocoScenes:
         self.ids: list[Any] = [packed.ids[row] for row in self._rows]
         self._files = [Path(root, packed.names[row]) for row in self._rows]
         settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
-        self.fingerprint = _sha256(settings, [packed.names[row] for row in self._rows], _file_sizes(root, self._files))
+        names = [packed.names[row] for row in self._rows]
+        self.fingerprint = json_sha256([settings, names, _file_sizes(root, self._files)])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -126,46 +267,22 @@ class CocoScenes:
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, without decoding its image.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The objects of the detector's classes.
-        """
+        """Return the objects of a scene, of the detector's classes, without decoding its image."""
         return self._packed.annotation(self._rows[index])
 
     def targets(self, index: int) -> list[int]:
-        """List the classes of a scene that may be searched for.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            Class indices 1..K, ascending.
-        """
+        """List the classes of a scene that may be searched for, 1..K, ascending."""
         return list(self._targets[index])
 
     def digest(self, index: int) -> str:
-        """Compute the sha256 of an image file and of the size in its annotations.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            64 hexadecimal digits.
-
-        Raises:
-            DataError: the file cannot be read.
-        """
+        """Compute the sha256 of an image file and of the size in its annotations."""
         path = self._files[index]
         check_regular(path, f"image {path}")
         try:
             content = sha256(path)
         except OSError as error:
             raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
-        return _sha256(content, self._packed.sizes[self._rows[index]])
+        return json_sha256([content, self._packed.sizes[self._rows[index]]])
 
 
 def _summary(repairs: Counter[str], most: int = 8) -> str:
@@ -272,10 +389,6 @@ def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
             f"check data.root, or fetch COCO with python -m semfov.data.coco"
         )
     return sizes
-
-
-def _sha256(*values: object) -> str:
-    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 if __name__ == "__main__":

@@ -86,20 +86,7 @@ def download_coco(split: str, root: str | os.PathLike[str], *, address: str = AD
 def fetch_split(
     split: str, root: Path, images: Archive, annotations: Archive, *, address: str, keep: bool, pause: float = 1.0
 ) -> None:
-    """`download_coco` for any pair of archives.
-
-    Args:
-        split: name of the split.
-        root: folder of the data set.
-        images: archive of the images.
-        annotations: archive of the annotations.
-        address: address of the server.
-        keep: keep the archives that were fetched.
-        pause: seconds to wait before a failed transfer is tried again.
-
-    Raises:
-        DataError: the network fails, the disk is full, or a file is not the official one.
-    """
+    """`download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
     instances = f"annotations/instances_{split}.json"
     try:
         if _is_complete(root, split, instances):
@@ -125,24 +112,7 @@ def fetch_split(
 
 
 def fetch_archive(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
-    """Fetch an archive and verify it; a transfer that breaks off is continued.
-
-    Unfinished bytes are kept in `<name>.part`, also from one run to the next. The file itself appears only when it is
-    complete and verified.
-
-    Args:
-        archive: the archive.
-        folder: folder to fetch it into.
-        address: address of the server.
-        pause: seconds to wait before a failed transfer is tried again.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        DataError: the transfer fails several times without progress, the disk is too small, or the file is not the
-            official one.
-    """
+    """Fetch an archive and verify it; what an earlier run transferred is not fetched again."""
     file, part = folder / archive.name, folder / f"{archive.name}.part"
     if file.exists():
         return file
@@ -171,18 +141,7 @@ def fetch_archive(archive: Archive, folder: Path, *, address: str = ADDRESS, pau
 
 
 def unpack_members(file: Path, root: Path, members: str) -> None:
-    """Unpack the members of a zip file whose names begin with `members`, each one atomically.
-
-    Files that already have the right content are skipped, so an interrupted run can be continued.
-
-    Args:
-        file: the zip file.
-        root: folder to unpack into.
-        members: beginning of the members' names.
-
-    Raises:
-        DataError: the zip file is damaged, has no such members, or has a member with an unsafe name.
-    """
+    """Unpack members whose names begin with `members`, each atomically; files that are right already are skipped."""
     from tqdm import tqdm
 
     try:

@@ -86,18 +86,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
 
 
 def from_pillow(image: Any, name: str) -> Tensor:
-    """Convert a Pillow image in the same way as `read_image` does.
-
-    Args:
-        image: a Pillow image of any mode.
-        name: its name in messages.
-
-    Returns:
-        The upright image, `(3, H, W)`, RGB in [0, 1].
-
-    Raises:
-        DataError: the image has no pixels or too many, or its file is damaged.
-    """
+    """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about damaged metadata
         try:

@@ -91,19 +91,7 @@ def as_images(
 
 
 def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
-    """Pixels with channels in the order red, green, blue.
-
-    Args:
-        pixels: `(B, 3, H, W)`, made from the source.
-        source: the picture. Files and Pillow images are RGB already.
-        color: order of the channels of arrays and tensors.
-
-    Returns:
-        The pixels.
-
-    Raises:
-        InputError: the order is unknown.
-    """
+    """Pixels `(B, 3, H, W)` in the order red, green, blue; files and Pillow images are RGB already."""
     swap = lookup(color, get_args(Color), "order of channels") == "bgr"
     return pixels.flip(1) if swap and isinstance(source, Tensor | np.ndarray) else pixels
 
@@ -114,18 +102,7 @@ def is_batch(image: object) -> bool:
 
 
 def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
-    """Read the pixels of a picture, and keep the layout and dtype of arrays and tensors.
-
-    Args:
-        image: the picture.
-        argument: name of the argument, for the message.
-
-    Returns:
-        The pixels.
-
-    Raises:
-        InputError: it is not a picture of a known type.
-    """
+    """The pixels of a picture; arrays and tensors keep their layout and dtype. Refuses what is no picture."""
     if isinstance(image, Tensor):
         return image
     if isinstance(image, np.ndarray):
@@ -147,14 +124,7 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
 
 
 def check_local(path: str | PathLike[str], argument: str) -> None:
-    """Raise `InputError` for an address, which is no file on this machine.
-
-    Args:
-        path: the path or address.
-        argument: name of the argument, for the message.
-
-    >>> check_local("kitchen.jpg", "image")
-    """
+    """Raise `InputError` for an address, which is no file on this machine."""
     kind, separator, _ = str(path).partition("://")
     remedy = "it is a stream; use live, or semfov.data.sources.open_stream" if kind in STREAMS else "download it first"
     check(not separator, argument, "a file on this machine", f"an address, {kind}://…; {remedy}")

@@ -1,7 +1,5 @@
 """Pictures larger than a detector's input, composed of annotated photographs by a seed."""
 
-import hashlib
-import json
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,8 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
 from semfov.errors import check
+from semfov.io.files import json_sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 
@@ -32,7 +31,7 @@ class Tile:
     box: tuple[int, int, int, int]
 
 
-class Mosaics:
+class Mosaics(ComposedScenes):
     """Mosaics of `columns` × `rows` photographs.
 
     Each photograph is resized to fit its slot, and keeps its proportions. The rest of the slot is grey. Mosaic `i`
@@ -70,23 +69,16 @@ class Mosaics:
     ) -> None:
         check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
         check(min(tile) >= 1, "tile", "a width and a height in pixels", tile)
-        check(count >= 1, "count", "at least 1", count)
-        check(seed >= 0, "seed", "at least 0", seed)
+        super().__init__(scenes.classes, count, seed)
         self.scenes, self.columns, self.rows, self.tile, self.fill = scenes, columns, rows, tile, fill
-        self.classes = scenes.classes
-        self.ids = list(range(count))
         self.size = columns * tile[0], rows * tile[1]
-        self._seed = seed
         self._alike = alike
         what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill, *([alike] if alike else [])]
-        self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-
-    def __len__(self) -> int:
-        return len(self.ids)
+        self.fingerprint = json_sha256(what)
 
     def tiles(self, index: int) -> list[Tile]:
         """List the photographs of a mosaic, row by row."""
-        generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
+        generator = self._generator(index)
         slots, photographs = self.columns * self.rows, np.arange(len(self.scenes))
         if self._alike and self._sharing:
             photographs = self._sharing[int(generator.integers(len(self._sharing)))]
@@ -120,9 +112,7 @@ class Mosaics:
             if image.shape[-2:] != (y2 - y1, x2 - x1):
                 image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)
             canvas[:, y1:y2, x1:x2] = image[0]
-        annotation = self.annotation(index)
-        name = f"mosaic {self.ids[index]}, seed {self._seed}"
-        return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
+        return self._scene(index, "mosaic", canvas)
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
@@ -131,14 +121,10 @@ class Mosaics:
         labels = torch.cat([annotation.labels for _, annotation in pairs])
         return Annotation(boxes, labels, torch.cat([annotation.crowd for _, annotation in pairs]), self.size)
 
-    def targets(self, index: int) -> list[int]:
-        """List the classes of a mosaic that may be searched for, ascending: those that cover at most a fifth of it."""
-        return legal_targets(self.annotation(index))
-
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""
         tiles = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
-        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, tiles]).encode()).hexdigest()
+        return json_sha256([_VERSION, self.size, self.fill, tiles])
 
 
 def _moved(part: Annotation, tile: Tile) -> Tensor:

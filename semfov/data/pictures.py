@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
@@ -13,7 +11,7 @@ import torch
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene
 from semfov.errors import DataError
-from semfov.io.files import check_regular, inside, sha256
+from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 
 class Pictures:
@@ -48,7 +46,7 @@ class Pictures:
     def fingerprint(self) -> str:
         """sha256 of the names and contents of the files."""
         what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]
-        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+        return json_sha256(what)
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -1,7 +1,5 @@
 """Large pictures of one scene, composed by a seed: parts of photographs scattered over one ground."""
 
-import hashlib
-import json
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
 from semfov.errors import check
+from semfov.io.files import json_sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 _MARGIN = 0.15
@@ -45,7 +44,7 @@ class Cutout:
     place: _Box
 
 
-class Scattered:
+class Scattered(ComposedScenes):
     """Pictures with few objects on a ground: single objects of one to three classes, or whole photographs.
 
     The ground is made of patches of photographs without objects, each mirrored again and again, which pass into one
@@ -81,17 +80,12 @@ class Scattered:
     ) -> None:
         check(min(size) >= 16, "size", "a width and a height of at least 16 pixels", size)
         check(1 <= sides[0] <= sides[1], "sides", "two ascending numbers of pixels", sides)
-        check(most >= 1 and count >= 1, "most, count", "at least 1", (most, count))
+        check(most >= 1, "most", "at least 1", most)
         check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
+        super().__init__(scenes.classes, count, seed)
         self.scenes, self.whole, self.size, self.sides, self.most = scenes, whole, size, sides, most
-        self.classes = scenes.classes
-        self.ids = list(range(count))
-        self._seed = seed
         self._what = [_VERSION, scenes.fingerprint, whole, size, sides, most, seed]
-        self.fingerprint = hashlib.sha256(json.dumps([*self._what, count]).encode()).hexdigest()
-
-    def __len__(self) -> int:
-        return len(self.ids)
+        self.fingerprint = json_sha256([*self._what, count])
 
     @cached_property
     def alone(self) -> dict[int, list[tuple[int, _Box]]]:
@@ -114,7 +108,7 @@ class Scattered:
 
     def cutouts(self, index: int) -> list[Cutout]:
         """List the parts of photographs in a picture."""
-        draw = self._generator(index)
+        draw = self._generator(index, 0)
         low, high = np.log(self.sides)
         side = np.exp(draw.uniform(low, high))
         count = round(np.exp(draw.uniform(0, np.log(self.most))))
@@ -152,14 +146,7 @@ class Scattered:
             image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)[0]
             fade = 1.0 if self.whole else _fading(y2 - y1)[:, None] * _fading(x2 - x1)
             canvas[:, y1:y2, x1:x2] += (image - canvas[:, y1:y2, x1:x2]) * fade
-        annotation = self.annotation(index)
-        return Scene(
-            self.ids[index],
-            f"scattered {self.ids[index]}, seed {self._seed}",
-            canvas,
-            annotation.boxes,
-            annotation.labels,
-        )
+        return self._scene(index, "scattered", canvas)
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a picture, without composing its image."""
@@ -177,16 +164,9 @@ class Scattered:
             crowd.append(annotation.crowd[inside])
         return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
 
-    def targets(self, index: int) -> list[int]:
-        """List the classes of a picture that may be searched for, ascending."""
-        return legal_targets(self.annotation(index))
-
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a picture depend on."""
-        return hashlib.sha256(json.dumps([*self._what, self.ids[index]]).encode()).hexdigest()
-
-    def _generator(self, index: int, part: int = 0) -> np.random.Generator:
-        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], part]))
+        return json_sha256([*self._what, self.ids[index]])
 
     def _ground(self, index: int) -> Tensor:
         """The ground of a picture, `(3, height, width)`."""

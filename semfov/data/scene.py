@@ -1,12 +1,16 @@
-"""Scenes (images with the boxes of their objects) and the interface of sets of scenes."""
+"""Scenes (images with the boxes of their objects), the interface of their sets, and composed and chosen sets."""
 
+import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape
+from semfov.io.files import json_sha256
 
 Coverage = Literal["sum", "union"]
 
@@ -172,3 +176,87 @@ def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage
         return present
     boxes, labels, size = annotation.boxes, annotation.labels, annotation.size
     return [label for label in present if box_coverage(boxes[labels == label], size, coverage) <= max_area]
+
+
+class ComposedScenes(ABC):
+    """Base of sets whose scenes are composed by a seed: a scene depends only on the seed and on its number.
+
+    Args:
+        classes: names of the detector's classes 1..K.
+        count: number of scenes.
+        seed: seed of the compositions.
+    """
+
+    def __init__(self, classes: tuple[str, ...], count: int, seed: int) -> None:
+        check(count >= 1, "count", "at least 1", count)
+        check(seed >= 0, "seed", "at least 0", seed)
+        self.classes, self._seed = classes, seed
+        self.ids = list(range(count))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @abstractmethod
+    def annotation(self, index: int) -> Annotation:
+        """Return the objects of a scene, without composing its image."""
+
+    def targets(self, index: int) -> list[int]:
+        """List the classes that may be searched for, ascending: those that cover at most a fifth of the scene."""
+        return legal_targets(self.annotation(index))
+
+    def _generator(self, index: int, *part: int) -> np.random.Generator:
+        """The random numbers of a scene, or of a part of it."""
+        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], *part]))
+
+    def _scene(self, index: int, kind: str, image: Tensor) -> Scene:
+        """A composed image with its objects, named after its kind."""
+        annotation, number = self.annotation(index), self.ids[index]
+        return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)
+
+
+class Crowded:
+    """The given share of a set's scenes, those with the most objects; among equals the first scenes count.
+
+    Args:
+        scenes: the set.
+        share: share of its scenes, above 0 and at most 1; rounded up.
+
+    Raises:
+        InputError: the share is outside its range, or the set is empty.
+
+    >>> from semfov.data import EmbeddedScenes
+    >>> scenes = EmbeddedScenes(("person", "cat"), count=6)
+    >>> crowded = Crowded(scenes, 1 / 3)
+    >>> len(crowded), set(crowded.ids) <= set(scenes.ids)
+    (2, True)
+    """
+
+    def __init__(self, scenes: Scenes, share: float) -> None:
+        check(0 < share <= 1, "share", "above 0 and at most 1", share)
+        check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
+        counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
+        order = sorted(range(len(scenes)), key=lambda index: -counts[index])
+        self._scenes, self._chosen = scenes, sorted(order[: math.ceil(share * len(scenes))])
+        self.classes = scenes.classes
+        every = scenes.ids
+        self.ids: list[int] | list[str] = [every[index] for index in self._chosen]  # type: ignore[assignment]
+        self.fingerprint = json_sha256([scenes.fingerprint, self.ids])
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, index: int) -> Scene:
+        """Decode a scene."""
+        return self._scenes[self._chosen[index]]
+
+    def annotation(self, index: int) -> Annotation:
+        """Return the objects of a scene, without decoding its image."""
+        return self._scenes.annotation(self._chosen[index])
+
+    def targets(self, index: int) -> list[int]:
+        """List the classes of a scene that may be searched for."""
+        return self._scenes.targets(self._chosen[index])
+
+    def digest(self, index: int) -> str:
+        """Compute a sha256 of everything that the pixels of a scene depend on."""
+        return self._scenes.digest(self._chosen[index])

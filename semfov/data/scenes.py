@@ -5,7 +5,6 @@ without touching each other, so every box is known by construction.
 """
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,8 +19,9 @@ from torch import Tensor
 
 from semfov.data.classes import class_indices
 from semfov.data.images import read_image
-from semfov.data.scene import Annotation, Scene, legal_targets
+from semfov.data.scene import Annotation, ComposedScenes, Scene
 from semfov.errors import DataError, check
+from semfov.io.files import json_sha256, sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 
@@ -104,7 +104,7 @@ class Item:
         return (px + (x1 - left) * sx, py + (y1 - top) * sy, px + (x2 - left) * sx, py + (y2 - top) * sy)
 
 
-class EmbeddedScenes:
+class EmbeddedScenes(ComposedScenes):
     """Search arrays of 640 × 480 pixels, each with five objects and five distractors on a textured background.
 
     Scene `i` depends only on the seed and on `i`. Objects are people, a cat, a cup and a motorcycle. Objects of classes
@@ -124,11 +124,7 @@ class EmbeddedScenes:
     """
 
     def __init__(self, classes: Sequence[str], *, count: int = 8, seed: int = 0) -> None:
-        check(count >= 1, "count", "at least 1", count)
-        check(seed >= 0, "seed", "at least 0", seed)
-        self.classes = tuple(classes)
-        self.ids = list(range(count))
-        self._seed = seed
+        super().__init__(tuple(classes), count, seed)
         self._labels = class_indices(self.classes)
         labels = {photograph.label for photograph in PHOTOGRAPHED_OBJECTS}
         some = f"at least one of {', '.join(sorted(labels))}"
@@ -136,69 +132,28 @@ class EmbeddedScenes:
         files = sorted(
             {(p.package, p.file) for p in PHOTOGRAPHED_OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES}
         )
-        digests = [hashlib.sha256(_path(*file).read_bytes()).hexdigest() for file in files]
-        settings = json.dumps([_VERSION, self.classes, count, seed, digests])
-        self.fingerprint = hashlib.sha256(settings.encode()).hexdigest()
-
-    def __len__(self) -> int:
-        return len(self.ids)
+        digests = [sha256(_path(*file)) for file in files]
+        self.fingerprint = json_sha256([_VERSION, self.classes, count, seed, digests])
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a scene."""
-        annotation = self.annotation(index)
         image = torch.from_numpy(self._pixels(index)).permute(2, 0, 1).contiguous()
-        name = f"search array {self.ids[index]}, seed {self._seed}"
-        return Scene(self.ids[index], name, image.float() / 255, annotation.boxes, annotation.labels)
+        return self._scene(index, "search array", image.float() / 255)
 
     def items(self, index: int) -> list[Item]:
-        """List the photographs in a scene, objects first.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The photographs with their places.
-        """
+        """List the photographs in a scene with their places, objects first."""
         return _layout(self._generator(index))
 
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, without composing its image.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The objects of the detector's classes.
-        """
+        """Return the objects of a scene, of the detector's classes, without composing its image."""
         objects = [item for item in self.items(index) if item.photograph.label in self._labels]
         boxes = torch.tensor([item.box() for item in objects], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([self._labels[item.photograph.label] for item in objects], dtype=torch.int64)
         return Annotation(boxes, labels, torch.zeros(len(objects), dtype=torch.bool), _SIZE)
 
-    def targets(self, index: int) -> list[int]:
-        """List the classes of a scene that may be searched for.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            Class indices 1..K, ascending.
-        """
-        return legal_targets(self.annotation(index))
-
     def digest(self, index: int) -> str:
-        """Compute the sha256 of a scene's pixels.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            64 hexadecimal digits.
-        """
+        """Compute the sha256 of a scene's pixels."""
         return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
-
-    def _generator(self, index: int) -> np.random.Generator:
-        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
 
     def _pixels(self, index: int) -> NDArray[np.uint8]:
         generator = self._generator(index)

@@ -66,17 +66,7 @@ def check_there(source: Path) -> None:
 
 
 def is_video(source: Path) -> bool:
-    """Tell by its name whether a file is a video.
-
-    Args:
-        source: the file.
-
-    Returns:
-        Whether it is a video.
-
-    >>> is_video(Path("holiday.MP4"))
-    True
-    """
+    """Tell by its name whether a file is a video."""
     return source.suffix.lower() in VIDEOS and not source.is_dir()
 
 

@@ -26,7 +26,7 @@ _IGNORED = frozenset(_COMMON.split())
 """Words of a description that are ignored because most descriptions have them."""
 
 TEMPERATURE = 0.08
-"""Temperature of `spread`, chosen on synonyms of COCO's classes (docs/measurements/words.md)."""
+"""Temperature of `spread`, chosen on synonyms of COCO's classes (docs/words.md)."""
 
 
 class WordVectors:

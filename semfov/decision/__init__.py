@@ -1,11 +1,11 @@
 """Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
 
 from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
-from semfov.decision.close_up import CloseUp
 from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
 from semfov.decision.rule import (
     NEARLY,
     OUTCOMES,
+    CloseUp,
     Decision,
     Outcome,
     check_thresholds,

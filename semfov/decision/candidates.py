@@ -11,9 +11,8 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.verification import closer_features
-from semfov.decision.close_up import CloseUp
 from semfov.decision.evidence import cell_of, strength, strongest
-from semfov.decision.rule import place_known
+from semfov.decision.rule import CloseUp, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou

@@ -11,8 +11,7 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import MATCHED, Verification, best_detection
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
-from semfov.decision.close_up import CloseUp
-from semfov.decision.rule import OUTCOMES, Decision, verified
+from semfov.decision.rule import OUTCOMES, CloseUp, Decision, verified
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole

@@ -1,4 +1,4 @@
-"""Names of a detector's classes, and outputs that do not stand for a class."""
+"""Names of a detector's classes: COCO's, and outputs that do not stand for a class."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +7,20 @@ import torch
 
 from semfov.detection.scores import Candidates
 from semfov.errors import check
+
+_NAMES = """
+person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light,
+fire hydrant, stop sign, parking meter, bench, bird, cat, dog, horse, sheep, cow,
+elephant, bear, zebra, giraffe, backpack, umbrella, handbag, tie, suitcase, frisbee,
+skis, snowboard, sports ball, kite, baseball bat, baseball glove, skateboard, surfboard, tennis racket, bottle,
+wine glass, cup, fork, knife, spoon, bowl, banana, apple, sandwich, orange,
+broccoli, carrot, hot dog, pizza, donut, cake, chair, couch, potted plant, bed,
+dining table, toilet, tv, laptop, mouse, remote, keyboard, cell phone, microwave, oven,
+toaster, sink, refrigerator, book, clock, vase, scissors, teddy bear, hair drier, toothbrush
+"""
+
+COCO_CLASSES: tuple[str, ...] = tuple(name.strip() for name in _NAMES.split(","))
+
 
 PLACEHOLDERS = ("", "N/A", "__background__")
 """Names of outputs that do not stand for a class: gaps in COCO's category ids, and background."""

@@ -1,16 +1,334 @@
-"""Darknet networks as PyTorch modules, built from the sections of a cfg."""
+"""Darknet networks as PyTorch modules: their layers, built from the sections of a cfg, and their weights files."""
 
 import hashlib
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from os import PathLike
+from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from semfov.detection.darknet_builder import Builder
 from semfov.detection.darknet_config import Section
-from semfov.detection.darknet_layers import Head
 from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
+from semfov.io.files import check_regular
+from semfov.io.schema import excerpt
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "linear": lambda x: x,
+    "leaky": lambda x: F.leaky_relu(x, 0.1, inplace=True),
+    "relu": lambda x: F.relu(x, inplace=True),
+    "mish": F.mish,
+    "swish": F.silu,
+    "logistic": F.sigmoid,
+}
+"""Activations by their Darknet name; they may overwrite their argument."""
+
+
+class Convolution(nn.Conv2d):
+    """Convolution and activation; batch norm is folded into the weight and the bias.
+
+    Attributes:
+        normalised: whether the weights file holds batch-norm statistics for this layer.
+        activation: name of the activation in `ACTIVATIONS`.
+
+    Shape:
+        - input: `(B, in_channels, H, W)`
+        - output: `(B, out_channels, H', W')`
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        size: int,
+        *,
+        stride: int = 1,
+        padding: int = 0,
+        groups: int = 1,
+        activation: str = "linear",
+        normalised: bool = False,
+    ) -> None:
+        super().__init__(in_channels, out_channels, size, stride, padding, groups=groups)
+        self.activation, self.normalised = activation, normalised
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Convolve and activate."""
+        return ACTIVATIONS[self.activation](super().forward(input))
+
+
+class MaxPool(nn.Module):
+    """Darknet's max pool.
+
+    The padding (by default `size - 1`) is split between both sides; if it is odd, the larger half is on the right and
+    at the bottom. The output is `(W + padding - size) // stride + 1` wide, so `size=2, stride=1` keeps the size.
+    """
+
+    def __init__(self, size: int, stride: int, padding: int) -> None:
+        super().__init__()
+        self.size, self.stride, self.padding = size, stride, padding
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Pool `(B, C, H, W)` to `(B, C, H', W')`."""
+        before = self.padding // 2
+        right, bottom = (self._after(n, before) for n in (image.shape[-1], image.shape[-2]))
+        if before == right == bottom and 2 * before <= self.size:
+            return F.max_pool2d(image, self.size, self.stride, before)
+        padded = F.pad(image, (before, right, before, bottom), value=float("-inf"))
+        return F.max_pool2d(padded, self.size, self.stride)
+
+    def _after(self, length: int, before: int) -> int:
+        outputs = (length + self.padding - self.size) // self.stride + 1
+        return max(0, (outputs - 1) * self.stride + self.size - length - before)
+
+
+class Upsample(nn.Module):
+    """Repeat every pixel `stride` times in both axes."""
+
+    def __init__(self, stride: int) -> None:
+        super().__init__()
+        self.stride = stride
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Enlarge `(B, C, H, W)` to `(B, C, stride H, stride W)`."""
+        return F.interpolate(image, scale_factor=float(self.stride), mode="nearest")
+
+
+class Route(nn.Module):
+    """Concatenate the channels of earlier layers, or one of `groups` equal parts of each."""
+
+    def __init__(self, groups: int = 1, group: int = 0) -> None:
+        super().__init__()
+        self.groups, self.group = groups, group
+
+    def forward(self, *images: Tensor) -> Tensor:
+        """Concatenate `(B, C_i, H, W)` to `(B, Σ C_i / groups, H, W)`."""
+        chunks = [image.chunk(self.groups, 1)[self.group] for image in images]
+        return chunks[0] if len(chunks) == 1 else torch.cat(chunks, 1)
+
+
+class Shortcut(nn.Module):
+    """Add the output of an earlier layer to the output of the previous one, and activate."""
+
+    def __init__(self, activation: str) -> None:
+        super().__init__()
+        self.activation = activation
+
+    def forward(self, image: Tensor, earlier: Tensor) -> Tensor:
+        """Add two maps `(B, C, H, W)`."""
+        return ACTIVATIONS[self.activation](image + earlier)
+
+
+class Head(nn.Module):
+    """A yolo layer: it returns its map unchanged, and holds the settings for decoding it.
+
+    Attributes:
+        anchors: `(width, height)` of the anchors in canvas pixels.
+        classes: number of classes.
+        scale: Darknet's `scale_x_y`; with more than 1, centres of boxes may lie outside their cell.
+    """
+
+    def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
+        super().__init__()
+        self.anchors, self.classes, self.scale = anchors, classes, scale
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the map: centre, size, objectness and classes of every anchor."""
+        return len(self.anchors) * (5 + self.classes)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the map unchanged."""
+        return image
+
+
+# YOLOv3 has 62 million parameters and a map of 12 million numbers; the limits keep a typing error from filling memory.
+_MOST_PARAMETERS = 3 * 10**8
+_MOST_ELEMENTS = 2**28
+_MOST_LAYERS = 2000
+_LARGEST_KERNEL = 255
+
+# Keys that change what a layer computes, with the only value that is implemented.
+_NEUTRAL = {
+    "convolutional": {"binary": "0", "xnor": "0", "dilation": "1", "antialiasing": "0"},
+    "maxpool": {"maxpool_depth": "0", "antialiasing": "0"},
+    "shortcut": {"weights_type": "none"},
+    "upsample": {"scale": "1"},
+    "yolo": {"new_coords": "0"},
+}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Channels of an output, and input pixels per output pixel."""
+
+    channels: int
+    step: Fraction
+
+
+class Builder:
+    """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads.
+
+    Args:
+        channels: number of channels of the image.
+        size: `(width, height)` of the image.
+    """
+
+    def __init__(self, channels: int, size: tuple[int, int]) -> None:
+        self._pixels = size[0] * size[1]
+        self._parameters = 0
+        self.shapes: list[Shape] = []
+        self.sources: list[tuple[int, ...]] = []
+        self._image = Shape(channels, Fraction(1))
+        self._makers: dict[str, Callable[[Section], nn.Module]] = {
+            "convolutional": self._convolution,
+            "maxpool": self._maxpool,
+            "upsample": self._upsample,
+            "route": self._route,
+            "shortcut": self._shortcut,
+            "yolo": self._yolo,
+            "dropout": self._dropout,
+        }
+
+    def add(self, section: Section) -> nn.Module:
+        """Make the layer of the next section."""
+        if len(self.shapes) >= _MOST_LAYERS:
+            raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers, got more; check the cfg")
+        if section.kind not in self._makers:
+            kinds = ", ".join(self._makers)
+            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {kinds}")
+        for key, value in _NEUTRAL.get(section.kind, {}).items():
+            if section.text(key, value) != value:
+                raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")
+        return self._makers[section.kind](section)
+
+    @property
+    def _here(self) -> Shape:
+        return self.shapes[-1] if self.shapes else self._image
+
+    def _note(self, channels: int, step: Fraction, *sources: int) -> None:
+        self._append(Shape(channels, step), (len(self.shapes) - 1, *sources))
+
+    def _append(self, shape: Shape, sources: tuple[int, ...]) -> None:
+        """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
+        if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
+            raise DataError(
+                f"cfg: layer {len(self.shapes)} has a map of more than {_MOST_ELEMENTS:,} numbers; check the cfg"
+            )
+        self.sources.append(sources)
+        self.shapes.append(shape)
+
+    def _convolution(self, section: Section) -> nn.Module:
+        here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
+        if here.channels % groups or filters % groups:
+            raise DataError(
+                f"{section.where}: expected groups that divide {excerpt(here.channels)} input channels and "
+                f"{excerpt(filters)} filters, got {excerpt(groups)}"
+            )
+        size, stride = section.integer("size", 1), section.integer("stride", 1)
+        # Parameters are counted before the layer is made, because making it allocates them.
+        self._parameters += here.channels // groups * filters * size**2 + 4 * filters
+        if self._parameters > _MOST_PARAMETERS:
+            raise DataError(
+                f"{section.where}: expected at most {_MOST_PARAMETERS:,} parameters up to this layer, got more; "
+                f"check the cfg"
+            )
+        _check_kernel(section, size, stride, section.integer("padding", 0, minimum=0))
+        same = section.integer("pad", 0, minimum=0)
+        self._note(filters, here.step * stride)
+        return Convolution(
+            here.channels,
+            filters,
+            size,
+            stride=stride,
+            padding=size // 2 if same else section.integer("padding", 0, minimum=0),
+            groups=groups,
+            activation=_activation(section, "logistic"),
+            normalised=bool(section.integer("batch_normalize", 0, minimum=0)),
+        )
+
+    def _maxpool(self, section: Section) -> nn.Module:
+        stride = section.integer("stride", 1)
+        size = section.integer("size", stride)
+        padding = section.integer("padding", size - 1, minimum=0)
+        _check_kernel(section, size, stride, padding)
+        self._note(self._here.channels, self._here.step * stride)
+        return MaxPool(size, stride, padding)
+
+    def _upsample(self, section: Section) -> nn.Module:
+        stride = section.integer("stride", 2)
+        self._note(self._here.channels, self._here.step / stride)
+        return Upsample(stride)
+
+    def _route(self, section: Section) -> nn.Module:
+        sources = tuple(self._layer(section, "layers", layer) for layer in section.integers("layers"))
+        groups, group = section.integer("groups", 1), section.integer("group_id", 0, minimum=0)
+        shapes = [self.shapes[source] for source in sources]
+        if len({shape.step for shape in shapes}) != 1:
+            raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
+        if group >= groups or any(shape.channels % groups for shape in shapes):
+            counts = excerpt([shape.channels for shape in shapes])
+            raise DataError(
+                f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
+                f"{counts}, got group_id={excerpt(group)} and groups={excerpt(groups)}"
+            )
+        self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
+        return Route(groups, group)
+
+    def _shortcut(self, section: Section) -> nn.Module:
+        sources = [self._layer(section, "from", layer) for layer in section.integers("from")]
+        if len(sources) != 1 or self.shapes[sources[0]] != self._here:
+            raise DataError(f"{section.where}: [shortcut] expected one layer of the same shape, got layers {sources}")
+        self._note(self._here.channels, self._here.step, *sources)
+        return Shortcut(_activation(section, "linear"))
+
+    def _yolo(self, section: Section) -> nn.Module:
+        numbers = section.numbers("anchors")
+        pairs = list(zip(numbers[::2], numbers[1::2], strict=False))
+        mask = section.integers("mask", ",".join(map(str, range(len(pairs)))))
+        if len(numbers) % 2 or not mask or any(not 0 <= index < len(pairs) for index in mask):
+            raise DataError(
+                f"{section.where}: [yolo] expected pairs of anchors and a mask of their indices, got {len(numbers)} "
+                f"numbers and the mask {mask}"
+            )
+        scale = section.numbers("scale_x_y", "1")
+        head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
+        if head.channels != self._here.channels:
+            raise DataError(f"{section.where}: [yolo] expected {head.channels} channels, got {self._here.channels}")
+        self._note(self._here.channels, self._here.step)
+        return head
+
+    def _dropout(self, section: Section) -> nn.Module:
+        self._note(self._here.channels, self._here.step)
+        return nn.Identity()
+
+    def _layer(self, section: Section, key: str, number: int) -> int:
+        index = number if number >= 0 else len(self.shapes) + number
+        if not 0 <= index < len(self.shapes):
+            raise DataError(
+                f"{section.where}: [{section.kind}] expected {key} to name an earlier layer, got {key}={number}"
+            )
+        return index
+
+
+def _check_kernel(section: Section, size: int, stride: int, padding: int) -> None:
+    if size > _LARGEST_KERNEL or stride > _LARGEST_KERNEL or padding > size:
+        raise DataError(
+            f"{section.where}: [{section.kind}] expected size and stride up to {_LARGEST_KERNEL} and no more padding "
+            f"than size, got {size}, {stride} and {padding}"
+        )
+
+
+def _activation(section: Section, default: str) -> str:
+    name = section.text("activation", default)
+    if name not in ACTIVATIONS:
+        raise DataError(f"{section.where}: activation {name!r} is not supported; known: {', '.join(ACTIVATIONS)}")
+    return name
 
 
 class Darknet(nn.Module):
@@ -33,7 +351,7 @@ class Darknet(nn.Module):
         - input: `(B, C, H, W)`
         - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
 
-    >>> from semfov.detection.architectures import yolov3_tiny
+    >>> from semfov.detection.darknet_config import yolov3_tiny
     >>> [tuple(m.shape) for m in Darknet(yolov3_tiny())(torch.zeros(1, 3, 64, 96))]
     [(1, 255, 2, 3), (1, 255, 4, 6)]
     """
@@ -94,18 +412,90 @@ class Darknet(nn.Module):
         check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
     def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
-        """Run the layers from `start` to `stop - 1`.
-
-        Args:
-            outputs: outputs of earlier layers by layer number; -1 is the image. They may be overwritten.
-            start: first layer to run.
-            stop: the layer after the last one to run.
-
-        Returns:
-            The outputs by layer number that later layers read, and the maps of the heads.
-        """
+        """Run layers `start` to `stop - 1` on outputs by layer (-1 is the image); returns those that are read later."""
         outputs = dict(outputs)
         for index in range(start, stop):
             outputs[index] = self.layers[index](*(outputs[source] for source in self.sources[index]))
             outputs = {source: output for source, output in outputs.items() if self._last_reader[source] > index}
         return outputs
+
+
+EPSILON = 1e-5
+"""Constant ε that batch norm adds to the variance."""
+
+
+@torch.no_grad()
+def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
+    """Load the parameters in a weights file into a network, with batch norm folded in.
+
+    The header of the file holds major version, minor version and revision as int32, then the number of images seen in
+    training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with batch norm
+    also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in float64:
+
+        weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
+
+    Args:
+        network: the network; its parameters are overwritten.
+        path: the weights file.
+
+    Returns:
+        sha256 of the file.
+
+    Raises:
+        DataError: the file cannot be read, or its length or its numbers do not fit the network.
+    """
+    layers = [layer for layer in network.layers if isinstance(layer, Convolution)]
+    check_regular(path, f"weights {str(path)!r}")
+    try:
+        length = Path(path).stat().st_size
+        longest = 20 + 4 * sum(_count(layer) for layer in layers)
+        # A longer file is refused below, so it is not read to its end.
+        with Path(path).open("rb") as file:
+            data = bytearray(file.read(longest + 1))
+    except OSError as error:
+        raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
+    start = _header(data)
+    needed = start + 4 * sum(_count(layer) for layer in layers)
+    if length != needed or len(data) != needed:
+        fault = "truncated" if length < needed else "too long"
+        sizes = f"expected {needed} bytes for this network, got {length}"
+        raise DataError(f"weights {str(path)!r}: {sizes}; the file is {fault}, or belongs to another network")
+    numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
+    if not bool(torch.isfinite(numbers).all()):
+        raise DataError(
+            f"weights {str(path)!r}: expected finite numbers, got NaN or infinite ones; the file is damaged or not a "
+            f"weights file"
+        )
+    for layer in layers:
+        numbers = _fill(layer, numbers, str(path))
+    return hashlib.sha256(data).hexdigest()
+
+
+def _header(data: bytearray) -> int:
+    if len(data) < 12:
+        return 20
+    major, minor, _ = struct.unpack_from("<3i", data)
+    return 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
+
+
+def _count(layer: Convolution) -> int:
+    return layer.weight.numel() + layer.out_channels * (4 if layer.normalised else 1)
+
+
+def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
+    """Load the first numbers into `layer`, and return the rest."""
+    channels = layer.out_channels
+    vectors = numbers[: channels * (4 if layer.normalised else 1)].view(-1, channels).double()
+    weight = numbers[vectors.numel() : _count(layer)].view(layer.weight.shape).double()
+    bias = vectors[0]
+    if layer.normalised:
+        _, scale, mean, variance = vectors
+        if bool((variance < 0).any()):
+            raise DataError(
+                f"weights {path!r}: expected variances of at least 0, got negative ones; the file does not fit the cfg"
+            )
+        factor = scale / (variance + EPSILON).sqrt()
+        weight, bias = weight * factor[:, None, None, None], bias - mean * factor
+    layer.weight.copy_(weight)
+    cast(Tensor, layer.bias).copy_(bias)
+    return numbers[_count(layer) :]

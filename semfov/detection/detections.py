@@ -1,17 +1,23 @@
-"""The detections that a detector returns: a padded batch of boxes with full class-score vectors."""
+"""The detections that a detector returns: a padded batch of boxes with full class-score vectors, and its conversion."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
-from semfov.detection.exchange import Exchange
-from semfov.errors import check, check_shape
+from semfov.detection.exchange import SCORES, category_ids, coco_results, named_detections, vectors_of
+from semfov.errors import InputError, check, check_shape
+
+if TYPE_CHECKING:
+    import supervision
 
 
 @dataclass(frozen=True)
-class Detections(Exchange):
+class Detections:
     """A padded batch of detections, each with a score for every class and for background.
 
     Attributes:
@@ -21,6 +27,9 @@ class Detections(Exchange):
 
     Detections are in descending order of confidence (the largest score of a class other than background), with padding
     last.
+
+    Other libraries store one class and one score for each box: the most probable class other than background, and its
+    score. Where a library can store further data, the full score vector is stored too, and converting back is exact.
 
     >>> d = Detections(torch.zeros(1, 2, 4), torch.full((1, 2, 3), 1 / 3), torch.tensor([[True, False]]))
     >>> d.count
@@ -114,3 +123,140 @@ class Detections(Exchange):
         return type(self)(
             pad(self.boxes, (0, 0, 0, extra)), pad(self.scores, (0, 0, 0, extra)), pad(self.mask, (0, extra))
         )
+
+    def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Boxes, score vectors, classes from 1, and scores of the single image."""
+        mask = self.mask
+        if mask.shape[:-1].numel() != 1:
+            raise InputError(
+                f"detections: expected the detections of one image, such as detections[0], got a batch of shape "
+                f"{tuple(mask.shape[:-1])}"
+            )
+        real = mask.reshape(-1)
+        boxes, vectors = self.boxes.reshape(-1, 4)[real], self.scores.reshape(-1, self.scores.shape[-1])[real]
+        best = vectors[:, 1:].max(-1) if vectors.shape[-1] > 1 else vectors.max(-1)
+        return boxes, vectors, best.indices + 1, best.values
+
+    def to_supervision(self, classes: Sequence[str] | None = None) -> supervision.Detections:
+        """Convert the detections of one image to `supervision.Detections`, for its annotators, trackers and metrics.
+
+        Supervision numbers classes from 0, without background. The full score vectors are in `data["scores"]`.
+
+        Args:
+            classes: names of the classes, without background, for `data["class_name"]`; None leaves them out.
+
+        Returns:
+            The detections for Supervision.
+
+        Raises:
+            InputError: there are several images, the number of names is wrong, or Supervision is not installed.
+
+        Example::
+
+            picture = supervision.BoxAnnotator().annotate(picture, seen.to_supervision(detector.classes))
+        """
+        boxes, vectors, labels, scores = (tensor.detach().cpu() for tensor in self._of_one_image())
+        if classes is not None:
+            count = vectors.shape[-1] - 1
+            check(len(classes) == count, "classes", f"{count} names, without background", len(classes))
+        return named_detections(boxes, labels, scores, classes, {SCORES: vectors.numpy()})
+
+    @classmethod
+    def from_supervision(cls, detections: supervision.Detections, classes: int) -> Self:
+        """Convert `supervision.Detections` of one image to a batch of one image.
+
+        Full score vectors are taken from `data["scores"]`. Without them, the vector of a box has the confidence at its
+        class, and the rest up to 1 at background.
+
+        Args:
+            detections: detections with `class_id`, from 0, and `confidence` (1 where it is missing).
+            classes: number of classes, without background.
+
+        Returns:
+            The detections.
+
+        Raises:
+            InputError: classes are missing, or a class or a confidence is out of range.
+        """
+        boxes = torch.as_tensor(detections.xyxy).reshape(-1, 4)
+        boxes = boxes if boxes.is_floating_point() else boxes.float()
+        full = detections.data.get(SCORES)
+        if full is not None:
+            vectors = torch.as_tensor(full)
+            shape = (len(boxes), classes + 1)
+            check(tuple(vectors.shape) == shape, "data['scores']", f"shape {shape}", tuple(vectors.shape))
+            return cls._one_image(boxes, vectors)
+        if detections.class_id is None and len(boxes):
+            raise InputError("detections: expected a class_id for every box, got none")
+        labels = torch.as_tensor([] if detections.class_id is None else detections.class_id).long() + 1
+        confidence = detections.confidence
+        return cls._one_image(
+            boxes, vectors_of(labels, None if confidence is None else torch.as_tensor(confidence), classes)
+        )
+
+    def to_torchvision(self) -> dict[str, Tensor]:
+        """Convert the detections of one image to the form of torchvision's detectors, which `torchmetrics` also takes.
+
+        Returns:
+            `boxes` `(L, 4)`, `labels` `(L,)` from 1 (0 is background), and `scores` `(L,)`.
+
+        Raises:
+            InputError: there are several images.
+        """
+        boxes, _, labels, scores = self._of_one_image()
+        return {"boxes": boxes.clone(), "labels": labels, "scores": scores}
+
+    @classmethod
+    def from_torchvision(cls, detections: Mapping[str, Tensor], classes: int) -> Self:
+        """Convert the output of a torchvision detector for one image to a batch of one image.
+
+        The score vector of a box has the score at its class, and the rest up to 1 at background.
+
+        Args:
+            detections: `boxes`, `labels` from 1, and `scores` (1 where they are missing, as in training targets).
+            classes: number of classes, without background.
+
+        Returns:
+            The detections.
+
+        Raises:
+            InputError: boxes or labels are missing, or a label or a score is out of range.
+        """
+        for name in ("boxes", "labels"):
+            check(name in detections, "detections", f"the key {name!r}", f"the keys {sorted(detections)}")
+        labels = detections["labels"]
+        return cls._one_image(detections["boxes"], vectors_of(labels.long(), detections.get("scores"), classes))
+
+    def to_coco(
+        self,
+        image_id: int,
+        categories: Sequence[int] | Sequence[Mapping[str, Any]],
+        classes: Sequence[str] | None = None,
+    ) -> list[dict[str, Any]]:
+        """Convert the detections of one image to COCO results, for `pycocotools.COCO.loadRes`.
+
+        Args:
+            image_id: id of the image in the annotation file.
+            categories: the category id of each class, or the `categories` of the annotation file, in which classes are
+                then found by name.
+            classes: names of the classes, without background; needed to find classes by name.
+
+        Returns:
+            `image_id`, `category_id`, `bbox` as `[x, y, width, height]`, and `score` of each box.
+
+        Raises:
+            InputError: there are several images, or a class has no category.
+        """
+        boxes, vectors, labels, scores = (tensor.detach().cpu() for tensor in self._of_one_image())
+        ids = category_ids(categories, classes)
+        count = vectors.shape[-1] - 1
+        check(len(ids) == count, "categories", f"one id for each of {count} classes", len(ids))
+        return coco_results(image_id, boxes, labels, scores, dict(enumerate(ids, 1)))
+
+    @classmethod
+    def _one_image(cls, boxes: Tensor, vectors: Tensor) -> Self:
+        """A batch of one, in descending order of confidence."""
+        check_shape(boxes, "boxes", len(vectors), 4)
+        order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
+        mask = torch.ones(1, len(boxes), dtype=torch.bool, device=boxes.device)
+        return cls(boxes[order][None], vectors[order][None], mask)

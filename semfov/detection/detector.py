@@ -39,6 +39,7 @@ class Detector(nn.Module, ABC):
         fill: value of the canvas's padding.
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
+        corner: whether letterboxed images are in the upper left corner of the canvas instead of its middle.
         faint: confidence from which on a candidate is a hint of where to zoom in (`semfov.zoom.hints`).
         least: score from which on a detection counts: two of three are right.
         digest: sha256 of the weights, `""` for random weights.
@@ -67,6 +68,7 @@ class Detector(nn.Module, ABC):
         fill: float = 0.5,
         stride: int | None = None,
         stretch: bool = False,
+        corner: bool = False,
         faint: float = FAINT,
         least: float = LEAST,
         digest: str = "",
@@ -83,7 +85,7 @@ class Detector(nn.Module, ABC):
         self.selection = Selection() if selection is None else selection
         self.fill = fill
         self.stride = stride
-        self.stretch = stretch
+        self.stretch, self.corner = stretch, corner
         self.faint, self.least = faint, least
         self.digest = digest
 
@@ -126,7 +128,9 @@ class Detector(nn.Module, ABC):
             The canvas `(B, 3, h, w)`, and the placement of the images on it.
         """
         check_images(images)
-        return letterbox(images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch)
+        return letterbox(
+            images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch, corner=self.corner
+        )
 
     def detect(
         self,

@@ -10,20 +10,15 @@ from pathlib import Path
 
 import torch
 
+from semfov.detection.darknet_onnx import network_model
 from semfov.detection.detector import Detector
-from semfov.detection.export_graph import network_model
-from semfov.detection.onnx_settings import METADATA_KEY
+from semfov.detection.onnx_file import METADATA_KEY
 from semfov.detection.yolo import YoloV3
 from semfov.errors import InputError
-from semfov.io.files import replacing
-
-CARD_KEY = "model_card"
-"""Key of the model card, a text for people, in the metadata of an exported model."""
+from semfov.io.files import write_bytes
 
 
-def export_onnx(
-    detector: Detector, path: str | PathLike[str], *, static: bool = False, card: str | None = None
-) -> None:
+def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:
     """Write a Darknet detector as an ONNX model.
 
     The model takes `images` `(B, 3, H, W)`, RGB in [0, 1]. It returns all boxes of all heads, before any selection:
@@ -35,7 +30,6 @@ def export_onnx(
         path: path of the ONNX file.
         static: fix the input to one image of the detector's `input_size`, for runtimes that need fixed sizes. Otherwise
             the model takes any batch, and any size that is a multiple of the network's stride.
-        card: text for people, stored in the metadata under the key `model_card`.
 
     Raises:
         InputError: the detector is not a Darknet network.
@@ -45,10 +39,7 @@ def export_onnx(
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
     model = network_model(detector.network, detector.name, detector.input_size if static else None)
     model.metadata_props.add(key=METADATA_KEY, value=json.dumps(_settings(detector, static)))
-    if card is not None:
-        model.metadata_props.add(key=CARD_KEY, value=card)
-    with replacing(Path(path)) as temporary:
-        temporary.write_bytes(model.SerializeToString())
+    write_bytes(path, model.SerializeToString())
 
 
 def _settings(detector: YoloV3, static: bool) -> dict[str, object]:
@@ -63,17 +54,7 @@ def _settings(detector: YoloV3, static: bool) -> dict[str, object]:
 
 
 def largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
-    """Compute the largest absolute difference between the outputs of a detector and its export, on one noise image.
-
-    Boxes are compared as fractions of the canvas, so that all numbers are of order 1.
-
-    Args:
-        detector: the detector.
-        path: its exported ONNX file.
-
-    Returns:
-        The difference.
-    """
+    """Largest absolute difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
     from semfov.detection.onnx import load_onnx
 
     exported = load_onnx(path)

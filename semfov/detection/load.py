@@ -8,14 +8,12 @@ from typing import Any
 import torch
 from torch import nn
 
-from semfov.detection.architectures import ARCHITECTURES
-from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_config import read_cfg
-from semfov.detection.darknet_weights import read_weights
+from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.darknet import Darknet, read_weights
+from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
+from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.detector import Detector
 from semfov.detection.modules import comes_from
-from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
@@ -90,20 +88,7 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
 
 
 def load_module(module: nn.Module, **options: Any) -> Detector:
-    """Make a detector of a torch module of another library; its library is recognised by the module of its class.
-
-    The module itself is used, not a copy, and set to `eval` mode.
-
-    Args:
-        module: a detection model of torchvision, an object detection model of transformers, or a model of Ultralytics.
-        options: options of `wrap_torchvision`, `wrap_transformers` or `wrap_ultralytics`.
-
-    Returns:
-        The detector, in `eval` mode.
-
-    Raises:
-        InputError: the library is unknown, or an option does not fit the module.
-    """
+    """Make a detector of a module of another library (in memory, not a copy), which is known by its class."""
     if comes_from(module, "torchvision.models.detection"):
         from semfov.detection.torchvision import wrap_torchvision
 

@@ -1,9 +1,66 @@
-"""Torch modules of other libraries: the library that one is from, and a digest of its weights."""
+"""Torch modules of other libraries as detectors: what the adapters of all libraries share."""
 
 import hashlib
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.detection.class_names import keep_classes, named_outputs
+from semfov.detection.detector import Detector
+from semfov.detection.placement import Placement
+from semfov.detection.scores import Candidates
+from semfov.errors import InputError, check_shape
+
+
+class ModuleDetector(Detector):
+    """Base of detectors whose network is a torch module of another library; they are differentiable.
+
+    Args:
+        model: the network.
+        classes: name of each of its scores; names that do not stand for a class are left out (`PLACEHOLDERS`).
+        name: name of the model in tables and in fitted models.
+        input_size: `(width, height)` of the canvas in pixels.
+        options: further arguments of `Detector`.
+    """
+
+    def __init__(
+        self, model: nn.Module, classes: Sequence[str], name: str, input_size: tuple[int, int], **options: Any
+    ) -> None:
+        names, places = named_outputs(classes)
+        super().__init__(name, names, input_size, **options)
+        self.model = model.eval()
+        self._places, self._count = places, len(classes)
+
+    def _pixels(self, canvas: Tensor) -> Tensor:
+        """A canvas in the precision of the network; raises `InputError` for anything else."""
+        check_shape(canvas, "canvas", None, 3, None, None)
+        if not canvas.is_floating_point():
+            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        return canvas.to(next(self.model.parameters()).dtype)
+
+    def _named(self, candidates: Candidates) -> Candidates:
+        """The candidates without scores that do not stand for a class."""
+        return keep_classes(candidates, self._places, self._count)
+
+
+def edge_scale(images: Tensor, edges: tuple[int, int]) -> float:
+    """The scale at which the shorter edge of images has a length, unless the longer one exceeds another."""
+    height, width = images.shape[-2:]
+    return min(edges[0] / min(width, height), edges[1] / max(width, height))
+
+
+def resized_images(
+    images: Tensor, *, scale: float = 1.0, size: tuple[int, int] | None = None, antialias: bool = False
+) -> tuple[Tensor, Placement]:
+    """Images resized bilinearly by a scale, or to `(width, height)`, and their placement, without padding."""
+    height, width = images.shape[-2:]
+    columns, rows = (max(1, math.floor(n * scale)) for n in (width, height)) if size is None else size
+    canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False, antialias=antialias)
+    return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))
 
 
 def module_digest(module: nn.Module) -> str:

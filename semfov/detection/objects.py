@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from semfov.detection.overlaps import intersection, neighbours, survivors
 from semfov.errors import InputError, check, check_number, check_shape
+
+Column = NDArray[np.float32]
+Index = NDArray[np.intp]
 
 LEAST = 0.3
 """Score from which on objects are shown, printed, drawn and counted, unless the detector or the user gives another."""
@@ -200,22 +202,7 @@ def unlike(
     inside: float = 0.8,
     around: float | None = None,
 ) -> Tensor:
-    """One box of each object, by the rule of `merge_looks`.
-
-    Args:
-        boxes: `(M, 4)`, in picture pixels.
-        scores: `(M,)`, scores.
-        labels: `(M,)`, classes.
-        looks: `(M,)`, number of the look of each box.
-        cut: `(M,)`, boolean, boxes that the border of their look cuts.
-        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
-        iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a cut box from which on it is the same object.
-        around: width of a picture whose left and right borders meet; None for others.
-
-    Returns:
-        Indices of the boxes, most confident first.
-    """
+    """Indices of one box of each object, by the rule of `merge_looks` and with its arguments, most confident first."""
     # Stable sorts, the last key first.
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
@@ -264,3 +251,59 @@ def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
     tensor = tensor if tensor.is_floating_point() else tensor.float()
     check(bool(tensor.isfinite().all()), name, "finite numbers", "infinite ones or NaN")
     return tensor
+
+
+def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[Index, Index]:
+    """Pairs of intervals of which the second starts within the first.
+
+    Args:
+        start: `(N,)`, in ascending order.
+        end: `(N,)`, none before its start.
+
+    Returns:
+        Indices `(P,)` of the first interval of each pair, and of the second.
+
+    >>> neighbours(np.array([0.0, 1.0, 5.0]), np.array([2.0, 3.0, 6.0]))
+    (array([0]), array([1]))
+    """
+    stop = start.searchsorted(end, side="right")
+    count = stop - np.arange(1, len(start) + 1)
+    first = np.arange(len(start)).repeat(count)
+    # The pairs of an interval stand together, and the last of them is with interval `stop - 1`.
+    second = np.arange(len(first)) + (stop - count.cumsum()).repeat(count)
+    return first, second
+
+
+def intersection(x1: Column, y1: Column, x2: Column, y2: Column, first: Index, second: Index) -> Column:
+    """Area `(P,)` that the boxes of each pair share, given edges `(N,)` of the boxes and indices `(P,)` of both."""
+    wide = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
+    high = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
+    shared: Column = np.maximum(wide, 0) * np.maximum(high, 0)
+    return shared
+
+
+def survivors(count: int, better: Index, worse: Index) -> Index:
+    """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
+
+    Args:
+        count: number of boxes, the best first.
+        better: `(P,)`, index of the better box of each pair.
+        worse: `(P,)`, index of the worse one, which is higher.
+
+    Returns:
+        Indices of the boxes that stay, in ascending order.
+
+    >>> survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
+    array([0, 2])
+    """
+    doubtful, gone = np.zeros((2, count), np.bool_)
+    doubtful[worse] = True
+    # A box that is never the worse one stays. Only the pairs that this leaves open depend on each other.
+    gone[worse[~doubtful[better]]] = True
+    left = np.flatnonzero(~(gone[better] | gone[worse]))
+    pairs = np.sort(better[left] * count + worse[left])
+    removed = bytearray(gone)
+    for one, other in zip((pairs // count).tolist(), (pairs % count).tolist(), strict=True):
+        if not removed[one]:
+            removed[other] = True
+    return np.flatnonzero(np.frombuffer(removed, np.bool_) == 0)

@@ -10,15 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.class_names import keep_classes, named_outputs
-from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.detector import Detector, check_images
-from semfov.detection.onnx_file import check_canvas, check_elements
-from semfov.detection.onnx_recognition import HEADS, STRIDES, Signature, recognise
-from semfov.detection.onnx_resize import with_input_size
+from semfov.detection.class_names import COCO_CLASSES, keep_classes, named_outputs
+from semfov.detection.detector import Detector
+from semfov.detection.onnx_file import check_canvas, check_elements, read_settings, with_input_size
+from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
-from semfov.detection.onnx_settings import read_settings
-from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
@@ -37,7 +33,7 @@ class OnnxDetector(Detector):
 
     Args:
         session: the model.
-        head: name of its head, a key of `semfov.detection.onnx_recognition.HEADS`.
+        head: name of its head, a key of `semfov.detection.onnx_heads.HEADS`.
         classes: name of each score, in order; `"N/A"` for scores that do not stand for a class.
         name: name of the model in tables and in fitted models.
         input_size: `(width, height)` of the canvas; None for the model's fixed size.
@@ -77,28 +73,15 @@ class OnnxDetector(Detector):
             fill=preprocessing.fill,
             stride=stride,
             stretch=preprocessing.stretch,
+            corner=preprocessing.corner,
             faint=family.faint,
             least=family.least,
             digest=digest,
         )
         fixed = None not in session.shape[2:]
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
-        check(stride is None or stride > 0, "stride", "None or a positive number of pixels", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
-
-    def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
-        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input, with the placement of the network's training."""
-        check_images(images)
-        preprocessing = self.preprocessing
-        return letterbox(
-            images,
-            self.input_size,
-            fill=preprocessing.fill,
-            stride=self.stride,
-            stretch=preprocessing.stretch,
-            corner=preprocessing.corner,
-        )
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""

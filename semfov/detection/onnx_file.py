@@ -1,13 +1,18 @@
-"""Checks of an ONNX file before memory is allocated for it."""
+"""ONNX files of detectors: checks before memory is allocated, their settings, and copies with another input size."""
 
+import ast
+import hashlib
+import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semfov.errors import DataError
-from semfov.io.files import check_regular, inside
-from semfov.io.schema import excerpt
+from semfov.detection.onnx_heads import cells
+from semfov.detection.weights import cache_folder
+from semfov.errors import DataError, check
+from semfov.io.files import check_regular, inside, sha256, write_bytes
+from semfov.io.schema import excerpt, is_number, is_plain
 
 MOST_ELEMENTS = 2**28
 """Largest number of elements of a tensor in a model; 1 GiB as float32."""
@@ -17,19 +22,28 @@ MOST_BATCH = 1024
 """Largest fixed batch size of a model."""
 MOST_PIXELS = 89_478_485
 """Largest number of pixels of a canvas, the same as for pictures that are read."""
+_COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
+
+METADATA_KEY = "semfov"
+"""Key of the settings, as JSON, in the metadata of models that semfov exports."""
+
+KEYS: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "head": (str,),
+    "classes": (list,),
+    "input_size": (int, list),
+    "stride": (int, type(None)),
+    "background": (str,),
+    "logits": (bool,),
+    "preprocessing": (dict,),
+    "licence": (str,),
+    "source": (str,),
+}
+"""Keys of a settings file, with the types of their values; `licence` and `source` are for people."""
 
 
 def check_file(path: Path) -> None:
-    """Check that a model's tensors are not too large, and that files with weights are inside its folder.
-
-    The sizes are read from the file and inferred by ONNX's shape inference; nothing is run.
-
-    Args:
-        path: the file.
-
-    Raises:
-        DataError: a tensor is too large, a file with weights is outside the folder, or the file is damaged.
-    """
+    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
     import onnx
 
     check_regular(path, f"ONNX model {str(path)!r}")
@@ -93,3 +107,136 @@ def _without_weights(model: Any) -> Any:
     del slim.graph.initializer[:]
     slim.graph.initializer.extend(small)
     return slim
+
+
+def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Read the settings of a model.
+
+    Settings in `model.json` in the folder of `model.onnx` override settings in the model's metadata. The metadata of
+    models that semfov or Ultralytics (class names, input size) have exported are understood.
+
+    Args:
+        path: path of the model.
+        metadata: metadata of the model.
+
+    Returns:
+        The settings by name.
+
+    Raises:
+        DataError: the file is not a JSON object, or has a key that is not one of `KEYS`.
+    """
+    beside = path.with_suffix(".json")
+    inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
+    outside = _parse(_read(beside), str(beside)) if beside.exists() else {}
+    preprocessing = {**inside.get("preprocessing", {}), **outside.get("preprocessing", {})}
+    return {**_ultralytics(metadata), **inside, **outside, "preprocessing": preprocessing}
+
+
+def _read(path: Path) -> str:
+    check_regular(path)
+    if path.stat().st_size > MOST_METADATA:
+        raise DataError(f"{path}: expected at most {MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read {path}: {error}") from error
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        settings = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
+    except (ValueError, RecursionError):  # integers too long, lists too deep
+        raise DataError(f"{where}: expected JSON, got numbers that are too long or lists that are too deep") from None
+    if not isinstance(settings, dict):
+        raise DataError(f"{where}: expected an object, got {excerpt(settings)}")
+    unknown = sorted(set(settings) - set(KEYS))
+    if unknown:
+        raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
+    for key, value in settings.items():
+        if not isinstance(value, KEYS[key]):
+            kinds = " or ".join(kind.__name__ for kind in KEYS[key])
+            raise DataError(f"{where}: {key}: expected {kinds}, got {excerpt(value)}")
+    names, size = settings.get("classes", []), settings.get("input_size", 1)
+    if not all(isinstance(name, str) and is_plain(name) for name in names):
+        raise DataError(f"{where}: classes: expected names without control characters, got {excerpt(names)}")
+    for number in size if isinstance(size, list) else [size]:
+        if not is_number(number, whole=True):
+            raise DataError(f"{where}: input_size: expected whole numbers, got {excerpt(size)}")
+    return settings
+
+
+def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Class names `{0: 'person', ...}` and input size `[height, width]` from Ultralytics' metadata."""
+    settings: dict[str, Any] = {}
+    try:
+        if "names" in metadata:
+            names = ast.literal_eval(metadata["names"])
+            settings["classes"] = [names[i] for i in range(len(names))]
+            if not all(isinstance(name, str) and is_plain(name) for name in settings["classes"]):
+                return {}
+        if "imgsz" in metadata:
+            height, width = ast.literal_eval(metadata["imgsz"])
+            settings["input_size"] = [int(width), int(height)]
+    except (ValueError, SyntaxError, TypeError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
+        return {}  # keys of the same name from another exporter
+    return settings
+
+
+def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int]) -> Path:
+    """Find a model with another input size in the cache, and make it if it is missing.
+
+    A fully convolutional network knows its input size in two places: the shape of its input, and the shapes that its
+    `Reshape` nodes ask for, which end with the rows and columns of the feature maps. Both are replaced.
+
+    Args:
+        path: the model.
+        canvas: `(width, height)` of the new input, in pixels.
+        strides: pixels per cell of each level of feature maps.
+
+    Returns:
+        The path of the model with this size; `path` itself if it has this size already.
+
+    Raises:
+        InputError: a side is not a multiple of 32 pixels.
+        DataError: the model is damaged, or the new one cannot be written.
+    """
+    import onnx
+
+    check_canvas("input_size", canvas)
+    check(all(side % _COARSEST == 0 for side in canvas), "input_size", f"multiples of {_COARSEST} pixels", canvas)
+    check_file(path)
+    model = onnx.load(path)
+    sides = model.graph.input[0].type.tensor_type.shape.dim[2:4]
+    size = sides[1].dim_value, sides[0].dim_value
+    if size == canvas:
+        return path
+    _resize(model.graph, size, canvas, strides)
+    content = model.SerializeToString()
+    digest = hashlib.sha256(content).hexdigest()
+    new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
+    if not new.is_file() or sha256(new) != digest:
+        write_bytes(new, content)
+    return new
+
+
+def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int], strides: Sequence[int]) -> None:
+    """Replace the sizes that a graph has in constants."""
+    from onnx import numpy_helper
+
+    maps = {cells(size, stride): cells(canvas, stride) for stride in strides}
+    shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
+    constants = {tensor.name: tensor for tensor in graph.initializer}
+    constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
+    for name in shape_names & constants.keys():
+        shape = numpy_helper.to_array(constants[name]).copy()
+        if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
+            shape[-2:] = maps[int(shape[-1]), int(shape[-2])][::-1]
+            constants[name].CopyFrom(numpy_helper.from_array(shape, constants[name].name))
+    sides = graph.input[0].type.tensor_type.shape.dim[2:4]
+    sides[0].dim_value, sides[1].dim_value = canvas[1], canvas[0]
+    del graph.value_info[:]
+    for output in graph.output:
+        for side in output.type.tensor_type.shape.dim[1:2]:
+            side.Clear()

@@ -1,5 +1,6 @@
 """Score vectors with a background component, from a detector's raw class scores."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
@@ -43,10 +44,8 @@ class Candidates:
 
     def precise(self) -> "Candidates":
         """Convert half precision, which is too coarse for pixels, to float32; other precisions stay as they are."""
-        if self.boxes.dtype not in HALVES and self.classes.dtype not in HALVES:
-            return self
-        objectness, background = (None if x is None else x.float() for x in (self.objectness, self.background))
-        return Candidates(self.boxes.float(), self.classes.float(), objectness, background)
+        coarse = self.boxes.dtype in HALVES or self.classes.dtype in HALVES
+        return self._mapped(Tensor.float) if coarse else self
 
     def take(self, image: int, index: Tensor) -> "Candidates":
         """Take some boxes of one image.
@@ -58,12 +57,12 @@ class Candidates:
         Returns:
             The boxes `(M, 4)` and their scores, without the batch dimension.
         """
-        return Candidates(
-            self.boxes[image].index_select(0, index),
-            self.classes[image].index_select(0, index),
-            None if self.objectness is None else self.objectness[image].index_select(0, index),
-            None if self.background is None else self.background[image].index_select(0, index),
-        )
+        return self._mapped(lambda tensor: tensor[image].index_select(0, index))
+
+    def _mapped(self, function: Callable[[Tensor], Tensor]) -> "Candidates":
+        """The results of a function of each tensor."""
+        objectness, background = (None if x is None else function(x) for x in (self.objectness, self.background))
+        return Candidates(function(self.boxes), function(self.classes), objectness, background)
 
 
 def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual") -> Tensor:

@@ -1,7 +1,6 @@
-"""torchvision's detection models, with the full score vector of every box."""
+"""torchvision's detection models, with the full score vector of every box before the models filter them."""
 
 import inspect
-import math
 import re
 from collections.abc import Callable, Sequence
 from os import PathLike, fspath
@@ -13,20 +12,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection.class_names import keep_classes, named_outputs
-from semfov.detection.detector import Detector, check_images
-from semfov.detection.modules import module_digest
+from semfov.detection.detector import check_images
+from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
-from semfov.detection.torchvision_heads import Raw, head_of, output_count
-from semfov.errors import DataError, InputError, check, check_shape, lookup
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import sha256
+
+Raw = list[tuple[Tensor, Tensor]]
+"""For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own box, and scores `(N, C)`."""
 
 PREFIX = "torchvision:"
 
 
-class TorchvisionDetector(Detector):
+class TorchvisionDetector(ModuleDetector):
     """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
 
     The canvas is the image, resized by the model's own transform. The model's padding, its normalisation and the
@@ -64,39 +64,29 @@ class TorchvisionDetector(Detector):
             raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
         outputs, softmax = head
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
-        names, places = named_outputs(classes)
         transform: Any = model.transform
         fixed = transform.fixed_size
         own: BackgroundPolicy = "own" if softmax else "residual"
         super().__init__(
+            model,
+            classes,
             name,
-            names,
             (transform.max_size, transform.max_size) if fixed is None else tuple(fixed),
             background=own if background is None else background,
             selection=selection,
             stretch=fixed is not None,
             digest=digest,
         )
-        self.model = model.eval()
         self.first = first
         self._outputs, self._softmax = outputs, softmax
-        self._places, self._count = places, len(classes)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's transform does, without padding."""
         check_images(images)
-        height, width = images.shape[-2:]
-        columns, rows = self._canvas_size(width, height)
-        canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False)
-        return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))
-
-    def _canvas_size(self, width: int, height: int) -> tuple[int, int]:
         transform: Any = self.model.transform
         if transform.fixed_size is not None:
-            return self.input_size
-        longer, shorter = max(width, height), min(width, height)
-        scale = min(transform.min_size[-1] / shorter, transform.max_size / longer)
-        return max(1, math.floor(width * scale)), max(1, math.floor(height * scale))
+            return resized_images(images, size=self.input_size)
+        return resized_images(images, scale=edge_scale(images, (transform.min_size[-1], transform.max_size)))
 
     def outputs(self, canvas: Tensor) -> Raw:
         """Compute the boxes and scores of the model before it filters them.
@@ -113,11 +103,8 @@ class TorchvisionDetector(Detector):
         """
         from torchvision.models.detection.image_list import ImageList
 
-        check_shape(canvas, "canvas", None, 3, None, None)
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
         transform: Any = self.model.transform
-        pixels = transform.normalize(canvas.to(next(self.model.parameters()).dtype))
+        pixels = transform.normalize(self._pixels(canvas))
         batch = transform.batch_images(list(pixels), size_divisible=transform.size_divisible)
         sizes = [(canvas.shape[-2], canvas.shape[-1])] * canvas.shape[0]
         return self._outputs(self.model, ImageList(batch, sizes), self.first)
@@ -139,7 +126,7 @@ class TorchvisionDetector(Detector):
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
         """The classes of one image without placeholders, with one box for each row."""
-        candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
+        candidates = self._named(Candidates(boxes, scores[:, self.first :]))
         if boxes.ndim == 2:
             return candidates
         places = torch.tensor(self._places, device=boxes.device) + self.first
@@ -303,20 +290,7 @@ def _file(weights: str | PathLike[str]) -> Path:
 
 
 def _download(enum: Any) -> str:
-    """Download the published weights into torch's cache, and compute their sha256.
-
-    torchvision would unpickle the file. Reading it once with only tensors allowed shows that it holds nothing else. The
-    name of the file contains the start of its sha256, which is checked.
-
-    Args:
-        enum: member of a weights enum.
-
-    Returns:
-        64 hexadecimal digits.
-
-    Raises:
-        DataError: the weights cannot be downloaded, are damaged, or hold more than tensors.
-    """
+    """Download published weights, check that they hold tensors only and have the sha256 of their name; the sha256."""
     try:
         enum.get_state_dict(progress=False, check_hash=True, weights_only=True)
     except UnpicklingError as error:
@@ -348,3 +322,114 @@ def _load_state(network: nn.Module, path: Path) -> None:
         network.load_state_dict(state.get("model", state))
     except Exception as error:  # torch, pickle, zip and safetensors each raise their own
         raise DataError(f"weights {str(path)!r}: do not fit the model, or are not a state dict ({error})") from error
+
+
+def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+    """Faster R-CNN (Ren et al. 2015): the proposals, with a softmax over classes and a box for each class."""
+    features = _features(model, images)
+    proposals, _ = model.rpn(images, features)
+    heads = model.roi_heads
+    regions = heads.box_head(heads.box_roi_pool(features, proposals, images.image_sizes))
+    logits, regression = heads.box_predictor(regions)
+    counts = [len(each) for each in proposals]
+    # Without proposals the box coder does not add the class dimension.
+    boxes = heads.box_coder.decode(regression, proposals).reshape(len(logits), logits.shape[-1], 4).split(counts)
+    scores = logits.softmax(-1).split(counts)
+    return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
+
+
+def ssd_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+    """SSD (Liu et al. 2016) and SSDlite: the default boxes, with a softmax over classes."""
+    outputs, anchors, _ = _dense(model, images)
+    boxes = [model.box_coder.decode_single(b, a) for b, a in zip(outputs["bbox_regression"], anchors, strict=True)]
+    scores = outputs["cls_logits"].softmax(-1)
+    return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
+
+
+def retinanet_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+    """RetinaNet (Lin et al. 2017): the best anchors of every level, with a sigmoid for each class."""
+    outputs, anchors, pixels = _dense(model, images)
+    scores = outputs["cls_logits"].sigmoid()
+    return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode_single)
+
+
+def fcos_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+    """FCOS (Tian et al. 2019): the best points of every level, with the scores `√(σ(class) σ(centreness))`."""
+    outputs, anchors, pixels = _dense(model, images)
+    scores = (outputs["cls_logits"].sigmoid() * outputs["bbox_ctrness"].sigmoid()).sqrt()
+    return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode)
+
+
+def _features(model: Any, images: Any) -> dict[str, Tensor]:
+    features = model.backbone(images.tensors)
+    return {"0": features} if isinstance(features, Tensor) else features
+
+
+def _dense(model: Any, images: Any) -> tuple[dict[str, Tensor], list[Tensor], list[int]]:
+    """Outputs of a head on all levels, `(B, N, ...)`, the anchors of each image, and the number of pixels by level."""
+    features = list(_features(model, images).values())
+    outputs = model.head(features)
+    anchors = model.anchor_generator(images, features)
+    return outputs, anchors, [feature.shape[-1] * feature.shape[-2] for feature in features]
+
+
+def _best_of_levels(
+    model: Any,
+    images: Any,
+    outputs: dict[str, Tensor],
+    anchors: list[Tensor],
+    pixels: Sequence[int],
+    scores: Tensor,
+    backgrounds: int,
+    decode: Callable[[Tensor, Tensor], Tensor],
+) -> Raw:
+    """The `topk_candidates` anchors of each level with the highest class score; the model's own are among these."""
+    raw: Raw = []
+    each = len(anchors[0]) // sum(pixels)
+    for regression, score, anchor, size in zip(
+        outputs["bbox_regression"], scores, anchors, images.image_sizes, strict=True
+    ):
+        index, start = [], 0
+        for best in score[:, backgrounds:].detach().amax(-1).split([each * count for count in pixels]):
+            index.append(best.topk(min(model.topk_candidates, len(best))).indices + start)
+            start += len(best)
+        rows = torch.cat(index)
+        raw.append((_clip(decode(regression[rows], anchor[rows]), size), score[rows]))
+    return raw
+
+
+def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
+    from torchvision.ops import clip_boxes_to_image
+
+    return clip_boxes_to_image(boxes, size)
+
+
+def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | None:
+    """The function that decodes a kind of model, and whether its scores are a softmax; None for an unknown kind."""
+    from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
+    from torchvision.models.detection.ssd import SSD
+
+    for kind, function, softmax in (
+        (FasterRCNN, roi_outputs, True),
+        (SSD, ssd_outputs, True),
+        (RetinaNet, retinanet_outputs, False),
+        (FCOS, fcos_outputs, False),
+    ):
+        if isinstance(model, kind):
+            return function, softmax
+    return None
+
+
+def output_count(model: nn.Module) -> int | None:
+    """The number of a model's outputs, background included; None where its head is not one of torchvision's."""
+    for path in (
+        "roi_heads.box_predictor.cls_score.out_features",
+        "head.classification_head.num_classes",
+        "head.classification_head.num_columns",
+    ):
+        value: Any = model
+        for part in path.split("."):
+            value = getattr(value, part, None)
+        if isinstance(value, int):
+            return value
+    return None

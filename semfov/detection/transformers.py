@@ -1,23 +1,20 @@
 """Object detection models of transformers (DETR, RT-DETR, D-FINE), with the full score vector of every box."""
 
 import inspect
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from semfov.detection.class_names import keep_classes, named_outputs
-from semfov.detection.detector import Detector, check_images
-from semfov.detection.modules import module_digest
+from semfov.detection.detector import check_images
+from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import decode_detr, decode_rtdetr
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
-from semfov.errors import DataError, InputError, check, check_shape
+from semfov.errors import DataError, InputError, check
 
 SOFTMAX = ("detr", "table-transformer", "yolos")
 """Kinds of models whose scores are a softmax over the classes and "no object"; the others have a sigmoid each."""
@@ -26,7 +23,7 @@ _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
 _SQUARE = {"height": 640, "width": 640}
 
 
-class TransformersDetector(Detector):
+class TransformersDetector(ModuleDetector):
     """An object detection model of transformers as a `Detector`; it is differentiable.
 
     The model takes `pixel_values` and returns `logits` and `pred_boxes`. Everything is taken before the thresholds and
@@ -68,7 +65,6 @@ class TransformersDetector(Detector):
             )
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
-        names, places = named_outputs(classes)
         normal = config.model_type in _IMAGENET
         settings: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
         settings |= processor or {}
@@ -76,42 +72,35 @@ class TransformersDetector(Detector):
         self.edges = (size["shortest_edge"], size["longest_edge"]) if "shortest_edge" in size else None
         self.softmax = config.model_type in SOFTMAX
         super().__init__(
+            model,
+            classes,
             config.model_type if name is None else name,
-            names,
             (size["width"], size["height"]) if self.edges is None else (self.edges[1], self.edges[1]),
             background=("own" if self.softmax else "residual") if background is None else background,
             selection=selection,
             stretch=self.edges is None,
             digest=digest,
         )
-        self.model = model.eval()
         self.preprocessing = Preprocessing(stretch=self.edges is None)
         if settings["do_normalize"]:
             means = {"mean": settings["image_mean"], "std": settings["image_std"]}
             self.preprocessing = self.preprocessing.merged(means)
-        self._places, self._count = places, len(classes)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's image processor does, without padding."""
         check_images(images)
         if self.edges is None:
             return letterbox(images, self.input_size, stretch=True)
-        height, width = images.shape[-2:]
-        scale = min(self.edges[0] / min(width, height), self.edges[1] / max(width, height))
-        columns, rows = max(1, math.floor(width * scale)), max(1, math.floor(height * scale))
-        canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False, antialias=scale < 1)
-        return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))
+        scale = edge_scale(images, self.edges)
+        return resized_images(images, scale=scale, antialias=scale < 1)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        check_shape(canvas, "canvas", None, 3, None, None)
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
-        outputs = self.model(pixel_values=self.preprocessing(canvas.to(next(self.model.parameters()).dtype)))
+        outputs = self.model(pixel_values=self.preprocessing(self._pixels(canvas)))
         logits, boxes = outputs.logits.to(canvas.dtype), outputs.pred_boxes.to(canvas.dtype)
         size = (canvas.shape[-1], canvas.shape[-2])
         candidates = decode_detr(logits, boxes, size) if self.softmax else decode_rtdetr(logits, boxes, size)
-        return keep_classes(candidates, self._places, self._count)
+        return self._named(candidates)
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""

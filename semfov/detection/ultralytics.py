@@ -6,16 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from semfov.detection.class_names import keep_classes, named_outputs
-from semfov.detection.detector import Detector
-from semfov.detection.modules import module_digest
+from semfov.detection.modules import ModuleDetector, module_digest
 from semfov.detection.onnx_heads import decode_yolov8
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
-from semfov.errors import InputError, check_shape
+from semfov.errors import InputError
 
 
-class UltralyticsDetector(Detector):
+class UltralyticsDetector(ModuleDetector):
     """A detection model of Ultralytics as a `Detector`; it is differentiable.
 
     Its network returns, for every cell, a box and a sigmoid for each class: `(B, 4 + K, N)`. The package itself is not
@@ -49,10 +47,10 @@ class UltralyticsDetector(Detector):
         if classes is None:
             labels = network.names
             classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
-        names, places = named_outputs(classes)
         super().__init__(
+            network,
+            classes,
             name,
-            names,
             (input_size, input_size) if isinstance(input_size, int) else input_size,
             background=background,
             selection=selection,
@@ -60,13 +58,10 @@ class UltralyticsDetector(Detector):
             stride=32,
             digest=digest,
         )
-        self.model = network.eval()
-        self._places, self._count = places, len(classes)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        check_shape(canvas, "canvas", None, 3, None, None)
-        outputs = self.model(canvas.to(next(self.model.parameters()).dtype))
+        outputs = self.model(self._pixels(canvas))
         columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
         if not isinstance(columns, Tensor) or columns.ndim != 3 or columns.shape[1] != 4 + self._count:
             got = tuple(columns.shape) if isinstance(columns, Tensor) else type(columns).__name__
@@ -74,7 +69,7 @@ class UltralyticsDetector(Detector):
                 f"detector: expected a network that returns all class scores of each box, (B, {4 + self._count}, N), "
                 f"got {got}; use a detection model whose head selects no boxes (end2end off)"
             )
-        return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)
+        return self._named(decode_yolov8(columns.to(canvas.dtype)))
 
 
 def wrap_ultralytics(

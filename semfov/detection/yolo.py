@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_onnx import RUNTIMES, OnnxTwin, Runtime, network_digest
 from semfov.detection.detector import Detector
-from semfov.detection.onnx_twin import RUNTIMES, OnnxTwin, Runtime, network_digest
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import InputError, check

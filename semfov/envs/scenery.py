@@ -61,7 +61,7 @@ class Scenery:
         scenes: indices of the scenes that may have episodes.
 
     Raises:
-        InputError: there are several policies, or the belief uses context between scenes.
+        InputError: there are several policies.
         DataError: no scene has anything to look for.
 
     Example::
@@ -74,11 +74,8 @@ class Scenery:
     def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
         check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")
         self._looking, self._data, self.count = looking, looking.scenes, len(looking.scenes)
-        self.policy, settings = next(iter(looking.policies.items()))
+        self.policy = next(iter(looking.policies))
         belief, self.protocol = looking.config.belief, looking.config.protocol
-        context = belief.context, settings.context
-        learned = {"place", "cooccurrence", "both"} & set(context)
-        check(not learned, "context", "none, as an environment keeps the belief about one scene", context)
         self.eye, self.shape = looking.eye, (belief.rows, belief.columns)
         self.observer: Observer = looking.strategies[self.policy].observer
         names = self.classes[1:]

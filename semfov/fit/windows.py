@@ -13,9 +13,8 @@ from typing import Annotated, Any, Literal, get_args
 import torch
 
 from semfov.belief.verification import Verification
-from semfov.data.crowded import Crowded
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Scenes
+from semfov.data.scene import Crowded, Scenes
 from semfov.errors import check
 from semfov.fit.outputs import training_of, write_outputs
 from semfov.fit.settings import FitConfig
@@ -38,7 +37,7 @@ from semfov.fit.windows_kinds import PICTURE_KINDS, PictureKind, compose_picture
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
-from semfov.io.transfer import pack_tensors, unpack_tensors
+from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share

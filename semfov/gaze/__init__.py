@@ -1,12 +1,10 @@
 """Where to look next: acquisition functions over the belief, policies, and the choice of a fixation."""
 
 from semfov.gaze import acquisition, policies, saliency
-from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax
+from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax, select_fixation, soft_fixation
 from semfov.gaze.habits import GazeHabits, Habitual
 from semfov.gaze.ivsn import IVSN
 from semfov.gaze.policies import Policy
-from semfov.gaze.relaxation import soft_fixation
-from semfov.gaze.selection import select_fixation
 from semfov.gaze.templates import ClassTemplates
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""How the next fixation is chosen from the acquisition values of the cells."""
+"""How the next fixation is chosen from the acquisition values of the cells: the best cell, or a draw."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -6,9 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_whole
-from semfov.gaze.relaxation import soft_fixation
-from semfov.gaze.selection import select_fixation
+from semfov.errors import check, check_shape, check_whole, values_known
 
 Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
@@ -176,6 +174,86 @@ class Given(Choice):
         """Return the centre of the next cell of the scanpath and the cell; the last cell again at the end."""
         cell = self.cells[episodes, min(shift + 1, self.cells.shape[1] - 1)]
         return centres[cell], cell
+
+
+def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance: float = 1e-6) -> Tensor:
+    r"""Cell with the highest acquisition value among those not visited (inhibition of return).
+
+    .. math:: f = \arg\max_{x \notin \mathcal V} a(x)
+
+    Cells whose values equal the best to within `tolerance` (relative) are tied, and the one with the highest
+    `noise` wins. A tolerance of a few rounding errors keeps equal beliefs tied, whatever the order of summation.
+
+    Args:
+        values: `(B, X·Y)`, acquisition values.
+        visited: `(B, X·Y)` boolean, cells that were fixated and may not be chosen.
+        noise: `(B, X·Y)`, random numbers in [0, 1) from each episode's own generator.
+        tolerance: relative difference up to which values count as equal.
+
+    Returns:
+        `(B,)`, the chosen cell, or -1 where every cell has been visited.
+
+    Raises:
+        InputError: the shapes differ, or a cell that is not visited has the value NaN.
+
+    >>> select_fixation(torch.tensor([[0.2, 0.9, 0.9]]), torch.tensor([[False, True, False]]), torch.rand(1, 3))
+    tensor([2])
+    """
+    check_shape(values, "values", None, None)
+    check_shape(visited, "visited", *values.shape)
+    check_shape(noise, "noise", *values.shape)
+    if values_known(values, visited):
+        unusable = torch.isnan(values) & ~visited
+        check(not bool(unusable.any()), "values", "numbers for all cells not visited", f"{int(unusable.sum())} NaN")
+    left = values.masked_fill(visited, -torch.inf)
+    best = left.amax(-1, keepdim=True)
+    tied = (left >= best - tolerance * best.abs()) & ~visited
+    choice = torch.where(tied, noise, -1.0).argmax(-1)
+    return torch.where(visited.all(-1), -1, choice)
+
+
+def soft_fixation(
+    logits: Tensor, visited: Tensor, centres: Tensor, noise: Tensor, *, temperature: float = 1.0, hard: bool = True
+) -> tuple[Tensor, Tensor]:
+    r"""Draw a fixation by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
+
+    .. math:: y = \mathrm{softmax}\left(\frac{\ell - \ln(-\ln u)}{\tau}\right), \quad
+              x^* = \arg\max_x y(x), \quad \tilde f = \sum_x y(x) \, c(x)
+
+    With `hard` the fixation is the centre of x*, a draw from `softmax(ℓ)`, and has the gradient of the soft point f̃
+    (straight-through; Bengio, Léonard and Courville, 2013); otherwise it is f̃ itself.
+
+    Args:
+        logits: `(B, X·Y)`, ℓ.
+        visited: `(B, X·Y)` boolean, cells that may not be drawn; each row must leave at least one.
+        centres: `(X·Y, 2)`, c, centres of the cells in pixels.
+        noise: `(B, X·Y)`, u, uniform in [0, 1).
+        temperature: τ, positive.
+        hard: fixate the centre of x* with a straight-through gradient; otherwise the soft point f̃.
+
+    Returns:
+        The fixations `(B, 2)` in pixels, and the drawn cells `(B,)`.
+
+    Raises:
+        InputError: the temperature is not positive, or the shapes do not fit together.
+
+    >>> logits = torch.tensor([[0.0, 9.0, 0.0]], requires_grad=True)
+    >>> centres = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    >>> point, cell = soft_fixation(logits, torch.tensor([[True, False, False]]), centres, torch.full((1, 3), 0.5))
+    >>> point.tolist(), cell.tolist()
+    ([[1.0, 0.0]], [1])
+    """
+    check(temperature > 0, "temperature", "a positive number", temperature)
+    check_shape(logits, "logits", None, None)
+    check_shape(visited, "visited", *logits.shape)
+    check_shape(noise, "noise", *logits.shape)
+    check_shape(centres, "centres", logits.shape[-1], 2)
+    limits = torch.finfo(noise.dtype)
+    gumbel = -(-noise.clamp(min=limits.tiny, max=1 - limits.eps).log()).log()
+    weights = ((logits + gumbel.to(logits)).masked_fill(visited, -torch.inf) / temperature).softmax(-1)
+    cell = weights.argmax(-1)
+    soft = weights @ centres.to(weights)
+    return (centres.to(weights)[cell] + (soft - soft.detach()) if hard else soft), cell
 
 
 def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:

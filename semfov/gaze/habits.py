@@ -9,8 +9,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_finite, check_shape
-from semfov.gaze.choice import Choice, Noise
-from semfov.gaze.relaxation import soft_fixation
+from semfov.gaze.choice import Choice, Noise, soft_fixation
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Field, Number, Schema
 

@@ -31,34 +31,12 @@ _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 
 def recommended_model(detector: str, growth: float) -> str:
-    """Name the observation model that is shipped for a detector with a sensor of this growth.
-
-    Args:
-        detector: name of the detector.
-        growth: growth of the foveal sensor.
-
-    Returns:
-        The name of the model.
-
-    >>> recommended_model("yolov3-tiny", 2.0), recommended_model("yolov3-tiny", 1.0)
-    ('yolov3-tiny', 'yolov3-tiny-sharp')
-    """
+    """Name the observation model that is shipped for a detector with a sensor of this growth."""
     return f"{detector}-sharp" if growth == 1 else detector
 
 
 def learned_for(detector: str, growth: float) -> str:
-    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth.
-
-    Args:
-        detector: name of the detector.
-        growth: growth of the foveal sensor.
-
-    Returns:
-        The name of the models.
-
-    >>> learned_for("yolov3-tiny", 2.0), learned_for("yolov3-tiny", 1.0)
-    ('yolov3-tiny', 'yolov3-tiny-published')
-    """
+    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth."""
     return f"{detector}-published" if growth == 1 else detector
 
 
@@ -104,17 +82,7 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str, *, strict: bool = False) -> None:
-    """Warn where the sensor has other settings than the one that the model was fitted with; raise if it is strict.
-
-    Args:
-        fitted: settings of the sensor of the fit; empty if they are not known.
-        sensor: settings of the sensor.
-        what: title of the model, for the message.
-        strict: whether another sensor is an error.
-
-    Raises:
-        InputError: the settings differ, and it is strict.
-    """
+    """Warn, or raise if it is strict, where the sensor has other settings than in the fit; empty ones are unknown."""
     others = _others(fitted, sensor, set()) if sensor and fitted else []
     if others and strict:
         raise InputError(

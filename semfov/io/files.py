@@ -1,6 +1,7 @@
 """Atomic writes, checksums and checks of paths."""
 
 import hashlib
+import json
 import os
 import re
 import secrets
@@ -22,7 +23,7 @@ def discard_unfinished() -> None:
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: a context manager that replaces `path` once its block has ended without an error.
 
     Readers see the old file or the new one, never a part of it. A writer that fails or is killed leaves `path` as it
@@ -123,12 +124,12 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
         raise DataError(f"{name}: expected a file, got {got}")
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode())
 
 
-def write_bytes(path: str | Path, content: bytes) -> None:
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a file atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
@@ -138,3 +139,8 @@ def sha256(path: str | Path) -> str:
     """Compute the sha256 of a file's content, as hexadecimal digits."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def json_sha256(value: object) -> str:
+    """Compute the sha256 of a value in JSON, as hexadecimal digits."""
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()

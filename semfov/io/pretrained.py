@@ -1,4 +1,4 @@
-"""Fitted modules that are saved to files; some of the files are shipped with the package."""
+"""Fitted modules that are saved to files; those that are shipped with the package, and the command that fits others."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -124,3 +124,31 @@ class PretrainedForEye(Pretrained):
             check_grid(self.metadata.get("training", {}), grid, self.title)
         check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
         check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
+
+
+def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
+    """Write the command that fits all models to a detector.
+
+    Args:
+        model: name or file of the detector.
+        out: folder for the models.
+
+    Returns:
+        The command line.
+
+    >>> fit_command("mine.onnx")
+    'semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'
+    """
+    return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
+
+
+def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
+    """Return the name under which a kind of model is shipped; if none is, the error has the command that fits one."""
+    if (kind.shipped / f"{name}.safetensors").is_file():
+        return name
+    names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
+    raise InputError(
+        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(names)}; fit all models to it with "
+        f"`{fit_command(model)}` or semfov.fit_detector, and load them with "
+        "ActivePerception.from_pretrained('mymodels'); ActivePerception.raw needs no model"
+    )

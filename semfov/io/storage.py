@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from semfov.errors import DataError, lookup
-from semfov.io.files import check_regular, replacing
+from semfov.io.files import check_regular, write_bytes
+from semfov.io.schema import Schema
 
 # A single key, because the order of several keys would differ from one write to the next.
 _KEY = "semfov"
@@ -36,8 +37,7 @@ def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record:
     header = {_KEY: json.dumps(verified, sort_keys=True, allow_nan=False)}
     content = save(whole, header)
     # The file is written here, because `safetensors` reports a full disk by an error that is not an `OSError`.
-    with replacing(Path(path)) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, content)
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -83,19 +83,7 @@ def _refuse_constant(name: str) -> None:
 
 
 def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
-    """Find the file of a model by its name or path.
-
-    Args:
-        name_or_path: name of a shipped model, or a path; a path has a folder or ends in `.safetensors`.
-        shipped: folder of the shipped models.
-        kind: kind of model, for the message.
-
-    Returns:
-        The path itself, or the path of the shipped model; a path need not exist.
-
-    Raises:
-        InputError: no model of that name is shipped.
-    """
+    """Path of a model: a path (with a folder or `.safetensors`) as it is, else that of the shipped model by name."""
     path = Path(name_or_path)
     if path.suffix == ".safetensors" or len(path.parts) > 1:
         return path
@@ -111,3 +99,67 @@ def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = N
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+_KIND = "cached-tensors"
+
+
+def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
+    """Write tensors atomically, with a checksum, the key of the inputs they depend on, and the name of their file."""
+    write_file(path, tensors, {"kind": _KIND, "key": key, "file": path.name})
+
+
+def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str, Tensor] | None:
+    """Read the tensors that `write_tensors` wrote to this file under this key.
+
+    A file that was written under another key or another file name (for another scene, for instance) counts as missing.
+    So does a file that does not fit the schema.
+
+    Args:
+        path: the file.
+        key: key of the inputs that the tensors depend on.
+        schema: what the file must hold; None accepts anything.
+
+    Returns:
+        The tensors by name, or None where they are missing or damaged.
+    """
+    try:
+        tensors, record = read(path, _KIND)
+        if schema is not None:
+            schema.check(tensors)
+    except Exception:  # whatever is wrong with the file, its tensors can be computed again
+        return None
+    return tensors if (record.get("key"), record.get("file")) == (key, path.name) else None
+
+
+def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
+    """Convert tensors to bytes in the safetensors format.
+
+    Args:
+        tensors: tensors by name, of any shape and type.
+
+    Returns:
+        The bytes.
+
+    >>> import torch
+    >>> unpack_tensors(pack_tensors({"a": torch.tensor([1.5])}))
+    {'a': tensor([1.5000])}
+    """
+    from safetensors.torch import save
+
+    # A view of a larger tensor may share its memory with another one, which the format refuses.
+    return save({name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()})
+
+
+def unpack_tensors(data: bytes) -> dict[str, Tensor]:
+    """Convert the bytes of `pack_tensors` back to tensors.
+
+    Args:
+        data: the bytes.
+
+    Returns:
+        The tensors by name.
+    """
+    from safetensors.torch import load
+
+    return load(data)

@@ -5,8 +5,7 @@ The room has the Dirichlet distribution, sufficient statistics that merge, and t
 
 from semfov.observation import dirichlet
 from semfov.observation.calibration import fit_discriminative
-from semfov.observation.folded import FoldedObservationModel
-from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.foveal import FoldedObservationModel, FovealObservationModel
 from semfov.observation.matching import match
 from semfov.observation.misses import MissCounts
 from semfov.observation.separation import visibility

@@ -406,3 +406,42 @@ class FovealObservationModel(Pretrained):
         if learning or torch.compiler.is_compiling() or parameter.is_inference():
             return linear_map(self.alpha)
         return self._cache(parameter)
+
+
+class FoldedObservationModel(FovealObservationModel):
+    """An observation model stored as a fixed linear map of log scores.
+
+    Its computation graph has no gamma functions, which ONNX lacks. It gives the same calibrated scores as `model`, to
+    the bit. Later training of `model` does not change it.
+
+    Args:
+        model: the observation model to copy.
+
+    >>> model = FovealObservationModel.identity(["cup", "cat"], edges=[0.1, 0.2])
+    >>> FoldedObservationModel(model).calibrate(torch.tensor([0.2, 0.7, 0.1]), torch.tensor(0.15))
+    tensor([0.2000, 0.7000, 0.1000])
+    """
+
+    weight: Tensor
+    constant: Tensor
+
+    def __init__(self, model: FovealObservationModel) -> None:
+        super().__init__(
+            model.alpha,
+            model.edges,
+            model.classes,
+            epsilon=model.epsilon,
+            log_prior=model.log_prior,
+            tempering=float(model.tempering),
+            expected=model.expected_scores(),
+            miss_rate=model.miss_rate,
+            metadata=model.metadata,
+        )
+        with torch.no_grad():
+            weight, constant = linear_map(model.alpha)
+        self.register_buffer("weight", weight)
+        self.register_buffer("constant", constant)
+        self.requires_grad_(False).eval()
+
+    def _linear(self) -> tuple[Tensor, Tensor]:
+        return self.weight, self.constant

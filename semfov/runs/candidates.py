@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from torch import Tensor
 
-from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
-from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief import Grid, MapEvidence, TargetEvidence
+from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
@@ -19,7 +19,7 @@ from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
-from semfov.runs.setup import make_context, make_learned, make_observation, make_templates
+from semfov.runs.setup import make_learned, make_observation, make_templates
 from semfov.strategy import Strategy
 
 T = TypeVar("T")
@@ -57,11 +57,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Models:
-    """Fitted models that the policies of a run need, contexts by name; None for a model that no policy needs."""
+    """Fitted models that the policies of a run need; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
-    context: Mapping[str, ContextPrior] = field(default_factory=dict)
     map: MapEvidence | None = None
     templates: ClassTemplates | None = None
 
@@ -76,14 +75,6 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         make_learned(TargetEvidence, belief.target_model, eye)
         if any(by_evidence(policy, task) for policy in policies)
         else None,
-        {
-            name: make_context(name, eye)
-            for name in dict.fromkeys(
-                _of(policy.context_model, belief.context_model)
-                for policy in policies
-                if _of(policy.context, belief.context) != "none"
-            )
-        },
         make_learned(MapEvidence, belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
         else None,
@@ -132,28 +123,8 @@ def make_strategy(
         The observer and the policy.
 
     Raises:
-        InputError: a context is asked for with a policy that cannot use one, or a model is missing.
+        InputError: a model is missing.
     """
-    context = _of(policy.context, belief.context)
-    if context == "none":
-        return _strategy(policy, task, belief, components, models, fovea)
-    if task != "search" or policy.policy not in (TARGET_EVIDENCE, NonPredictive.name):
-        raise InputError(
-            "context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive', got policy "
-            f"{policy.policy!r}"
-        )
-    inner = _strategy(policy, task, belief, components, models, fovea)
-    prior = _required(
-        models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context"
-    )
-    place, cooccurrence = prior.weights_for("evidence" if inner.observer.by_target else "map")
-    weights = place * (context != "cooccurrence"), cooccurrence * (context != "place")
-    return Strategy(Context(inner.observer, prior, weights), inner.policy)
-
-
-def _strategy(
-    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
-) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_required(models.evidence, "policy", "learned target evidence")), NonPredictive())
     calibrated = policy.scores == "calibrated"

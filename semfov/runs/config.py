@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
-from semfov.detection.onnx_twin import Runtime
+from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import lookup
 from semfov.gaze.policies import Task
@@ -19,7 +19,6 @@ from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
-ContextKind = Literal["none", "place", "cooccurrence", "both"]
 Scores = Literal["raw", "calibrated", "learned"]
 
 
@@ -160,10 +159,6 @@ class BeliefConfig(Settings):
             published sensor it is the published one, for others one of our own).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
         map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
-        context: context that is added to the log odds of the target: `none`, the `place` where the class usually is,
-            its `cooccurrence` with the classes seen so far, or `both`. Only `target-evidence` and `non-predictive` can
-            use context.
-        context_model: fitted context, by name or file.
     """
 
     columns: Side = 10
@@ -177,8 +172,6 @@ class BeliefConfig(Settings):
     model: str | None = None
     target_model: str | None = None
     map_model: str | None = None
-    context: ContextKind = "none"
-    context_model: str = "coco"
 
 
 @dataclass(frozen=True)
@@ -215,8 +208,6 @@ class PolicyConfig(Settings):
         misses: also update cells in which nothing was detected.
         saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2` or
             `itti-koch`.
-        context: context that is added to the log odds of the target: `none`, `place`, `cooccurrence` or `both`.
-        context_model: fitted context, by name or file.
         samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
             `negative-entropy`, `surprise` and `two-peaks` take the expectation; null takes the look with the expected
             scores, as published. The observation model must be one of the densities of scores (`...-published`).
@@ -229,8 +220,6 @@ class PolicyConfig(Settings):
     memory: CellMemory | None = None
     misses: bool | None = None
     saliency: SaliencyModel | None = None
-    context: ContextKind | None = None
-    context_model: str | None = None
     samples: Annotated[int, Range(1, 100_000)] | None = None
 
 

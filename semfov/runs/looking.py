@@ -13,7 +13,7 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
-from semfov.io.transfer import pack_tensors, unpack_tensors
+from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import BeliefConfig, LookingConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder

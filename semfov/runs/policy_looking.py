@@ -75,8 +75,6 @@ class PolicyLooking(Looking):
         """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""
         config, models = self.config, self.models
         policies = {name: asdict(policy) for name, policy in self.policies.items()}
-        for policy in policies.values():
-            policy["context_model"] = models.context.get(policy["context_model"] or config.belief.context_model)
         return {
             **super().depends_on(),
             "task": self.task,

@@ -10,7 +10,7 @@ from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
-from semfov.runs.config import ContextKind, PolicyConfig, SaliencyModel, Scores
+from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 
 TARGET_EVIDENCE = "target-evidence"
 SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
@@ -20,7 +20,6 @@ WORDS = {
     "footprint": Footprint,
     "memory": CellMemory,
     "saliency": SaliencyModel,
-    "context": ContextKind,
 }
 """Settings with a fixed set of values."""
 

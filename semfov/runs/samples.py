@@ -20,7 +20,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
-from semfov.io.transfer import pack_tensors, unpack_tensors
+from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.observation.matching import match
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import look_from

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence, Verification
+from semfov.belief import MapEvidence, TargetEvidence, Verification
 from semfov.data.coco import CocoScenes
 from semfov.data.scene import Scenes
 from semfov.data.scenes import EmbeddedScenes
@@ -23,7 +23,7 @@ from semfov.eye import Eye
 from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
-from semfov.io.shipped import shipped_model
+from semfov.io.pretrained import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
@@ -198,13 +198,6 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     model = ClassTemplates.from_pretrained(name or eye.detector.name)
     model.check_eye(eye.settings(), eye.detector.classes)
     return model
-
-
-def make_context(name: str, eye: Eye) -> ContextPrior:
-    """Load a fitted context; check that it knows the detector's classes."""
-    prior = ContextPrior.from_pretrained(name)
-    prior.check_compatible(eye.detector.classes)
-    return prior.requires_grad_(False)
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

@@ -19,9 +19,9 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
-from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
+from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.looks import LOOK_SOURCES, BoxKey, one_thread, photograph_looks
 from semfov.version import __version__
 

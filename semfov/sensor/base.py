@@ -1,7 +1,7 @@
 """The interface of the sensors of an eye."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
@@ -190,19 +190,15 @@ class Sensor(nn.Module, ABC):
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
 
+def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
+    """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""
+    views = [view(b, g) for b in range(batch) for g in range(many)]
+    whole = torch.stack(views) if views else empty[None].expand(0, *empty.shape)
+    return whole.reshape(batch, many, *whole.shape[1:])
+
+
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:
-    """Bring fixations into one shape, and move them to the images' type and device.
-
-    Args:
-        gaze: `(2,)` for all images, `(B, 2)` for one fixation of each image, or `(B, G, 2)` for G of each.
-        like: the images, `(B, C, H, W)`.
-
-    Returns:
-        Fixations `(B, G, 2)`, and whether the gaze had the dimension G.
-
-    Raises:
-        InputError: a shape does not fit, or a fixation is not finite.
-    """
+    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as `(B, G, 2)` like the images, and whether they had G."""
     batch = like.shape[0]
     fits = 1 <= gaze.ndim <= 3 and gaze.shape[-1] == 2 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch)
     check(fits, "gaze", f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)", tuple(gaze.shape))

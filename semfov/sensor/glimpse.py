@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.sensor.base import stacked_views
 
 Padding = Literal["zeros", "border", "fill"]
 Length = TypeVar("Length", float, Tensor)
@@ -65,13 +66,11 @@ def glimpse(
         check(full, "boxes", "windows with a positive width and height", "an empty window")
     windows = boxes.to(image) if boxes.ndim == 3 else boxes[:, None].to(image)
     value = 0.0 if padding_mode == "zeros" else fill_value
-    views = [
-        torch.stack([_window(image[b], windows[b, g], size, padding_mode, value) for g in range(windows.shape[1])])
-        if windows.shape[1]
-        else image.new_zeros(0, image.shape[1], size[1], size[0])
-        for b in range(batch)
-    ]
-    result = torch.stack(views) if views else image.new_zeros(*windows.shape[:2], image.shape[1], size[1], size[0])
+
+    def view(b: int, g: int) -> Tensor:
+        return _window(image[b], windows[b, g], size, padding_mode, value)
+
+    result = stacked_views(view, batch, windows.shape[1], image.new_zeros(image.shape[1], size[1], size[0]))
     return result if boxes.ndim == 3 else result[:, 0]
 
 

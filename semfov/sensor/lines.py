@@ -84,20 +84,7 @@ class Lines(NamedTuple):
 def banded(
     taps: Taps, count: int, tile: int, shift: int, reach: int, dtype: torch.dtype, device: torch.device
 ) -> Lines:
-    """Make the matrix of a filter, cut into tiles where the line is long.
-
-    Args:
-        taps: the filter.
-        count: number of input pixels.
-        tile: number of output pixels of a tile.
-        shift: number of input pixels that a tile covers.
-        reach: largest number of input pixels that a tile reads before and after those.
-        dtype: type of the matrix.
-        device: device of the matrix.
-
-    Returns:
-        The matrix.
-    """
+    """The matrix of a filter; long lines are cut into tiles of `tile` pixels, each over `shift` and twice `reach`."""
     index, weight = taps.index, taps.weight
     length, window = len(index), shift + 2 * reach
     before = -(-reach // shift)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
+from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
 
 
@@ -47,13 +48,11 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
     poses = (pose if pose.ndim == 3 else pose[:, None]).to(panorama)
     source = go_around(even_rows(panorama) if antialias else panorama)
-    views = [
-        torch.stack([sample(source[b], poses[b, g], size, antialias=antialias) for g in range(poses.shape[1])])
-        if poses.shape[1]
-        else panorama.new_zeros(0, panorama.shape[1], size[1], size[0])
-        for b in range(batch)
-    ]
-    result = torch.stack(views) if views else panorama.new_zeros(0, poses.shape[1], panorama.shape[1], size[1], size[0])
+
+    def view(b: int, g: int) -> Tensor:
+        return sample(source[b], poses[b, g], size, antialias=antialias)
+
+    result = stacked_views(view, batch, poses.shape[1], panorama.new_zeros(panorama.shape[1], size[1], size[0]))
     return result if pose.ndim == 3 else result[:, 0]
 
 

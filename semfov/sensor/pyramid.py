@@ -87,8 +87,7 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     >>> pyrdown(torch.rand(1, 3, 48, 65)).shape, pyrdown(torch.rand(1, 3, 48, 65), "opencv").shape
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
     """
-    _check_image(image)
-    lookup(convention, get_args(Convention), "pyramid convention")
+    _check(image, convention)
     return reduce(image, convention)
 
 
@@ -121,8 +120,7 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     >>> pyrup(torch.rand(1, 3, 24, 32), (48, 65)).shape
     torch.Size([1, 3, 48, 65])
     """
-    _check_image(image)
-    lookup(convention, get_args(Convention), "pyramid convention")
+    _check(image, convention)
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], size, strict=True):
             check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
@@ -152,10 +150,7 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 64, 48), 2)]
     [(64, 48), (32, 24), (16, 12)]
     """
-    check(levels >= 0, "levels", "0 or more", levels)
-    _check_image(image)
-    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
-    lookup(convention, get_args(Convention), "pyramid convention")
+    _check(image, convention, levels)
     pyramid = [image]
     for _ in range(levels):
         pyramid.append(reduce(pyramid[-1], convention))
@@ -180,10 +175,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     >>> [tuple(band.shape[-2:]) for band in bands.details], tuple(bands.base.shape[-2:])
     ([(64, 48), (32, 24), (16, 12)], (8, 6))
     """
-    check(levels >= 0, "levels", "0 or more", levels)
-    _check_image(image)
-    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
-    lookup(convention, get_args(Convention), "pyramid convention")
+    _check(image, convention, levels)
     details = []
     for _ in range(levels):
         smaller = reduce(image, convention)
@@ -196,16 +188,10 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
 
 
 def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
-    """Whether Kornia computes the next level of `image`, or enlarges it to `size`, instead of the matrices of `lines`.
-
-    Kornia computes its own convention on devices where `benchmarks.pyramid` does not measure ours as faster, with and
-    without gradients. Ours computes what Kornia does not define: levels of fewer than three pixels along an axis, and
-    enlargement to other sizes than twice the image's. Ours also computes the cases in which Kornia would be less exact
-    or not deterministic.
-
-    Returns:
-        Whether Kornia does it.
-    """
+    """Whether Kornia computes the next level of `image`, or enlarges it to `size`, instead of our matrices."""
+    # Kornia computes its own convention on devices where `benchmarks.pyramid` does not measure ours as faster. Ours
+    # computes what Kornia does not define (fewer than three pixels along an axis, other sizes than twice the image's),
+    # and where Kornia would be less exact or not deterministic.
     if convention != "kornia" or image.device.type in _AHEAD:
         return False
     channels, height, width = image.shape[-3:]
@@ -223,10 +209,13 @@ def _kornia() -> ModuleType:
     return kornia.geometry.transform
 
 
-def _check_image(image: Tensor) -> None:
-    """Raise `InputError` unless `image` is `(B, C, H, W)` of floating-point numbers."""
+def _check(image: Tensor, convention: Convention, levels: int | None = None) -> None:
+    """Raise `InputError` unless `image` is `(B, C, H, W)` of floats, with a pixel for a pyramid of `levels`."""
+    check(levels is None or levels >= 0, "levels", "0 or more", levels)
     check_shape(image, "image", None, None, None, None)
     check(image.is_floating_point(), "image", "floating-point numbers", image.dtype)
+    check(levels is None or min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
+    lookup(convention, get_args(Convention), "pyramid convention")
 
 
 @constant

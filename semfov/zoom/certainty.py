@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.detection.overlaps import intersection, neighbours
+from semfov.detection.objects import intersection, neighbours
 from semfov.errors import check
 
 FACTS = (

@@ -4,8 +4,8 @@ from typing import Any
 
 import torch
 
+from semfov.detection.darknet_onnx import Graph
 from semfov.detection.detector import Detector
-from semfov.detection.export_graph import Graph
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
 from semfov.zoom.gist import DETECTION_SCORE

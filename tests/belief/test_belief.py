@@ -250,6 +250,16 @@ def test_an_observer_refuses_beliefs_and_looks_of_another_kind(kind):
                 observer.update(own, other.weigh(looks(), FIXATIONS, GRID, 2))
 
 
+@pytest.mark.parametrize("kind", ["context", "any of targets"])
+def test_beliefs_and_looks_of_another_observer_do_not_fade(kind):
+    observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
+    own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    with pytest.raises(InputError, match=rf"^belief: expected {type(own).__name__}"):
+        observer.fade(seen(Landing(3)), said, 0.5, visited)
+    with pytest.raises(InputError, match=rf"^look: expected {type(said).__name__}"):
+        observer.fade(own, Landing(3).weigh(looks(), FIXATIONS, GRID), 0.5, visited)
+
+
 @pytest.mark.parametrize("kind", ["target", "context"])
 def test_a_belief_about_one_target_gives_its_probability_for_any_class(kind):
     belief = seen(OBSERVERS[kind]())
@@ -324,32 +334,13 @@ def test_gathered_evidence_fades_towards_that_of_an_empty_look_from_far_away():
     assert torch.equal(faded.visited, visited)
 
 
-def test_context_fades_with_the_inner_belief(monkeypatch):
-    observer, visited = context_observer(), torch.zeros(2, 12, dtype=torch.bool)
+def test_context_fades_with_the_inner_belief():
+    inner, visited = target_observer(), torch.arange(24).reshape(2, 12) % 3 == 0
+    prior = ContextPrior(["cat", "cup", "dog"], rand(4, 3, 3), rand(4, 4, 2), [0.2])
+    observer = Context(inner, prior, (1.0, 0.5))
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, visited)
-    inner = observer.observer.fade(belief.inner, look.inner, 0.25, visited)
-    assert torch.equal(faded.inner.beta, inner.beta)
-    assert torch.equal(faded.closest, inner.closest)
+    assert equal(faded.inner, inner.fade(belief.inner, look.inner, 0.25, visited))
+    assert torch.equal(faded.closest, faded.inner.closest)
     torch.testing.assert_close(faded.scores, belief.scores / 4)
     assert torch.equal(faded.present, belief.present)
-    with pytest.raises(InputError, match=r"^belief: expected ContextBelief"):
-        observer.fade(belief.inner, look, 0.25, visited)
-    with pytest.raises(InputError, match=r"^look: expected ContextLook"):
-        observer.fade(belief, look.inner, 0.25, visited)
-    calls = []
-    monkeypatch.setattr(observer.observer, "fade", lambda *given: calls.append(given) or belief.inner)
-    observer.fade(belief, look, 0.25, visited)
-    assert [one is other for one, other in zip(calls[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
-        True
-    ] * 4
-
-
-@pytest.mark.parametrize("kind", OBSERVERS)
-def test_joining_a_single_batch_of_looks_changes_nothing(kind):
-    observer = OBSERVERS[kind]()
-    look = observer.weigh(looks(), FIXATIONS, GRID, 2)
-    start = observer.start(2, GRID, looks().scores)
-    joined = observer.update(start, type(look).join([look]))
-    for one, other in zip(tensors_of(joined), tensors_of(seen(observer)), strict=True):
-        assert torch.equal(one, other)

@@ -1,4 +1,4 @@
-"""Fusion rules against the exact posterior, the paper's formula and the properties that define them.
+"""Fusion rules against the exact posterior and the paper's formula, and many detections and cells against a loop.
 
 Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
 """
@@ -11,11 +11,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.belief import fusion
+from semfov import Detections, Grid
+from semfov.belief import fuse, fusion, likelihoods
+from semfov.belief.observers import Semantic
 from semfov.errors import InputError
 
 positive = st.floats(0.05, 20.0)
-likelihoods = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=6).filter(lambda values: max(values) > 1e-3)
+score_lists = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=6).filter(lambda values: max(values) > 1e-3)
 
 
 def exact_posterior_mean(beta: list[float], likelihood: list[float]) -> list[float]:
@@ -33,7 +35,7 @@ def scalar_kaplan(beta: list[float], likelihood: list[float]) -> list[float]:
     return [b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)]
 
 
-@given(likelihoods, st.data())
+@given(score_lists, st.data())
 def test_kaplan_matches_the_formula_and_the_exact_mean(likelihood, data):
     beta = data.draw(st.lists(positive, min_size=len(likelihood), max_size=len(likelihood)))
     b, l = torch.tensor(beta, dtype=torch.float64), torch.tensor(likelihood, dtype=torch.float64)
@@ -45,7 +47,7 @@ def test_kaplan_matches_the_formula_and_the_exact_mean(likelihood, data):
     assert after[l.argmin()] == b[l.argmin()]
 
 
-@given(likelihoods, st.data())
+@given(score_lists, st.data())
 def test_the_rule_of_semba_divides_only_the_second_term(likelihood, data):
     beta = np.array(data.draw(st.lists(positive, min_size=len(likelihood), max_size=len(likelihood))))
     scores = np.array(likelihood)
@@ -68,23 +70,6 @@ def test_kaplan_mean_equals_that_of_the_integrated_posterior():
     torch.testing.assert_close(after / after.sum(), posterior, atol=2e-3, rtol=0)
 
 
-def test_kaplan_depends_on_the_order_of_detections():
-    """Section IV-A applies it "in no particular order": the caller has to choose one."""
-    beta = torch.full((3,), 0.5, dtype=torch.float64)
-    first, second = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]], dtype=torch.float64)
-    one, other = fusion.kaplan(fusion.kaplan(beta, first), second), fusion.kaplan(fusion.kaplan(beta, second), first)
-    assert (one - other).abs().max() > 0.01
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_kaplan_with_uniform_and_one_hot_likelihoods(dtype):
-    beta = torch.tensor([0.5, 1.5, 3.0], dtype=dtype)
-    torch.testing.assert_close(fusion.kaplan(beta, torch.full((3,), 0.37, dtype=dtype)), beta)
-    one_hot = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
-    torch.testing.assert_close(fusion.kaplan(beta, one_hot), beta + one_hot)
-    assert fusion.kaplan(beta, one_hot).dtype == dtype
-
-
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
 def test_rules_ignore_scale_and_order_of_classes(rule):
     torch.manual_seed(1)
@@ -95,7 +80,7 @@ def test_rules_ignore_scale_and_order_of_classes(rule):
         torch.testing.assert_close(rule(beta[:, order], likelihood[:, order]), after[:, order])
 
 
-@given(st.lists(likelihoods.filter(lambda values: min(values) > 1e-3), min_size=1, max_size=5), st.data())
+@given(st.lists(score_lists.filter(lambda values: min(values) > 1e-3), min_size=1, max_size=5), st.data())
 def test_product_is_bayes_and_sum_is_an_average(looks, data):
     """Over several looks: p_k Π λ, normalised, and the mean of the normalised λ with the prior counting Σβ times."""
     classes = min(len(look) for look in looks)
@@ -127,11 +112,16 @@ def test_likelihoods_of_another_number_of_classes_are_refused(rule):
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
 @pytest.mark.parametrize(
     ("bad", "word"),
-    [([0.0, 0.0], "zeros"), ([float("nan"), 1.0], "NaN"), ([-0.1, 1.0], "negative"), ([1.0, float("inf")], "inf")],
+    [
+        ([0.0, 0.0], "a row of zeros"),
+        ([float("nan"), -1.0], "NaN or infinity"),
+        ([float("inf"), 1.0], "NaN or infinity"),
+        ([-0.1, 1.0], "a negative value"),
+    ],
 )
 def test_unusable_likelihoods_are_refused(rule, bad, word):
-    with pytest.raises(InputError, match=word):
-        rule(torch.ones(2), torch.tensor(bad))
+    with pytest.raises(InputError, match=rf"^likelihood: .*, got {word}$"):
+        rule(torch.ones(2, 2), torch.tensor([[1.0, 2.0], bad]))
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
@@ -166,3 +156,140 @@ def test_numpy_arrays_are_refused_with_the_conversion(rule):
         rule(beta, torch.from_numpy(likelihood))
     with pytest.raises(InputError, match=r"^likelihood: expected a tensor, got a NumPy array"):
         rule(torch.from_numpy(beta), likelihood)
+
+
+def fuse_by_loop(beta, likelihood, footprint, rule):
+    beta = beta.clone()
+    for image in range(beta.shape[0]):
+        for detection in range(likelihood.shape[1]):
+            for cell in range(beta.shape[1]):
+                if footprint[image, detection, cell]:
+                    beta[image, cell] = rule(beta[image, cell], likelihood[image, detection])
+    return beta
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_fuse_equals_the_loop(name, dtype):
+    torch.manual_seed(0)
+    beta = torch.rand(3, 6, 5, dtype=dtype) + 0.2
+    likelihood = torch.rand(3, 7, 5, dtype=dtype)
+    footprint = torch.rand(3, 7, 6) < 0.4
+    before = beta.clone()
+    got = fuse(beta, likelihood, footprint, name)
+    torch.testing.assert_close(got, fuse_by_loop(beta, likelihood, footprint, getattr(fusion, name)))
+    assert torch.equal(beta, before)
+
+
+def test_fuse_changes_nothing_if_detections_cover_no_cell():
+    beta = torch.rand(2, 3, 4)
+    got = fuse(beta, torch.zeros(2, 5, 4), torch.zeros(2, 5, 3, dtype=torch.bool))
+    assert torch.equal(got, beta)
+    assert got.data_ptr() != beta.data_ptr()
+
+
+def stacked_maps(soft):
+    """Three batches of two maps, four detections each, the last of which is padding."""
+    torch.manual_seed(2)
+    beta, likelihood = torch.rand(3, 2, 6, 5) + 0.2, torch.rand(3, 2, 4, 5)
+    footprint = torch.rand(3, 2, 4, 6) * (torch.rand(3, 2, 4, 6) < 0.5)
+    footprint[:, :, 3] = 0
+    likelihood[:, :, 3] = 0
+    return beta, likelihood, footprint if soft else footprint > 0
+
+
+def seen(grid: Grid) -> Detections:
+    boxes = torch.tensor([[[0.0, 0, 30, 30], [20, 20, 90, 60], [0, 0, 0, 0]]])
+    scores = torch.tensor([[[0.1, 0.6, 0.3], [0.5, 0.1, 0.4], [0, 0, 0]]])
+    return Detections(boxes, scores, torch.tensor([[True, True, False]]))
+
+
+class Sharper:
+    """An observation model that squares scores near the fovea and ignores those far away."""
+
+    def calibrate(self, scores, distance):
+        return torch.where(distance[..., None] < 0.3, scores**2, torch.ones_like(scores))
+
+
+def test_the_observation_model_gets_the_distance_of_each_box():
+    grid = Grid(4, 3, (100, 60))
+    fixation = torch.tensor([[10.0, 10.0]])
+    near = likelihoods(seen(grid), fixation, grid, Sharper())
+    torch.testing.assert_close(near[0, 0], torch.tensor([0.01, 0.36, 0.09]))
+    torch.testing.assert_close(near[0, 1], torch.ones(3))
+    said = Semantic(3, Sharper()).weigh(seen(grid), fixation, grid)
+    assert torch.equal(said.likelihood[0, :2], near[0, :2] / near[0, :2].amax(-1, keepdim=True))
+    assert torch.equal(said.footprint[0, :2], grid.footprint(seen(grid).boxes)[0, :2])
+    assert not said.footprint[0, 2].any()
+
+
+def test_likelihoods_of_raw_scores_are_the_scores_and_uniform_for_padding():
+    grid = Grid(4, 3, (100, 60))
+    raw = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid)
+    assert torch.equal(raw[0, :2], seen(grid).scores[0, :2])
+    torch.testing.assert_close(raw[0, 2], torch.full((3,), 1 / 3))
+    tempered = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid, tempering=0.25)
+    torch.testing.assert_close(tempered, raw.double().pow(0.25).float())
+
+
+@pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 3)])
+def test_likelihoods_need_one_fixation_for_each_look(shape):
+    with pytest.raises(InputError, match=r"^fixation: expected a tensor of shape \(..., 1, 2\)"):
+        likelihoods(seen(Grid(4, 3, (100, 60))), torch.zeros(shape), Grid(4, 3, (100, 60)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_weights_of_the_footprint_are_exponents_of_the_likelihood(name, dtype):
+    """Row by row: λ to the power of its weight, scaled to a largest value of 1."""
+    beta, likelihood, footprint = (tensor[0] for tensor in stacked_maps(soft=True))
+    expected = beta.clone()
+    for image, detection, cell in footprint.nonzero().tolist():
+        said = (likelihood[image, detection] / likelihood[image, detection].max()) ** footprint[image, detection, cell]
+        expected[image, cell] = getattr(fusion, name)(expected[image, cell], said)
+    got = fuse(beta, likelihood, footprint.to(dtype), name)
+    torch.testing.assert_close(got, expected)
+    rows = torch.func.vmap(lambda b, l, f: fuse(b[None], l[None], f[None], name)[0])(
+        beta, likelihood, footprint.to(dtype)
+    )
+    torch.testing.assert_close(rows, expected)
+
+
+@pytest.mark.parametrize("batched", [0, 1, 2])
+def test_fuse_vectorises_over_one_argument_alone(batched):
+    arguments = stacked_maps(soft=True)
+    given = [tensor if number == batched else tensor[0] for number, tensor in enumerate(arguments)]
+    dims = tuple(0 if number == batched else None for number in range(3))
+    together = torch.func.vmap(fuse, in_dims=dims)(*given)
+    for row in range(3):
+        alone = [tensor[row] if number == batched else tensor for number, tensor in enumerate(given)]
+        torch.testing.assert_close(together[row], fuse(*alone))
+
+
+@pytest.mark.parametrize(
+    ("argument", "beta", "likelihood", "footprint"),
+    [
+        ("beta", (4, 3), (2, 3), (2, 4)),
+        ("likelihood", (1, 4, 3), (2, 2, 3), (1, 2, 4)),
+        ("likelihood", (1, 4, 3), (2, 3), (1, 2, 4)),
+        ("likelihood", (1, 4, 3), (1, 2, 5), (1, 2, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (2, 2, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (1, 3, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (1, 2, 5)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (2, 4)),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(argument, beta, likelihood, footprint):
+    with pytest.raises(InputError, match=rf"^{argument}: expected a tensor of shape"):
+        fuse(torch.ones(beta), torch.ones(likelihood), torch.ones(footprint))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+def test_invalid_dirichlet_parameters_are_refused(value):
+    beta = torch.tensor([[[1.0, 2.0], [value, 1.0]]])
+    with pytest.raises(InputError, match=r"^beta: expected positive, finite Dirichlet parameters"):
+        fuse(beta, torch.ones(1, 1, 2), torch.ones(1, 1, 2))
+    for rule in (fusion.kaplan, fusion.product, fusion.sum):
+        with pytest.raises(InputError, match=r"^beta: expected positive, finite"):
+            rule(beta, torch.ones(2))
+        assert rule(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)

@@ -11,7 +11,6 @@ from semfov.belief import TargetEvidence
 from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target
 from semfov.errors import InputError
-from tests import small
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -117,29 +116,6 @@ def test_belief_equals_a_loop_over_looks_and_cells(looks, model, reference, orde
     assert belief.presence(7) is belief.presence(torch.tensor([2])) is belief.anywhere
 
 
-def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
-    observer, cell = Target(small.score_evidence(TargetEvidence)), 9
-    x, y = GRID.centres[cell].tolist()
-    box = torch.tensor([[[x - 7, y - 7, x + 7, y + 7]]])
-    shown = Detections(box, torch.tensor([[[0.02, 0.02, 0.94, 0.02]]]), torch.ones(1, 1, dtype=torch.bool))
-    belief = observer.start(1, GRID, box)
-    history = []
-    for where, seen in ((0, Detections.empty(1, 3)), (cell, shown), (cell, shown), (23, Detections.empty(1, 3))):
-        belief = observer(belief, seen, GRID.centres[[where]], GRID, 2)
-        history.append(belief)
-    blank, first, second, later = (float(each.present[0, cell]) for each in history)
-    assert blank < 0.05
-    assert first > 0.9
-    assert first == second == later
-    assert int(history[-1].present.argmax()) == cell
-    assert all(float(each.anywhere) > 0.9 for each in history[1:])
-    # For the next look, fixated cells are ruled out, but not their neighbours.
-    assert float(history[1].following[0, cell]) < 0.001
-    assert float(history[1].following[0, 0]) < 0.001 < float(history[1].following[0, 8])
-    # A fixated cell that showed nothing equals any other cell that showed nothing.
-    assert float(history[0].present[0, 0]) == pytest.approx(blank)
-
-
 def test_gradients_reach_every_parameter(looks):
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=4).double()
@@ -171,29 +147,6 @@ def test_gradients_through_log_odds_and_presence(gathered):
 
     values = [start.nearest, start.best, start.mean, start.distance, start.score, model.prior]
     assert torch.autograd.gradcheck(odds, [value.detach().clone().requires_grad_() for value in values])
-
-
-def test_log_odds_equal_a_loop_in_float64(gathered, reference):
-    torch.manual_seed(1)
-    model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
-    torch.nn.init.normal_(model.prior)
-    said = gathered(classes=3)
-    cells = model.log_odds(said, 6)
-    emptied, image = model.chance(said, 6), model.presence(cells, said)
-    for row in range(6):
-        known = {
-            "nearest": said.nearest[row].tolist(),
-            "best": said.best[row].tolist(),
-            "mean": said.mean[row].tolist(),
-            "closest": said.distance[row].tolist(),
-            "score": float(said.score[row]),
-            "looks": float(said.looks[row]),
-            "visited": said.visited[row].tolist(),
-        }
-        expected, following, anywhere = read_out(reference, model, known, int(said.target[row]))
-        assert cells[row].tolist() == pytest.approx(expected, abs=1e-7)
-        assert emptied[row].tolist() == pytest.approx(following, abs=1e-7)
-        assert float(image[row]) == pytest.approx(anywhere, abs=1e-7)
 
 
 def test_bad_input(looks, model):

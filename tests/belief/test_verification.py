@@ -56,16 +56,6 @@ def test_features_equal_a_loop(count, seed, presence, cell, evidence):
     assert torch.equal(found, chosen)
 
 
-def test_detections_that_are_masked_change_nothing():
-    closer, box = seen(5, 1), torch.tensor([20.0, 30, 70, 90])
-    kept = closer.mask[0]
-    alone = Detections(closer.boxes[:, kept], closer.scores[:, kept], closer.mask[:, kept])
-    for one, other in zip(
-        closer_features(0.5, 0.5, 0.5, closer, box, 1), closer_features(0.5, 0.5, 0.5, alone, box, 1), strict=True
-    ):
-        assert torch.equal(one, other)
-
-
 def test_shipped_models_are_loaded_by_name_and_others_are_none():
     assert Verification.if_shipped("no such model") is None
     shipped = sorted(path.stem for path in Verification.shipped.glob("*.safetensors"))

@@ -274,12 +274,6 @@ def test_a_disk_that_fills_up_is_an_error_and_a_later_run_completes(server, tmp_
     assert tree(tmp_path) == WHOLE
 
 
-def test_a_root_below_a_file_is_refused(tmp_path, unreachable_address):
-    (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="cannot be written"):
-        get(tmp_path / "file" / "coco", unreachable_address)
-
-
 def test_the_program_downloads_and_reports_errors(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(SPLITS, "val2017", IMAGES)
     monkeypatch.setattr(download, "_ANNOTATIONS", ANNOTATIONS)

@@ -18,30 +18,31 @@ def pixels(height=150, width=230, seed=0):
     return np.random.default_rng(seed).integers(256, size=(height, width, 3), dtype=np.uint8)
 
 
-BOXES = [(0, 0, 230, 150), (17, 33, 99, 120), (190, 100, 230, 150), (64, 64, 65, 65)]
-
-
-@pytest.mark.parametrize("box", BOXES)
-def test_every_source_gives_the_same_window(tmp_path, box):
+@pytest.mark.parametrize("large", [1 << 24, 1 << 15])  # pictures with more pixels are read from reduced copies
+def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch, large):
     tifffile = pytest.importorskip("tifffile")
-    array = pixels()
+    monkeypatch.setattr("semfov.data.large.LARGE", large)
+    smooth = Image.fromarray(pixels(8, 8)).resize((450, 330), Image.Resampling.BICUBIC)
+    smooth.save(tmp_path / "a.jpg", quality=90)
+    with Image.open(tmp_path / "a.jpg") as image:
+        stored = image.convert("RGB")
+    stored.save(tmp_path / "a.png")
+    array = np.array(stored)
     np.save(tmp_path / "a.npy", array)
-    Image.fromarray(array).save(tmp_path / "a.png")
     tifffile.imwrite(tmp_path / "tiles.tif", array, tile=(64, 48), photometric="rgb", compression="zlib")
     tifffile.imwrite(tmp_path / "strips.tif", array, rowsperstrip=7, photometric="rgb")
-    x1, y1, x2, y2 = box
-    expected = torch.from_numpy(array[y1:y2, x1:x2].copy()).permute(2, 0, 1)
-    for source in (
-        array,
-        np.load(tmp_path / "a.npy", mmap_mode="r"),
-        torch.from_numpy(array).permute(2, 0, 1).float() / 255,
-        tmp_path / "a.png",
-        tmp_path / "tiles.tif",
-        str(tmp_path / "strips.tif"),
-    ):
-        picture = open_large(source)
-        assert picture.size == (230, 150)
-        assert torch.equal(picture.read(box), expected)
+    tensor = torch.from_numpy(array.copy()).permute(2, 0, 1)
+    files = [tmp_path / name for name in ("a.jpg", "a.png", "tiles.tif")]
+    sources = [stored, tensor, tensor / 255, np.load(tmp_path / "a.npy", mmap_mode="r"), str(tmp_path / "strips.tif")]
+    for box in ((0, 0, 450, 330), (17, 33, 99, 120), (390, 100, 450, 330), (64, 64, 65, 65)):
+        x1, y1, x2, y2 = box
+        assert torch.equal(open_large(array).read(box), tensor[:, y1:y2, x1:x2])
+        for source in (*files, *sources):
+            picture = open_large(source)
+            assert picture.size == (450, 330)
+            assert picture.reduction(9) == (1 if large > 450 * 330 else 4)
+            for reduction in (1, 8):
+                assert torch.equal(picture.read(box, reduction), open_large(array).read(box, reduction))
 
 
 def test_grey_has_three_channels(tmp_path):
@@ -59,25 +60,6 @@ def test_rotated_photographs_are_read_upright(tmp_path):
     picture = open_large(tmp_path / "turned.png")
     assert picture.size == (150, 230)
     assert np.array_equal(picture.pixels((0, 0, 150, 230)), np.rot90(array, -1))
-
-
-@pytest.mark.parametrize("large", [1 << 24, 1 << 18])  # pictures with more pixels are read from reduced copies
-def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch, large):
-    monkeypatch.setattr("semfov.data.large.LARGE", large)
-    smooth = Image.fromarray(pixels(8, 8)).resize((1200, 900), Image.Resampling.BICUBIC)
-    smooth.save(tmp_path / "a.jpg", quality=90)
-    with Image.open(tmp_path / "a.jpg") as image:
-        stored = image.convert("RGB")
-    stored.save(tmp_path / "a.png")
-    array = np.array(stored)
-    tensor = torch.from_numpy(array.copy()).permute(2, 0, 1)
-    for box in ((0, 0, *stored.size), (400, 80, 816, 496)):
-        for reduction in (1, 8):
-            expected = open_large(array).read(box, reduction)
-            for source in (tmp_path / "a.jpg", tmp_path / "a.png", stored, tensor, tensor / 255):
-                picture = open_large(source)
-                assert picture.reduction(9) == open_large(array).reduction(9)
-                assert torch.equal(picture.read(box, reduction), expected)
 
 
 def test_windows_of_a_memory_mapped_file_need_little_memory(tmp_path):

@@ -1,10 +1,13 @@
+"""Scenes, how much of them boxes cover, and the scenes of a set that hold most objects."""
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.data import Annotation, Scene, box_coverage, legal_targets
+from semfov.data import Annotation, EmbeddedScenes, Scene, box_coverage, legal_targets
+from semfov.data.scene import Crowded
 from semfov.errors import InputError
 
 
@@ -29,16 +32,6 @@ def test_coverage_equals_counts_on_a_pixel_grid(case):
     assert box_coverage(tensor, (width, height), "union") == pytest.approx((grid > 0).mean(), abs=1e-12)
 
 
-@given(integer_boxes(), st.floats(0.1, 8))
-def test_coverage_does_not_depend_on_the_scale(case, factor):
-    boxes, (width, height) = case
-    tensor = torch.tensor(boxes, dtype=torch.float64)
-    for coverage in ("sum", "union"):
-        small = box_coverage(tensor, (width, height), coverage)
-        large = box_coverage(tensor * factor, (width * factor, height * factor), coverage)
-        assert large == pytest.approx(small, abs=1e-9)
-
-
 def test_a_target_that_covers_exactly_the_limit_is_legal():
     boxes = torch.tensor(
         [[0.0, 0.0, 128.0, 480.0], [0.0, 0.0, 129.0, 480.0]]
@@ -57,3 +50,33 @@ def test_bad_arguments():
 
 def test_size_is_width_and_height():
     assert Scene(1, "a", torch.zeros(3, 4, 6), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64)).size == (6, 4)
+
+
+def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
+    scenes = EmbeddedScenes(("person", "cat", "dog"), count=9, seed=3)
+    crowded = Crowded(scenes, 0.4)
+    counts = {name: len(scenes.annotation(index).boxes) for index, name in enumerate(scenes.ids)}
+    assert len(crowded) == len(crowded.ids) == 4  # 3.6 rounded up
+    assert len(set(counts.values())) > 1
+    left = [counts[name] for name in scenes.ids if name not in crowded.ids]
+    assert min(counts[name] for name in crowded.ids) >= max(left)
+    assert crowded.ids == sorted(crowded.ids)
+
+
+def test_a_scene_is_that_of_the_set():
+    scenes = EmbeddedScenes(("person", "cat", "dog"), count=6, seed=3)
+    crowded = Crowded(scenes, 0.5)
+    for index, name in enumerate(crowded.ids):
+        place = scenes.ids.index(name)
+        assert torch.equal(crowded[index].image, scenes[place].image)
+        assert torch.equal(crowded.annotation(index).boxes, scenes.annotation(place).boxes)
+        assert crowded.targets(index) == scenes.targets(place)
+        assert crowded.digest(index) == scenes.digest(place)
+    assert crowded.classes == scenes.classes
+    assert len({crowded.fingerprint, scenes.fingerprint, Crowded(scenes, 0.3).fingerprint}) == 3
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.5, float("nan")])
+def test_a_share_outside_its_range_is_refused(share):
+    with pytest.raises(InputError, match="share: expected above 0"):
+        Crowded(EmbeddedScenes(("person",), count=2), share)

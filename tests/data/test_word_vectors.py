@@ -9,9 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data import WordVectors, spread
-from semfov.data.naming import alike
 from semfov.data.word_vectors import words_of
-from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, InputError
 
 VECTORS = np.random.default_rng(0).normal(size=(6, 5))
@@ -105,11 +103,3 @@ def test_errors_name_the_file_line_or_argument(path, tmp_path):
     for options, name in (({"temperature": 0.0}, "temperature"), ({"least": 2}, "least")):
         with pytest.raises(InputError, match=name):
             spread("cup", ["cup"], words, **options)
-
-
-def test_every_class_name_matches_only_its_own_class():
-    for place, name in enumerate(COCO_CLASSES):
-        for spelling in (name, name.upper(), name.replace(" ", "_")):
-            assert alike(spelling, COCO_CLASSES) == [place]
-    assert alike("sofa", COCO_CLASSES) == [COCO_CLASSES.index("couch")]
-    assert alike("spaceship", COCO_CLASSES) == []

@@ -8,103 +8,30 @@ import numpy as np
 import pytest
 import torch
 
+from semfov.detection.load import load_yolo
+from semfov.detection.yolo import YoloV3
+
 SMALL_CFG = """
-[net]
-width=64
-height=32
-channels=3
-# training only
-batch=8
-
-[convolutional]
-batch_normalize=1
-filters=8
-size=3
-stride=1
-pad=1
-activation=leaky
-
-[maxpool]
-size=2
-stride=2
-
-[convolutional]
-batch_normalize=1
-filters=12
-size=3
-stride=2
-pad=1
-activation=leaky
-
-[convolutional]
-batch_normalize=1
-filters=12
-size=3
-groups=3
-stride=1
-pad=1
-activation=mish
-
-[shortcut]
-from=-2
-activation=linear
-
-[maxpool]
-size=2
-stride=1
-
-[maxpool]
-size=5
-stride=1
-
-[route]
-layers=-1,-2,4
-
-[route]
-layers=-1
-groups=2
-group_id=1
-
-[convolutional]
-filters=14
-size=1
-stride=2
-pad=1
-activation=linear
-
-[yolo]
-mask=1,2
-anchors=4,6, 8,10, 20,12
-classes=2
-
-[route]
-layers=-4
-
-[convolutional]
-batch_normalize=1
-filters=6
-size=1
-pad=0
-padding=0
-activation=relu
-
-[upsample]
-stride=2
-
-[route]
-layers=-1, 1
-
-[convolutional]
-filters=7
-size=3
-pad=1
-activation=linear
-
-[yolo]
-mask=0
-anchors=4,6, 8,10, 20,12
-classes=2
-"""
+[net] width=64 height=32 channels=3 batch=8
+[convolutional] batch_normalize=1 filters=8 size=3 stride=1 pad=1 activation=leaky
+[maxpool] size=2 stride=2
+[convolutional] batch_normalize=1 filters=12 size=3 stride=2 pad=1 activation=leaky
+[convolutional] batch_normalize=1 filters=12 size=3 groups=3 stride=1 pad=1 activation=mish
+[shortcut] from=-2 activation=linear
+[maxpool] size=2 stride=1
+[maxpool] size=5 stride=1
+[route] layers=-1,-2,4
+[route] layers=-1 groups=2 group_id=1
+[convolutional] filters=14 size=1 stride=2 pad=1 activation=linear
+[yolo] mask=1,2 anchors=4,6,8,10,20,12 classes=2
+[route] layers=-4
+[convolutional] batch_normalize=1 filters=6 size=1 pad=0 padding=0 activation=relu
+[upsample] stride=2
+[route] layers=-1,1
+[convolutional] filters=7 size=3 pad=1 activation=linear
+[yolo] mask=0 anchors=4,6,8,10,20,12 classes=2
+""".replace(" ", "\n")
+"""A network with every kind of layer, one a line; `batch` is for training only."""
 
 # Filters, inputs per group, kernel side and batch norm of each convolution of SMALL_CFG, in order.
 SMALL_CONVOLUTIONS = [(8, 3, 3, 1), (12, 8, 3, 1), (12, 4, 3, 1), (14, 18, 1, 0), (6, 36, 1, 1), (7, 14, 3, 0)]
@@ -146,6 +73,17 @@ def small_weights(write_weights: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
+def make_small(small_cfg: Path, small_weights: Path) -> Callable[..., YoloV3]:
+    """Loads the network of `small_cfg` with random weights."""
+
+    def make(runtime: str = "torch", **options: object) -> YoloV3:
+        settings = {"weights": small_weights, "classes": ("cat", "dog"), "stride": 16, "runtime": runtime}
+        return load_yolo(str(small_cfg), **{**settings, **options})
+
+    return make
+
+
+@pytest.fixture
 def threads() -> Iterator[Callable[[], Iterator[int]]]:
     """Yield 1 and 2 after setting that number of threads, and restore the number at the end."""
     before = torch.get_num_threads()
@@ -167,7 +105,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _export_to_temporary_folder(monkeypatch: pytest.MonkeyPatch, exports: Path) -> None:
-    monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: exports)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.cache_folder", lambda: exports)
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,8 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from semfov.detection.darknet import Darknet
+from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import parse_cfg, read_cfg
-from semfov.detection.darknet_weights import read_weights
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, InputError, SemfovError

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from semfov import Detector
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.onnx import load_onnx
-from semfov.detection.onnx_recognition import HEADS
+from semfov.detection.onnx_heads import HEADS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "detectors.md").read_text(encoding="utf-8")
 

@@ -1,43 +1,26 @@
-import sys
-from types import SimpleNamespace
-
 import pytest
 import torch
 from torch import nn
 
 from semfov import ActivePerception
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.darknet_onnx import RUNTIMES
 from semfov.detection.load import check_detector, detector_name, load_detector
-from semfov.detection.onnx_twin import RUNTIMES
 from semfov.detection.placement import resize
 from semfov.errors import DataError, InputError
 
 
-def test_cfg_and_weights(small_cfg, write_weights):
-    detector = load_detector(small_cfg, weights=write_weights(), classes=["cat", "dog"], stride=8, threshold=0.1)
-    assert detector.name == "small"
-    assert detector.classes == ("cat", "dog")
-    assert detector.input_size == (64, 32)
-    assert detector.stride == 8
-    assert detector.selection.threshold == 0.1
-    assert len(detector.digest) == 64
-    assert not detector.training
-    assert not any(parameter.requires_grad for parameter in detector.parameters())
-    assert int(detector(torch.rand(2, 3, 40, 60)).count.sum()) > 0
-
-
-def test_options(small_cfg, write_weights, tmp_path):
+def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
     names = tmp_path / "pets.names"
     names.write_text("cat\n\ndog\n")
-    weights = write_weights()
-    options = {"weights": weights, "classes": names, "stride": None}
-    detector = load_detector(
-        str(small_cfg), **options, input_size=96, background="none", iou=0.4, limit=3, per_class=True
-    )
-    assert detector.classes == ("cat", "dog")
-    assert detector.input_size == (96, 96)
-    assert detector.background == "none"
+    options = {"weights": small_weights, "classes": names, "stride": None}
+    detector = load_detector(small_cfg, **options, input_size=96, background="none", iou=0.4, limit=3, per_class=True)
+    assert (detector.name, detector.classes, len(detector.digest)) == ("small", ("cat", "dog"), 64)
+    assert (detector.input_size, detector.background) == ((96, 96), "none")
     assert detector.settings()["selection"] == {"threshold": 0.02, "iou": 0.4, "limit": 3, "per_class": True}
+    assert not detector.training
+    assert not any(parameter.requires_grad for parameter in detector.parameters())
+    assert load_detector(str(small_cfg), **options).input_size == (64, 32)
     image = torch.rand(1, 3, 64, 96)
     exact = load_detector(small_cfg, **options, dtype=torch.float64).propose(image)
     assert exact.boxes.dtype == torch.float64
@@ -52,7 +35,7 @@ def test_unknown_names_are_refused_with_the_known_ones(name):
         load_detector(name)
 
 
-def test_missing_and_unsuitable_files_are_refused(small_cfg, write_weights, tmp_path):
+def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_path):
     with pytest.raises(InputError, match=r"expected a cfg and its weights"):
         load_detector("x.weights")
     with pytest.raises(InputError, match="weights: expected the path"):
@@ -60,26 +43,11 @@ def test_missing_and_unsuitable_files_are_refused(small_cfg, write_weights, tmp_
     with pytest.raises(DataError, match=r"cannot read the cfg"):
         load_detector(tmp_path / "missing.cfg", weights="x")
     with pytest.raises(DataError, match=r"expected 248007048 bytes .* got"):
-        load_detector("yolov3", weights=write_weights())
+        load_detector("yolov3", weights=small_weights)
     with pytest.raises(InputError, match="classes: expected 2 names, got 80"):
-        load_detector(small_cfg, weights=write_weights(), stride=None)
+        load_detector(small_cfg, weights=small_weights, stride=None)
     with pytest.raises(DataError, match="cannot read the class names"):
-        load_detector(small_cfg, weights=write_weights(), classes=tmp_path / "missing.names")
-
-
-def test_onnx_and_torchvision_loaders_are_imported_when_needed(monkeypatch):
-    calls = []
-    for module, function in [("onnx", "load_onnx"), ("torchvision", "load_torchvision")]:
-        stand_in = SimpleNamespace(**{function: lambda name, _f=function, **options: calls.append((_f, name, options))})
-        monkeypatch.setitem(sys.modules, f"semfov.detection.{module}", stand_in)
-    load_detector("folder/model.onnx", threshold=0.1)
-    load_detector("yolox-nano")
-    load_detector("torchvision:fcos_resnet50_fpn")
-    assert calls == [
-        ("load_onnx", "folder/model.onnx", {"threshold": 0.1}),
-        ("load_onnx", "yolox-nano", {}),
-        ("load_torchvision", "torchvision:fcos_resnet50_fpn", {}),
-    ]
+        load_detector(small_cfg, weights=small_weights, classes=tmp_path / "missing.names")
 
 
 def test_coco_classes_equal_those_of_the_annotations(shared):
@@ -127,20 +95,8 @@ def test_one_thread_is_reproducible_and_two_threads_agree_with_it(tiny_weights, 
     torch.testing.assert_close(two.classes, one.classes, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.weights
-def test_both_runtimes_give_the_same_detections(tiny, tiny_weights):
-    from skimage import data
-
-    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
-    network = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch")
-    expected, actual = network(image), tiny(image)
-    assert torch.equal(actual.labels, expected.labels)
-    torch.testing.assert_close(actual.scores, expected.scores, atol=1e-4, rtol=0)
-    torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.01, rtol=0)
-
-
-def test_a_detector_is_returned_as_it_is(small_cfg, write_weights):
-    detector = load_detector(small_cfg, weights=write_weights(), classes=["cat", "dog"])
+def test_a_detector_is_returned_as_it_is(small_cfg, small_weights):
+    detector = load_detector(small_cfg, weights=small_weights, classes=["cat", "dog"])
     assert load_detector(detector) is detector
     assert ActivePerception.raw(detector).eye.detector is detector
     with pytest.raises(InputError, match="options: expected none for a detector that is made already, got threshold"):

@@ -1,11 +1,11 @@
-"""Merging of boxes that were computed anywhere, against loops over the definition."""
+"""Merging of boxes that were computed anywhere, and suppression by pairs of boxes, against plain loops."""
 
 import numpy as np
 import pytest
 import torch
 
 from semfov import InputError, Objects, merge_boxes
-from semfov.detection.objects import merge_looks
+from semfov.detection.objects import merge_looks, survivors
 
 SIZE = (1000, 800)
 
@@ -125,3 +125,20 @@ def test_wrong_arguments_are_refused_by_name():
     ):
         with pytest.raises(InputError, match=message):
             merge_boxes(*arguments, **options)
+
+
+@pytest.mark.parametrize("count", [1, 2, 12, 60])
+def test_survivors_are_those_of_removing_one_box_after_the_other(count):
+    lengths = set()
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        pairs = generator.integers(count, size=(2 * count, 2))
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        better, worse = pairs.min(1), pairs.max(1)
+        stays: list[int] = []
+        for box in range(count):
+            if not any(one in stays and other == box for one, other in zip(better, worse, strict=True)):
+                stays.append(box)
+        assert survivors(count, better, worse).tolist() == stays
+        lengths.add(len(stays))
+    assert (len(lengths) > 1) == (count > 1)

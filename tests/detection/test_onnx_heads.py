@@ -1,4 +1,4 @@
-"""Every decoder against plain Python code that decodes one box at a time."""
+"""Decoders of cells against plain Python code (`test_onnx` has the others), and recognition of heads."""
 
 import math
 
@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import onnx_heads as heads
+from semfov.detection.onnx_heads import HEADS, Signature, recognise
 from semfov.errors import InputError
 
 both = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -55,19 +56,6 @@ def test_yolox(dtype, canvas, strides):
     assert torch.equal(found.classes, raw[..., 5:])
 
 
-@both
-def test_yolov5_and_yolov8_rows(dtype):
-    rows = noise(2, 7, 9, dtype=dtype)
-    expected = [[corners(*row[:4]) for row in image] for image in rows.tolist()]
-    five, eight = heads.decode_yolov5(rows), heads.decode_yolov8(rows.transpose(1, 2))
-    close(five.boxes, expected)
-    close(eight.boxes, expected)
-    assert torch.equal(five.objectness, rows[..., 4])
-    assert torch.equal(five.classes, rows[..., 5:])
-    assert eight.objectness is None
-    assert torch.equal(eight.classes, rows[..., 4:])
-
-
 @given(canvases, st.integers(2, 9), st.sampled_from([0.0, 0.5]))
 @both
 def test_distance_distributions(dtype, canvas, bins, offset):
@@ -86,24 +74,6 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     close(found.boxes, [expected])
     assert torch.equal(found.classes, classes)
     assert found.objectness is None
-
-
-@both
-def test_detr_softmax_and_sigmoid(dtype):
-    canvas = (60, 40)
-    logits, boxes = noise(2, 5, 4, dtype=dtype), noise(2, 5, 4, dtype=dtype, seed=1).sigmoid()
-    expected = [[corners(x * 60, y * 40, w * 60, h * 40) for x, y, w, h in image] for image in boxes.tolist()]
-    soft, hard = heads.decode_detr(logits, boxes, canvas), heads.decode_rtdetr(logits, boxes, canvas)
-    close(soft.boxes, expected)
-    close(hard.boxes, expected)
-    powers = [[[math.exp(t) for t in row] for row in image] for image in logits.tolist()]
-    close(soft.classes, [[[p / sum(row) for p in row[:-1]] for row in image] for image in powers])
-    close(soft.background, [[row[-1] / sum(row) for row in image] for image in powers])
-    close(hard.classes, [[[p / (1 + p) for p in row] for row in image] for image in powers])
-    assert hard.background is None
-    rows = heads.decode_rtdetr_rows(torch.cat([boxes, logits], -1), canvas)
-    close(rows.boxes, expected)
-    assert torch.equal(rows.classes, logits)
 
 
 def test_decoders_are_differentiable():
@@ -134,3 +104,77 @@ def test_wrong_shapes_are_refused_by_name():
         heads.decode_distances(noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
     with pytest.raises(InputError, match="boxes"):
         heads.decode_detr(noise(1, 5, 3), noise(1, 5, 5), (64, 64))
+
+
+LEVELS = (6400, 1600, 400)
+
+
+def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None):
+    named = tuple(o if isinstance(o[0], str) else (f"output{i}", o) for i, o in enumerate(outputs))
+    return Signature(image, named, canvas, producer, classes)
+
+
+def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
+    pairs = [
+        (name.format(i), (1, n, c)) for name, c in zip(names, (80, bins), strict=True) for i, n in enumerate(levels)
+    ]
+    return pairs
+
+
+@pytest.mark.parametrize(
+    ("expected", "given"),
+    [
+        ("yolox", signature(("output", (1, 8400, 85)))),
+        ("yolox", signature(("output", (1, 3549, 85)), canvas=(416, 416))),
+        ("yolov5", signature((1, 25200, 85))),
+        ("yolov5", signature((1, 25200, 7), classes=2)),
+        ("yolov5", signature((1, 3 * (25600 + 6400 + 1600 + 400), 85), canvas=(1280, 1280))),
+        ("yolov8", signature((1, 84, 8400))),
+        ("yolov8", signature((1, 5, 8400))),
+        ("yolov8", signature((1, 84, 6300), canvas=(640, 480))),
+        ("rtdetr", signature((1, 300, 84), classes=80)),
+        ("rtdetr", signature(("logits", (1, 300, 80)), ("pred_boxes", (1, 300, 4)))),
+        ("detr", signature(("logits", (1, 100, 92)), ("pred_boxes", (1, 100, 4)), ("hidden", (1, 100, 256)))),
+        ("detr", signature(("pred_logits", (1, 100, 6)), ("pred_boxes", (1, 100, 4)), classes=5)),
+        ("rtdetr", signature(("pred_logits", (1, 100, 6)), ("pred_boxes", (1, 100, 4)), classes=6)),
+        ("candidates", signature(("boxes", (1, 10, 4)), ("objectness", (1, 10)), ("classes", (1, 10, 3)))),
+        ("candidates", signature(("boxes", (1, 10, 4)), ("scores", (1, 10, 3)))),
+        ("picodet", signature(*maps(2704, 676, 169, 49), canvas=(416, 416), producer="PaddlePaddle")),
+        ("nanodet", signature(*maps(1600, 400, 100), canvas=(320, 320))),
+        ("nanodet-plus", signature((1, 2125, 112), canvas=(320, 320), classes=80)),
+    ],
+)
+def test_unambiguous_signatures_are_recognised(expected, given):
+    assert recognise(given) == expected
+
+
+@pytest.mark.parametrize(
+    ("fits", "given"),
+    [
+        ("yolox and yolov5 fit", signature((1, 8400, 85))),  # YOLOv6 also has this shape, with decoded boxes
+        ("nanodet-plus and yolov5 fit", signature((1, 2125, 112), canvas=(320, 320))),
+        ("picodet and nanodet fit", signature(*maps(1600, 400, 100, names=("a{}", "b{}")), canvas=(320, 320))),
+        ("no head fits", signature((1, 300, 84))),
+        ("no head fits", signature((1, 1000, 85))),
+        ("no head fits", signature((1, 255, 20, 20), (1, 255, 40, 40))),
+        ("no head fits", signature(("logits", (1, 100, 91)), ("pred_boxes", (1, 100, 4)))),
+        ("with 20 classes: no head fits", signature((1, 84, 8400), classes=20)),
+    ],
+)
+def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
+    with pytest.raises(InputError, match=fits) as error:
+        recognise(given)
+    assert all(head in str(error.value) for head in HEADS)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        signature((1, 300, 6)),
+        signature((1, 300, 6), classes=80),
+        signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
+    ],
+)
+def test_outputs_without_score_vectors_are_refused(given):
+    with pytest.raises(InputError, match="export"):
+        recognise(given)

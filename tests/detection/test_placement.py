@@ -48,22 +48,6 @@ def test_the_image_is_at_the_place_given_by_the_placement(width, height, stride)
         assert all(side % stride == 0 for side in canvas.shape[-2:])
 
 
-def test_boxes_are_clipped_to_the_image():
-    _, placement = letterbox(torch.zeros(1, 3, 50, 100), (100, 100))
-    boxes = placement.boxes_to_image(torch.tensor([[-5.0, 0.0, 300.0, 40.0]]))
-    torch.testing.assert_close(boxes, torch.tensor([[0.0, 0.0, 100.0, 15.0]]))
-
-
-def test_options_corner_and_stretch():
-    image = torch.rand(1, 3, 20, 40)
-    canvas, placement = letterbox(image, (80, 80), corner=True)
-    assert placement.offset == (0, 0)
-    torch.testing.assert_close(canvas[..., :40, :], resize(image, (80, 40)))
-    canvas, placement = letterbox(image, (80, 80), stretch=True)
-    assert placement.scale == (2.0, 4.0)
-    torch.testing.assert_close(canvas, resize(image, (80, 80)))
-
-
 @pytest.mark.parametrize("size", [(37, 29), (60, 45), (100, 81)])
 def test_resize_equals_bilinear_opencv_down_to_half_the_size(size):
     image = np.random.default_rng(0).random((58, 74, 3), dtype=np.float32)
@@ -81,13 +65,6 @@ def test_resize_equals_bilinear_pillow_below_half_the_size(size):
     np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
 
 
-def test_resize_averages_pixels_that_it_would_otherwise_skip():
-    stripes = torch.zeros(1, 1, 8, 64)
-    stripes[..., ::4] = 1
-    small = resize(stripes, (8, 1))
-    torch.testing.assert_close(small[..., 1:-1], torch.full((1, 1, 1, 6), 0.25), atol=0.03, rtol=0)
-
-
 def test_resize_to_the_same_size_returns_a_copy():
     image = torch.rand(1, 3, 8, 8)
     canvas = resize(image, (8, 8))
@@ -100,7 +77,7 @@ def test_letterbox_is_differentiable():
     assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
 
 
-@pytest.mark.parametrize("size", [(416, 312), (700, 500), (300, 200)])
+@pytest.mark.parametrize("size", [(700, 500), (300, 200)])
 def test_resize_is_reproducible_on_one_thread_and_agrees_on_two(size, threads):
     image = torch.rand(1, 3, 480, 640)
     (one, again), (two, _) = [[resize(image, size) for _ in range(2)] for _ in threads()]

@@ -50,11 +50,6 @@ def test_score_vectors_are_points_of_the_simplex(dtype, classes, objectness, pol
         assert scores[0, 1:].argmax() == torch.tensor(classes, dtype=dtype).argmax()
 
 
-def test_confidence_is_objectness_times_best_class_score():
-    assert candidates([0.6, 0.2], [0.5]).confidence.item() == pytest.approx(0.3)
-    assert candidates([0.6, 0.2]).confidence.item() == pytest.approx(0.6)
-
-
 @pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
 def test_score_vectors_are_differentiable(policy):
     classes = torch.rand(2, 3, dtype=torch.float64, requires_grad=True)

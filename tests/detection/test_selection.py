@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from semfov.detection import Candidates, Selection, letterbox
 from semfov.detection.selection import select, suppress
+from semfov.errors import InputError
+from tests.small import Fixed
 
 
 def overlap(a, b) -> float:
@@ -75,20 +77,6 @@ def test_selection_applies_threshold_suppression_and_order():
     torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
 
 
-def test_an_image_does_not_depend_on_its_batch():
-    candidates = make(40, batch=3)
-    whole = select(candidates, None, Selection(), "residual")
-    for image in range(3):
-        part = Candidates(
-            *(x[image : image + 1] for x in (candidates.boxes, candidates.classes, candidates.objectness))
-        )
-        alone = select(part, None, Selection(), "residual")
-        length = int(alone.count)
-        assert int(whole.count[image]) == length
-        assert torch.equal(whole.boxes[image, :length], alone.boxes[0])
-        assert torch.equal(whole.scores[image, :length], alone.scores[0])
-
-
 def test_boxes_outside_the_image_are_dropped():
     _, placement = letterbox(torch.zeros(1, 3, 32, 64), (64, 64))
     boxes = torch.tensor([[[10.0, 0.0, 20.0, 15.0], [10.0, 20.0, 20.0, 30.0]]])  # the first box lies in the padding
@@ -102,9 +90,6 @@ def test_a_selection_without_candidates_is_empty(count):
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
     assert found.count.tolist() == [0, 0]
-
-
-def test_one_image_of_a_batch_may_have_no_detections():
     candidates = make(5)
     candidates.objectness[0] = 0
     assert select(candidates, None, Selection(), "residual").count.tolist()[0] == 0
@@ -118,3 +103,32 @@ def test_gradients_reach_boxes_classes_and_objectness():
     for leaf in leaves:
         rows = leaf.grad.reshape(20, -1).abs().sum(-1) > 0
         assert int(rows.sum()) == int(found.count)
+
+
+def made_of(**changes):
+    parts = {
+        "boxes": torch.tensor([[[1.0, 1, 9, 9], [10, 10, 20, 20]]]),
+        "classes": torch.tensor([[[0.9, 0.1], [0.2, 0.7]]]),
+        "objectness": torch.tensor([[0.8, 0.6]]),
+    }
+    for name, value in changes.items():
+        parts[name][0, 1] = value
+    return Candidates(**parts)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"classes": torch.nan}, "confidence.*finite"),
+        ({"objectness": torch.nan}, "confidence.*finite"),
+        ({"boxes": torch.nan}, "boxes.*finite"),
+        ({"boxes": torch.inf}, "boxes.*finite"),
+        ({"classes": 1.5}, r"class scores.*\[0, 1\]"),
+        ({"objectness": 2.0}, r"objectness.*\[0, 1\]"),
+    ],
+)
+def test_invalid_scores_and_boxes_are_refused_and_are_no_image_without_detections(changes, message):
+    image = torch.rand(1, 3, 32, 32)
+    assert Fixed(candidates=made_of())(image).count.tolist() == [2]
+    with pytest.raises(InputError, match=message):
+        Fixed(candidates=made_of(**changes))(image)

@@ -5,36 +5,8 @@ import sys
 
 import pytest
 import torch
+import transformers as hf
 from torch import nn
-from transformers import (
-    ConditionalDetrConfig,
-    ConditionalDetrForObjectDetection,
-    ConditionalDetrImageProcessor,
-    DabDetrConfig,
-    DabDetrForObjectDetection,
-    DeformableDetrConfig,
-    DeformableDetrForObjectDetection,
-    DeformableDetrImageProcessor,
-    DetrConfig,
-    DetrForObjectDetection,
-    DetrImageProcessor,
-    DFineConfig,
-    DFineForObjectDetection,
-    OwlViTConfig,
-    OwlViTForObjectDetection,
-    ResNetConfig,
-    RTDetrConfig,
-    RTDetrForObjectDetection,
-    RTDetrImageProcessor,
-    RTDetrResNetConfig,
-    RTDetrV2Config,
-    RTDetrV2ForObjectDetection,
-    TableTransformerConfig,
-    TableTransformerForObjectDetection,
-    YolosConfig,
-    YolosForObjectDetection,
-    YolosImageProcessor,
-)
 from transformers.models.hgnet_v2 import HGNetV2Config
 
 from semfov import load_detector
@@ -43,12 +15,12 @@ from semfov.detection.transformers import SOFTMAX
 from semfov.errors import DataError, InputError
 
 PROCESSORS = {
-    "detr": DetrImageProcessor,
-    "table-transformer": DetrImageProcessor,
-    "yolos": YolosImageProcessor,
-    "conditional_detr": ConditionalDetrImageProcessor,
-    "dab-detr": ConditionalDetrImageProcessor,
-    "deformable_detr": DeformableDetrImageProcessor,
+    "detr": hf.DetrImageProcessor,
+    "table-transformer": hf.DetrImageProcessor,
+    "yolos": hf.YolosImageProcessor,
+    "conditional_detr": hf.ConditionalDetrImageProcessor,
+    "dab-detr": hf.ConditionalDetrImageProcessor,
+    "deformable_detr": hf.DeformableDetrImageProcessor,
 }
 """Whose `post_process_object_detection` a kind of model uses, if it is not RT-DETR's."""
 
@@ -70,7 +42,7 @@ HYBRID = {
 
 
 def resnet():
-    return RTDetrResNetConfig(
+    return hf.RTDetrResNetConfig(
         embedding_size=8,
         hidden_sizes=[8, 16, 24, 32],
         depths=[1, 1, 1, 1],
@@ -97,7 +69,7 @@ def hgnet():
 
 def like_detr(config, model, stages=("stage4",), **more):
     """A model of the family of DETR, with one layer each in its encoder and its decoder."""
-    backbone = ResNetConfig(
+    backbone = hf.ResNetConfig(
         embedding_size=8, hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], layer_type="basic", out_features=[*stages]
     )
     sizes = {"encoder_layers": 1, "decoder_layers": 1, "encoder_ffn_dim": 32, "num_queries": 12, "id2label": NAMES}
@@ -107,28 +79,28 @@ def like_detr(config, model, stages=("stage4",), **more):
 
 def yolos():
     sizes = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 32}
-    config = YolosConfig(
+    config = hf.YolosConfig(
         **sizes, image_size=[96, 128], num_detection_tokens=12, use_mid_position_embeddings=False, id2label=NAMES
     )
-    return YolosForObjectDetection(config)
+    return hf.YolosForObjectDetection(config)
 
 
 MODELS = {
-    "detr": lambda: like_detr(DetrConfig, DetrForObjectDetection),
-    "table-transformer": lambda: like_detr(TableTransformerConfig, TableTransformerForObjectDetection),
+    "detr": lambda: like_detr(hf.DetrConfig, hf.DetrForObjectDetection),
+    "table-transformer": lambda: like_detr(hf.TableTransformerConfig, hf.TableTransformerForObjectDetection),
     "yolos": yolos,
-    "conditional_detr": lambda: like_detr(ConditionalDetrConfig, ConditionalDetrForObjectDetection),
-    "dab-detr": lambda: like_detr(DabDetrConfig, DabDetrForObjectDetection, hidden_size=16),
+    "conditional_detr": lambda: like_detr(hf.ConditionalDetrConfig, hf.ConditionalDetrForObjectDetection),
+    "dab-detr": lambda: like_detr(hf.DabDetrConfig, hf.DabDetrForObjectDetection, hidden_size=16),
     "deformable_detr": lambda: like_detr(
-        DeformableDetrConfig,
-        DeformableDetrForObjectDetection,
+        hf.DeformableDetrConfig,
+        hf.DeformableDetrForObjectDetection,
         ("stage2", "stage3", "stage4"),
         d_model=32,
         decoder_layers=2,
     ),
-    "rt_detr": lambda: RTDetrForObjectDetection(RTDetrConfig(backbone_config=resnet(), **HYBRID)),
-    "rt_detr_v2": lambda: RTDetrV2ForObjectDetection(RTDetrV2Config(backbone_config=resnet(), **HYBRID)),
-    "d_fine": lambda: DFineForObjectDetection(DFineConfig(backbone_config=hgnet(), **HYBRID)),
+    "rt_detr": lambda: hf.RTDetrForObjectDetection(hf.RTDetrConfig(backbone_config=resnet(), **HYBRID)),
+    "rt_detr_v2": lambda: hf.RTDetrV2ForObjectDetection(hf.RTDetrV2Config(backbone_config=resnet(), **HYBRID)),
+    "d_fine": lambda: hf.DFineForObjectDetection(hf.DFineConfig(backbone_config=hgnet(), **HYBRID)),
 }
 
 
@@ -160,7 +132,7 @@ def test_boxes_and_scores_are_those_of_transformers(kind):
     found = detector.propose(canvas)
     with torch.no_grad():
         outputs = model(pixel_values=detector.preprocessing(canvas))
-    processor = PROCESSORS.get(kind, RTDetrImageProcessor)()
+    processor = PROCESSORS.get(kind, hf.RTDetrImageProcessor)()
     theirs = processor.post_process_object_detection(outputs, threshold=0.0, target_sizes=[(96, 128)] * 2)
     for image, each in enumerate(theirs):
         compared = 0
@@ -225,7 +197,7 @@ def test_exported_models_give_the_same_candidates(kind, tmp_path):
 def test_pictures_are_resized_as_by_the_image_processor():
     detector = load_detector(small("detr"))
     image = torch.rand(1, 3, 100, 300)
-    theirs = DetrImageProcessor()(image[0], do_rescale=False, return_tensors="pt", do_pad=False)["pixel_values"]
+    theirs = hf.DetrImageProcessor()(image[0], do_rescale=False, return_tensors="pt", do_pad=False)["pixel_values"]
     canvas, placement = detector.fit(image)
     assert canvas.shape == theirs.shape
     torch.testing.assert_close(detector.preprocessing(canvas), theirs, atol=0.05, rtol=0)
@@ -239,7 +211,7 @@ def test_pictures_are_resized_as_by_the_image_processor():
 def test_a_saved_model_is_loaded_with_its_processor(tmp_path):
     model = small("rt_detr")
     model.save_pretrained(tmp_path)
-    RTDetrImageProcessor(size={"height": 64, "width": 96}).save_pretrained(tmp_path)
+    hf.RTDetrImageProcessor(size={"height": 64, "width": 96}).save_pretrained(tmp_path)
     detector = load_detector(f"hf:{tmp_path}", limit=5)
     assert (detector.input_size, detector.selection.limit) == ((96, 64), 5)
     image = torch.rand(1, 3, 40, 60)
@@ -255,9 +227,9 @@ def test_models_that_cannot_be_read_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="detector: expected hf:owner/name, got 'hf:'"):
         load_detector("hf:")
     small_text = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
-    text = OwlViTForObjectDetection(OwlViTConfig(text_config=small_text, vision_config=small_text, projection_dim=8))
+    config = hf.OwlViTConfig(text_config=small_text, vision_config=small_text, projection_dim=8)
     with pytest.raises(InputError, match=r"classes of its own, such as RTDetr.*got OwlViT"):
-        load_detector(text)
+        load_detector(hf.OwlViTForObjectDetection(config))
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match="pip install transformers"):
         load_detector("hf:someone/model")

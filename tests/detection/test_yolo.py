@@ -3,10 +3,8 @@ import math
 import pytest
 import torch
 
-from semfov.detection import Selection
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
-from semfov.detection.darknet_weights import read_weights
 from semfov.detection.yolo import YoloV3, decode_yolo
 from semfov.errors import InputError
 
@@ -15,13 +13,6 @@ ANCHORS = [(10.0, 14.0), (23.0, 27.0)]
 
 def sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
-
-
-@pytest.fixture
-def detector(small_cfg, write_weights) -> YoloV3:
-    network = Darknet(read_cfg(small_cfg)).eval().requires_grad_(False)
-    digest = read_weights(network, write_weights())
-    return YoloV3(network, ("cat", "dog"), digest=digest)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
@@ -74,7 +65,8 @@ def test_decoding_refuses_a_wrong_number_of_channels():
         decode_yolo(torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
 
 
-def test_proposals_of_all_heads_are_concatenated(detector):
+def test_proposals_of_all_heads_are_concatenated(make_small):
+    detector = make_small()
     canvas = torch.rand(2, 3, 32, 64)
     candidates = detector.propose(canvas)
     assert candidates.boxes.shape == (2, 2 * 4 * 8 + 16 * 32, 4)
@@ -83,31 +75,6 @@ def test_proposals_of_all_heads_are_concatenated(detector):
     second = decode_yolo(fine, [(4.0, 6.0)], (64, 32))
     torch.testing.assert_close(candidates.boxes, torch.cat([first.boxes, second.boxes], 1))
     torch.testing.assert_close(candidates.classes, torch.cat([first.classes, second.classes], 1))
-
-
-def test_boxes_are_mapped_back_to_the_image(detector):
-    detector.selection = Selection(threshold=0.0, limit=5)
-    image = torch.rand(1, 3, 100, 150)
-    canvas, placement = detector.fit(image)
-    assert canvas.shape == (1, 3, 32, 64)
-    found = detector(image)
-    assert 0 < found.count.item() <= 5
-    assert float(found.boxes[..., 2].max()) <= 150
-    proposed = placement.boxes_to_image(detector.propose(canvas).boxes[0])
-    torch.testing.assert_close(found.scores.sum(-1), torch.ones(1, found.mask.shape[1]))
-    for box in found.boxes[0]:
-        assert bool((proposed == box).all(-1).any())
-
-
-def test_settings_contain_runtime_digest_and_cfg(detector, small_cfg, write_weights):
-    before = detector.settings()
-    assert before["runtime"] == "torch"
-    other = read_cfg(small_cfg)
-    other[-1].options["mask"] = "1"
-    network = Darknet(other)
-    digest = read_weights(network, write_weights())
-    assert digest == before["digest"]
-    assert YoloV3(network, ("cat", "dog"), digest=digest).settings()["cfg"] != before["cfg"]
 
 
 @pytest.mark.parametrize(
@@ -122,3 +89,12 @@ def test_settings_contain_runtime_digest_and_cfg(detector, small_cfg, write_weig
 def test_refuses_invalid_settings(small_cfg, options, message):
     with pytest.raises(InputError, match=message):
         YoloV3(Darknet(read_cfg(small_cfg)), **({"classes": ("cat", "dog")} | options))
+
+
+def test_settings_contain_runtime_digest_and_cfg(make_small, small_cfg):
+    before = make_small().settings()
+    assert before["runtime"] == "torch"
+    small_cfg.write_text(small_cfg.read_text().replace("mask=0", "mask=1"))
+    after = make_small().settings()
+    assert after["digest"] == before["digest"]
+    assert after["cfg"] != before["cfg"]

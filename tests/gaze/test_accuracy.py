@@ -1,13 +1,170 @@
-"""Expected accuracy against a loop over fixations, cells and classes."""
+"""Additional correct cells, by an observation model and by a learned map, against loops; policies for learned maps."""
 
 import pytest
 import torch
 
-from semfov.belief import Grid
-from semfov.gaze.acquisition import ExpectedAccuracy
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.errors import InputError
+from semfov.gaze.acquisition import CloserLook, ExpectedAccuracy, ExpectedGain
+from semfov.gaze.policies import Closer, Gain, Random, SaliencyMaximum
+from semfov.runs.candidates import Models, make_strategy
+from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.presets import presets, resolve
+from semfov.strategy import Strategy
 from tests.small import values_of
 
-GRID = Grid(4, 3, (80, 60))
+GRID, CELLS = Grid(5, 4, (50, 40)), Grid(4, 3, (80, 60))
+
+
+@pytest.fixture
+def model():
+    generator = torch.Generator().manual_seed(1)
+    model = MapEvidence(5, 4, components=4)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))
+    return model.requires_grad_(False).eval()
+
+
+def belief_of(model, dtype=torch.float32, device=None):
+    """Beliefs of three episodes after two looks."""
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(3, 4, 2, generator=generator) * 30
+    boxes = torch.cat([corner, corner + 3 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
+    scores = (3 * torch.rand(3, 4, 4, generator=generator)).softmax(-1)
+    seen = Detections(boxes.to(device, dtype), scores.to(device, dtype), torch.ones(3, 4, dtype=bool, device=device))
+    observer = LearnedMap(model)
+    belief, visited = observer.start(3, GRID, seen.scores), torch.zeros(3, 20, dtype=torch.bool, device=device)
+    for cells in ([0, 7, 19], [4, 8, 2]):
+        belief = observer(belief, seen, GRID.centres[cells].to(seen.boxes), GRID)
+        visited[[0, 1, 2], cells] = True
+    return belief, visited
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_gain_is_summed_over_all_cells(model, dtype, device):
+    model = model.to(device, dtype)
+    belief, visited = belief_of(model, dtype, device)
+    acquisition = ExpectedGain(model, GRID).to(device)
+    got = acquisition(belief, visited)
+    assert got.shape == (3, 20)
+    assert got.dtype == dtype
+    assert got.device.type == device.type
+    for episode in range(3):
+        one = belief[episode : episode + 1]
+        for fixation in range(20):
+            distance = GRID.distance(GRID.centres[fixation])[None].to(one.closest)
+            gains = model.gain(one.probabilities, one.closest, one.looks, distance)[0, 0]
+            total = 0.0
+            for cell, told in enumerate(gains):
+                nearer = float(distance[0, cell]) < float(one.closest[0, cell]) - 1e-6
+                assert nearer == (float(told) != 0)
+                total += float(told)
+            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
+    # A second look at the same cell gains nothing.
+    assert not got[visited].any()
+    assert bool((got[~visited] != 0).all())
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_gain_of_a_batch_equals_the_gain_of_each_episode(model):
+    belief, visited = belief_of(model)
+    acquisition = ExpectedGain(model, GRID)
+    whole = acquisition(belief, visited)
+    for row in range(3):
+        assert torch.equal(acquisition(belief[row : row + 1], visited[row : row + 1])[0], whole[row])
+
+
+def test_other_beliefs_are_refused(model):
+    acquisition, visited = ExpectedGain(model, GRID), torch.zeros(1, 20, dtype=torch.bool)
+    like = torch.empty(0)
+    for observer in (Semantic(4), Target(TargetEvidence(4, 4, components=4))):
+        belief = observer.start(1, GRID, like)
+        with pytest.raises(InputError, match=f"belief: expected MapBelief, got {type(belief).__name__}"):
+            acquisition(belief, visited)
+
+
+def test_closer_look_accepts_a_learned_map(model):
+    """The uncertainty of a cell is one minus the share of its most probable object among all objects."""
+    belief, visited = belief_of(model)
+    got = CloserLook(GRID, 0.2)(belief, visited)
+    for episode in range(3):
+        for fixation in range(20):
+            total = 0.0
+            for cell in range(20):
+                p = belief.probabilities[episode, cell, 1:].tolist()
+                away = float(GRID.cell_distance[fixation, cell])
+                before = float((1 - belief.closest[episode, cell] / 0.2).clamp(max=0).exp())
+                now = float((1 - torch.tensor(away) / 0.2).clamp(max=0).exp())
+                total += max(now - before, 0) * (1 - max(p) / sum(p))
+            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-5)
+
+
+LEARNED = {
+    "random-learned": PolicyConfig("random", "learned"),
+    "closer-look-learned": PolicyConfig("closer-look", "learned"),
+    "expected-gain-learned": PolicyConfig("expected-gain", "learned"),
+    "vocus2-learned": PolicyConfig("saliency", "learned", saliency="vocus2"),
+    "itti-koch-learned": PolicyConfig("saliency", "learned", saliency="itti-koch"),
+}
+
+
+DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
+
+
+@pytest.mark.parametrize(
+    ("task", "policy", "scores", "expected"),
+    [
+        *(("exploration", policy, "learned", "expected 'raw' or 'calibrated' for policy") for policy in DIRICHLET),
+        *(
+            ("exploration", "expected-gain", scores, "expected 'learned' for policy")
+            for scores in ("raw", "calibrated")
+        ),
+        *(("search", policy, "learned", ".*") for policy in ("random", "non-predictive", "target-evidence")),
+    ],
+)
+def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected):
+    """Policies for Dirichlet beliefs need an observation model or a Dirichlet belief; a learned map has neither."""
+    with pytest.raises(InputError, match=f"^scores: {expected} ?'{policy}', got '{scores}'"):
+        resolve(PolicyConfig(policy, scores), task)
+    if task == "exploration":
+        assert f"{policy}-{scores}" not in presets(task)
+        with pytest.raises(InputError, match="policy"):
+            resolve(f"{policy}-{scores}", task)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"tempering": 0.5}, {"footprint": "soft"}, {"memory": "closest"}, {"misses": True}], ids=str
+)
+@pytest.mark.parametrize("policy", sorted(LEARNED))
+def test_settings_of_another_belief_are_refused(policy, setting):
+    own = LEARNED[policy]
+    with pytest.raises(InputError, match=f"^{next(iter(setting))}: expected null, .*has its own belief"):
+        resolve(PolicyConfig(own.policy, "learned", saliency=own.saliency, **setting), "exploration")
+
+
+def test_strategies_of_learned_maps(model):
+    def strategy(name, **models):
+        return make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, Models(**models), 0.15)
+
+    for name, kind in zip(LEARNED, (Random, Closer, Gain, SaliencyMaximum, SaliencyMaximum), strict=True):
+        made = strategy(name, map=model)
+        assert isinstance(made, Strategy)
+        assert isinstance(made.observer, LearnedMap)
+        assert made.observer.model is model
+        assert not made.observer.together
+        assert isinstance(made.policy, kind)
+        with pytest.raises(InputError, match=r"expected a learned map.*, got none"):
+            strategy(name, observation=FovealObservationModel.identity(["a", "b", "c"], [0.2]))
+    assert strategy("closer-look-learned", map=model).policy.fovea == 0.15
+
+
+def test_a_grid_in_double_precision_works_with_a_belief_in_single_precision(model):
+    belief, visited = belief_of(model)
+    wide = ExpectedGain(model, Grid(5, 4, torch.tensor([50.0, 40.0], dtype=torch.float64)))
+    torch.testing.assert_close(wide(belief, visited), ExpectedGain(model, GRID)(belief, visited))
 
 
 class Model:
@@ -30,10 +187,10 @@ def beta():
 
 
 def test_value_equals_the_loop(beta):
-    acquisition = ExpectedAccuracy(Model(), GRID)
+    acquisition = ExpectedAccuracy(Model(), CELLS)
     got = values_of(acquisition, beta)
     torch.testing.assert_close(values_of(acquisition, beta[0]), got[0])
-    right, levels = Model().expected_scores(), Model().level(GRID.cell_distance)
+    right, levels = Model().expected_scores(), Model().level(CELLS.cell_distance)
     for episode in range(2):
         p = beta[episode] / beta[episode].sum(-1, keepdim=True)
         for f in range(12):

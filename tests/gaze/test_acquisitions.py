@@ -5,49 +5,24 @@ import inspect
 import pytest
 import torch
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
+from semfov import DirichletBelief, InputError, acquisition
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
 from tests import small
+from tests.gaze.test_modules import LOOKAHEADS, functions
+from tests.small import GRID
 from tests.small import draw as rand
 
-GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
 
 
 def model():
-    alpha = 0.5 + 3 * rand(4, 3, 4) + 2 * torch.eye(4, dtype=torch.float64)[:, None]
-    names, misses = ("cat", "cup", "dog"), 0.1 + 0.8 * rand(4, 3)
-    return FovealObservationModel(alpha, [0.2, 0.5], names, miss_rate=misses).requires_grad_(False)
+    return small.model().double().requires_grad_(False)
 
 
-SEARCH = {
-    "TargetPosterior": lambda: acquisition.TargetPosterior(TARGETS),
-    "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(TARGETS, model()),
-    "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(TARGETS, model(), GRID),
-    "FovealHit": lambda: acquisition.FovealHit(TARGETS, model(), GRID),
-    "PlaceInformation": lambda: acquisition.PlaceInformation(TARGETS, model(), GRID),
-}
-EXPLORATION = {
-    "KLDivergence": lambda: acquisition.KLDivergence(model(), GRID),
-    "BayesianSurprise": lambda: acquisition.BayesianSurprise(model(), GRID),
-    "NegativeEntropy": lambda: acquisition.NegativeEntropy(model(), GRID),
-    "TwoPeaks": lambda: acquisition.TwoPeaks(model(), GRID),
-    "UpperConfidenceBound": lambda: acquisition.UpperConfidenceBound(model(), GRID),
-    "ProbabilityOfImprovement": lambda: acquisition.ProbabilityOfImprovement(model(), GRID),
-    "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID),
-    "CloserLook": lambda: acquisition.CloserLook(GRID, 0.2),
-    "ObjectEvidence": acquisition.ObjectEvidence,
-}
-BLIND = {"Static": lambda: acquisition.Static(rand(3, 12)), "Uniform": acquisition.Uniform}
-PRIOR = {
-    "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(TARGETS), rand(3, 12), weight=0.3)
-}
-EVERY = SEARCH | EXPLORATION | BLIND | PRIOR
+EVERY = functions(TARGETS, model, rand(3, 12))
 # These need only the probabilities of the target, or no belief at all.
-OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", *BLIND}
-# These predict the belief after a look at each cell of their grid.
-GRIDDED = ["NeighbourhoodPosterior", *(name for name in EXPLORATION if name not in ("CloserLook", "ObjectEvidence"))]
+OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", "Static", "Uniform"}
 
 
 def beliefs():
@@ -115,16 +90,9 @@ def test_a_batch_gives_the_values_of_each_episode_alone(name, dtype):
         assert torch.equal(alone, together[row : row + 1])
 
 
-@pytest.mark.parametrize("name", BLIND)
-def test_functions_that_ignore_the_belief_have_no_gradient(name):
-    known = beliefs()
-    known.beta.requires_grad_()
-    assert not EVERY[name]()(known, visits()).requires_grad
-
-
 def test_values_have_the_dtype_of_the_belief(name):
-    """An observation model in double precision works with beliefs in single precision."""
-    function, known = EVERY[name](), beliefs()
+    """A function and an observation model in double precision work with beliefs in single precision."""
+    function, known = EVERY[name]().double(), beliefs()
     single = DirichletBelief(known.beta.float(), known.closest.float())
     if name == "Static":
         function = function.float()
@@ -169,16 +137,8 @@ def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cell
     assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name != "Static"])
-def test_a_function_in_double_precision_keeps_the_dtype_of_the_belief(name):
-    """Its values are compared with other values of that belief, so they have the same dtype."""
-    known = beliefs()
-    values = EVERY[name]().double()(DirichletBelief(known.beta.float(), known.closest.float()), visits())
-    assert values.dtype == torch.float32
-
-
 @pytest.mark.parametrize("shape", [(5,), (11, 4), (1, 13, 4)])
-@pytest.mark.parametrize("name", GRIDDED)
+@pytest.mark.parametrize("name", ["NeighbourhoodPosterior", *LOOKAHEADS])
 def test_a_belief_with_another_number_of_cells_is_refused(name, shape):
     with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 12, any\)"):
         small.values_of(EVERY[name](), torch.ones(shape))

@@ -1,12 +1,13 @@
-"""Random choices of the next cell: how often, which cells, and never a visited one."""
+"""The best cell against a loop, random choices against frequencies, and gradients of the soft choice."""
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov import Grid
 from semfov.errors import InputError
-from semfov.gaze.choice import Exploratory, Greedy, Softmax, drawn_from
+from semfov.gaze.choice import Exploratory, Greedy, Softmax, drawn_from, select_fixation, soft_fixation
 
 CENTRES = torch.stack([torch.arange(9.0), torch.zeros(9)], -1)
 
@@ -43,15 +44,6 @@ def test_a_visited_cell_is_never_chosen(seed, astray):
     _, cell = Exploratory(noise_from(seed), astray)(0, torch.arange(6), values, visited, CENTRES)
     assert not visited[left].gather(1, cell[left, None]).any()
     assert torch.equal(values, before)
-
-
-def test_a_complete_search_visits_every_cell_once():
-    choice, visited = Exploratory(noise_from(1), 0.5), torch.zeros(5, 9, dtype=torch.bool)
-    for shift in range(9):
-        _, cell = choice(shift, torch.arange(5), torch.rand(5, 9), visited, CENTRES)
-        assert not visited.gather(1, cell[:, None]).any()
-        visited = visited.scatter(1, cell[:, None], True)
-    assert bool(visited.all())
 
 
 def test_without_random_fixations_the_choice_is_greedy():
@@ -91,16 +83,104 @@ def test_softmax_draws_in_proportion_to_exponentials(inverse_temperature, dtype,
     assert bool(((counts - count * share).abs() <= 5 * (count * share * (1 - share)).sqrt()).all())
 
 
-def test_a_softmax_at_low_temperature_is_greedy():
-    values, visited = torch.rand(200, 9), torch.rand(200, 9) < 0.5
-    visited[:, 0] = False
-    noise = drawn_from(torch.rand(200, 1, 9))
-    cold, greedy = (
-        choice(0, torch.arange(200), values, visited, CENTRES)[1] for choice in (Softmax(noise, 1e7), Greedy(noise))
-    )
-    assert torch.equal(cold, greedy)
-
-
 def test_a_negative_inverse_temperature_is_refused():
     with pytest.raises(InputError, match="inverse_temperature"):
         Softmax(lambda *_: torch.zeros(1, 9), -1.0)
+
+
+@given(st.integers(1, 9), st.integers(0, 10_000))
+def test_selection_equals_a_loop(cells, seed):
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randint(0, 4, (3, cells), generator=generator).double()
+    visited = torch.rand(3, cells, generator=generator) < 0.4
+    noise = torch.rand(3, cells, generator=generator)
+    for row, got in enumerate(select_fixation(values, visited, noise).tolist()):
+        free = [c for c in range(cells) if not visited[row, c]]
+        best = max((float(values[row, c]) for c in free), default=None)
+        tied = [c for c in free if float(values[row, c]) == best]
+        assert got == (max(tied, key=lambda c: float(noise[row, c])) if free else -1)
+
+
+def test_rounding_does_not_break_ties():
+    values = torch.tensor([[0.3, 0.1 + 0.2, 0.30000003]])
+    noise = torch.tensor([[0.9, 0.2, 0.5]])
+    assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [0]
+
+
+def test_selection_with_negative_values_and_infinities():
+    values = torch.tensor([[-3.0, -2.0, -float("inf")]])
+    noise = torch.tensor([[0.9, 0.2, 0.95]])
+    assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [1]
+
+
+def test_selection_compiles_to_one_graph():
+    values, noise = torch.rand(4, 9), torch.rand(4, 9)
+    visited = torch.rand(4, 9) < 0.5
+    compiled = torch.compile(select_fixation, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(values, visited, noise), select_fixation(values, visited, noise))
+
+
+def test_selection_refuses_nan_and_other_shapes():
+    with pytest.raises(InputError, match="NaN"):
+        select_fixation(torch.tensor([[float("nan")]]), torch.tensor([[False]]), torch.rand(1, 1))
+    with pytest.raises(InputError, match="visited"):
+        select_fixation(torch.zeros(1, 3), torch.zeros(1, 2, dtype=torch.bool), torch.rand(1, 3))
+
+
+CELLS, GRID = 12, Grid(4, 3, (64, 48))
+
+
+@pytest.fixture
+def visited():
+    visited = torch.zeros(3, CELLS, dtype=torch.bool)
+    visited[0, 5] = visited[1, [0, 7]] = True
+    return visited
+
+
+def test_hard_fixations_are_draws_from_the_softmax():
+    torch.manual_seed(0)
+    logits = torch.tensor([0.0, 1.0, 5.0, -1.0]).expand(20000, 4)
+    visited = torch.tensor([False, False, True, False]).expand_as(logits)
+    _, cell = soft_fixation(logits, visited, torch.zeros(4, 2), torch.rand(20000, 4))
+    share = torch.bincount(cell, minlength=4) / len(cell)
+    torch.testing.assert_close(share, torch.tensor([0.0, 1.0, -torch.inf, -1.0]).softmax(0), atol=0.015, rtol=0)
+    assert share[2] == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_hard_fixation_has_the_gradient_of_the_soft_one(visited, dtype):
+    torch.manual_seed(0)
+    centres, noise = GRID.centres.to(dtype), torch.rand(3, CELLS, dtype=dtype)
+    logits = torch.randn(3, CELLS, dtype=dtype, requires_grad=True)
+    hard, cell = soft_fixation(logits, visited, centres, noise, temperature=0.7)
+    soft, same = soft_fixation(logits, visited, centres, noise, temperature=0.7, hard=False)
+    assert torch.equal(hard, centres[cell])
+    assert torch.equal(cell, same)
+    assert not visited.gather(1, cell[:, None]).any()
+    weight = torch.randn(3, 2, dtype=dtype)
+    gradients = [torch.autograd.grad((point * weight).sum(), logits)[0] for point in (hard, soft)]
+    assert torch.equal(*gradients)
+    assert gradients[0].abs().max() > 0.1
+
+
+def test_soft_fixation_gradcheck(visited):
+    torch.manual_seed(0)
+    centres, noise = GRID.centres.double(), torch.rand(3, CELLS).double()
+    logits = torch.randn(3, CELLS, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: soft_fixation(x, visited, centres, noise, hard=False)[0], logits)
+
+
+def test_soft_fixations_at_low_temperature_are_cell_centres(visited):
+    torch.manual_seed(0)
+    centres, noise = GRID.centres, torch.rand(3, CELLS)
+    noise[0, 0], noise[1, 1] = 0.0, 1.0  # ends of the range
+    soft, cell = soft_fixation(torch.randn(3, CELLS), visited, centres, noise, temperature=1e-4, hard=False)
+    torch.testing.assert_close(soft, centres[cell])
+
+
+def test_soft_fixations_refuse_wrong_arguments():
+    zeros = torch.zeros(1, 3)
+    with pytest.raises(InputError, match="temperature"):
+        soft_fixation(zeros, zeros > 0, torch.zeros(3, 2), zeros, temperature=0.0)
+    with pytest.raises(InputError, match="centres"):
+        soft_fixation(zeros, zeros > 0, torch.zeros(4, 2), zeros)

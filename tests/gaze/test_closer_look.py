@@ -39,14 +39,6 @@ def test_value_equals_the_loop(belief):
             assert float(got[episode, f]) == pytest.approx(total, rel=1e-5, abs=1e-6)
 
 
-def test_the_first_fixation_is_at_the_centre():
-    belief = DirichletBelief.uniform(1, 12, 5, 0.5, torch.ones(1))
-    values = CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool))
-    # Every cell is unknown and unseen; most of the image is seen from its centre.
-    assert values.argmax().item() in (5, 6)
-    torch.testing.assert_close(values, values.flip(-1))
-
-
 def test_a_fovea_of_zero_width_is_refused():
     with pytest.raises(InputError, match="fovea"):
         CloserLook(GRID, 0.0)

@@ -33,26 +33,6 @@ def four_classes(dtype=torch.float64):
     return model.requires_grad_(False).eval()
 
 
-def test_kaplans_rule_keeps_the_mean_on_average_for_true_likelihoods():
-    """E[p'] = p, where the scores are drawn from the belief's own mixture of the classes' densities."""
-    torch.manual_seed(0)
-    alpha, beta = ALPHA.new_tensor([[4.0, 1, 1], [1, 3, 0.6], [2, 2, 5]]), ALPHA.new_tensor([0.5, 3.0, 1.5])
-    mean = beta / beta.sum()
-    kind = torch.multinomial(mean, 200_000, replacement=True)
-    scores = torch.distributions.Dirichlet(alpha[kind]).sample()
-    likelihood = dirichlet.log_prob(alpha[:, None], scores.log()).exp().t()
-    after = fusion.kaplan(beta.expand(len(scores), 3), likelihood)
-    after = after / after.sum(-1, keepdim=True)
-    error = after.std(0) / len(scores) ** 0.5
-    assert ((after.mean(0) - mean).abs() < 4 * error).all()
-    assert (error < 1e-3).all()
-    assert (after.std(0) > 0.02).all()
-    # The scores themselves are not the likelihoods: with them the mean moves.
-    wrong = fusion.kaplan(beta.expand(len(scores), 3), scores)
-    wrong = wrong / wrong.sum(-1, keepdim=True)
-    assert ((wrong.mean(0) - mean).abs() > 10 * error).any()
-
-
 MEASURES = {
     "KLDivergence": lambda beta: dirichlet.kl_divergence(beta, torch.full((2,), 0.5, dtype=torch.float64)),
     "NegativeEntropy": lambda beta: torch.xlogy(beta / beta.sum(), beta / beta.sum()).sum(),
@@ -152,22 +132,6 @@ def test_episodes_do_not_depend_on_their_batch(name, dtype):
         assert torch.equal(alone[0], together[row])
     # The points at which classes are drawn move with the number of visited cells.
     assert not torch.equal(value(DirichletBelief(beta[:1]), visited[1:2]), together[:1])
-
-
-def test_cells_with_the_same_belief_have_the_same_value():
-    model = four_classes()
-    drawn = sampled_likelihoods(model, 8)
-    outlook = look_ahead_by_samples((rand(4) + 0.2).expand(6, 4), drawn, torch.zeros(6, dtype=torch.bool))
-    assert all(torch.equal(outlook.evidence[0], other) for other in outlook.evidence)
-
-
-def test_the_update_is_kaplans_rule():
-    model, beta = four_classes(), 0.3 + 4 * rand(3, 4, seed=1) ** 2
-    outlook = look_ahead_by_samples(beta, sampled_likelihoods(model, 8), UNSEEN)
-    likelihood = outlook.evidence * 0.3
-    after = fusion.kaplan(beta[:, None].expand_as(likelihood), likelihood)
-    assert torch.allclose(outlook.next_beta, after)
-    assert torch.allclose(outlook.next_mean, after / after.sum(-1, keepdim=True))
 
 
 def test_looks_are_drawn_from_the_dirichlets_by_a_seed():

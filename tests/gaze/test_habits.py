@@ -11,7 +11,7 @@ from semfov import Detections, Grid, rollout
 from semfov.belief.observers import Semantic
 from semfov.episode import StoredLooks
 from semfov.errors import InputError
-from semfov.gaze import GazeHabits, Greedy, Habitual, acquisition
+from semfov.gaze import GazeHabits, Habitual, acquisition
 from semfov.gaze.choice import drawn_by
 from semfov.gaze.habits import standardised
 
@@ -116,15 +116,6 @@ def test_the_same_seed_gives_the_same_scanpaths():
     once, again, other = (walk(Habitual(noise(seed), make_habits(), GRID), 6, 8) for seed in (0, 0, 1))
     assert torch.equal(once, again)
     assert not torch.equal(once, other)
-
-
-def test_habits_with_a_strong_pull_are_a_greedy_searcher():
-    values = torch.rand(12, generator=torch.Generator().manual_seed(2))
-    never = torch.full((3,), -1e3)
-    strict = make_habits(
-        pull=900.0, place=torch.zeros(12), step=torch.tensor([-1e3, 0.0, 0.0, 0.0]) * 9, back=9 * never
-    )
-    assert torch.equal(walk(Habitual(noise(), strict, GRID), 3, 9, values), walk(Greedy(noise()), 3, 9, values))
 
 
 @pytest.mark.parametrize(

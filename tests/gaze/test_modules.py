@@ -25,58 +25,52 @@ class AcquisitionTester(GraphTester):
         return module(DirichletBelief(beta, closest), closest == 0)
 
 
-class TestPredictedTargetPosterior(AcquisitionTester):
-    autocast = 0.05
+def functions(target, model, values):
+    """Acquisition functions on `GRID` by name: for a target, a function that makes an observation model, and values."""
+    a = acquisition
+    return {
+        "TargetPosterior": lambda: a.TargetPosterior(target),
+        "PredictedTargetPosterior": lambda: a.PredictedTargetPosterior(target, model()),
+        "NeighbourhoodPosterior": lambda: a.NeighbourhoodPosterior(target, model(), GRID),
+        "FovealHit": lambda: a.FovealHit(target, model(), GRID),
+        "PlaceInformation": lambda: a.PlaceInformation(target, model(), GRID),
+        "KLDivergence": lambda: a.KLDivergence(model(), GRID),
+        "BayesianSurprise": lambda: a.BayesianSurprise(model(), GRID),
+        "NegativeEntropy": lambda: a.NegativeEntropy(model(), GRID),
+        "TwoPeaks": lambda: a.TwoPeaks(model(), GRID),
+        "UpperConfidenceBound": lambda: a.UpperConfidenceBound(model(), GRID),
+        "ProbabilityOfImprovement": lambda: a.ProbabilityOfImprovement(model(), GRID),
+        "ExpectedAccuracy": lambda: a.ExpectedAccuracy(model(), GRID),
+        "CloserLook": lambda: a.CloserLook(GRID),
+        "ObjectEvidence": a.ObjectEvidence,
+        "Static": lambda: a.Static(values),
+        "Uniform": a.Uniform,
+        "SaliencyPrior": lambda: a.SaliencyPrior(a.TargetPosterior(target), values, weight=0.5),
+    }
 
-    def make(self):
-        return acquisition.PredictedTargetPosterior(2, model())
 
+LOOKAHEADS = (
+    "KLDivergence",
+    "BayesianSurprise",
+    "NegativeEntropy",
+    "TwoPeaks",
+    "UpperConfidenceBound",
+    "ProbabilityOfImprovement",
+    "ExpectedAccuracy",
+)
+"""Functions that subtract nearly equal values."""
+AUTOCAST = {"PredictedTargetPosterior": 0.05, "PlaceInformation": 0.05, **dict.fromkeys(LOOKAHEADS, 0.1)}
 
-class TestPlaceInformation(AcquisitionTester):
-    autocast = 0.05
-
-    def make(self):
-        return acquisition.PlaceInformation(2, model(), GRID)
-
-
+for name, make in functions(2, model, rand(len(GRID))).items():
+    (tester,) = made = make_testers(AcquisitionTester, {name: make})
+    made[tester].autocast = AUTOCAST.get(name, AcquisitionTester.autocast)
+    globals().update(made)
 globals().update(
     make_testers(
         AcquisitionTester,
         {
-            "TargetPosterior": lambda: acquisition.TargetPosterior(2),
-            "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(2, model(), GRID),
-            "FovealHit": lambda: acquisition.FovealHit(2, model(), GRID),
             "EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID),
-            "SaliencyPrior": lambda: acquisition.SaliencyPrior(
-                acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5
-            ),
             "TemplateAttention": lambda: acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID),
-            "ObjectEvidence": acquisition.ObjectEvidence,
-            "CloserLook": lambda: acquisition.CloserLook(GRID),
-            "Static": lambda: acquisition.Static(rand(len(GRID))),
-            "Uniform": acquisition.Uniform,
-        },
-    )
-)
-
-
-class LookAheadTester(AcquisitionTester):
-    """For functions that subtract nearly equal values."""
-
-    autocast = 0.1
-
-
-globals().update(
-    make_testers(
-        LookAheadTester,
-        {
-            "KLDivergence": lambda: acquisition.KLDivergence(model(), GRID),
-            "BayesianSurprise": lambda: acquisition.BayesianSurprise(model(), GRID),
-            "NegativeEntropy": lambda: acquisition.NegativeEntropy(model(), GRID),
-            "TwoPeaks": lambda: acquisition.TwoPeaks(model(), GRID),
-            "UpperConfidenceBound": lambda: acquisition.UpperConfidenceBound(model(), GRID),
-            "ProbabilityOfImprovement": lambda: acquisition.ProbabilityOfImprovement(model(), GRID),
-            "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID),
         },
     )
 )

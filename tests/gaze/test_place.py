@@ -27,38 +27,30 @@ def beta():
     return torch.rand(2, 12, 3, dtype=torch.float64) + 0.1
 
 
-def parts(beta, episode, target):
-    p = (beta[episode, :, target] / beta[episode].sum(-1)).tolist()
-    rates = Misses.miss_rate[target, Misses().level(GRID.cell_distance)].tolist()
-    return p, rates
-
-
-@pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
-def test_foveal_hit_equals_the_loop(beta, target):
-    got = values_of(FovealHit(target, Misses(), GRID), beta)
-    for episode in range(2):
-        p, rates = parts(beta, episode, int(torch.as_tensor(target).expand(2)[episode]))
-        for f in range(12):
-            missed = math.prod(1 - p[x] * (1 - rates[f][x]) for x in range(12))
-            assert float(got[episode, f]) == pytest.approx(1 - missed)
-
-
-@pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
-def test_information_is_the_expected_reduction_of_entropy(beta, target):
-    got = values_of(PlaceInformation(target, Misses(), GRID), beta)
-    for episode in range(2):
-        p, rates = parts(beta, episode, int(torch.as_tensor(target).expand(2)[episode]))
-        q = [value / sum(p) for value in p]
-        for f in range(12):
-            missed = [q[x] * rates[f][x] for x in range(12)]
-            after = [value / sum(missed) for value in missed]
-            expected = entropy(q) - sum(missed) * entropy(after)
-            assert float(got[episode, f]) == pytest.approx(expected, abs=1e-9)
-    assert (got > -1e-12).all()
-
-
 def entropy(q):
     return -sum(value * math.log(value) for value in q if value > 0)
+
+
+def value_by_loop(kind, p, visible):
+    """The value of a fixation, from the probability of the target in each cell and its visibility there."""
+    if kind is FovealHit:
+        return 1 - math.prod(1 - chance * seen for chance, seen in zip(p, visible, strict=True))
+    q = [chance / sum(p) for chance in p]
+    missed = [chance * (1 - seen) for chance, seen in zip(q, visible, strict=True)]
+    return entropy(q) - sum(missed) * entropy([value / sum(missed) for value in missed])
+
+
+@pytest.mark.parametrize("kind", [FovealHit, PlaceInformation])
+@pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
+def test_values_equal_a_loop(beta, target, kind):
+    got = values_of(kind(target, Misses(), GRID), beta)
+    for episode in range(2):
+        k = int(torch.as_tensor(target).expand(2)[episode])
+        p = (beta[episode, :, k] / beta[episode].sum(-1)).tolist()
+        visible = (1 - Misses.miss_rate[k, Misses().level(GRID.cell_distance)]).tolist()
+        for f in range(12):
+            assert float(got[episode, f]) == pytest.approx(value_by_loop(kind, p, visible[f]), abs=1e-9)
+    assert (got > -1e-12).all()
 
 
 @pytest.mark.parametrize("kind", [FovealHit, PlaceInformation])
@@ -69,12 +61,6 @@ def test_values_of_a_batch_equal_a_loop_over_maps(kind):
     visibility = torch.rand(3, 12, 12, generator=generator, dtype=torch.float64)
     got = kind(1, Misses(), GRID).values(present, visibility)
     for row in range(3):
-        p, v = present[row].tolist(), visibility[row].tolist()
         for f in range(12):
-            if kind is FovealHit:
-                expected = 1 - math.prod(1 - p[x] * v[f][x] for x in range(12))
-            else:
-                q = [value / sum(p) for value in p]
-                missed = [q[x] * (1 - v[f][x]) for x in range(12)]
-                expected = entropy(q) - sum(missed) * entropy([value / sum(missed) for value in missed])
+            expected = value_by_loop(kind, present[row].tolist(), visibility[row, f].tolist())
             assert float(got[row, f]) == pytest.approx(expected)

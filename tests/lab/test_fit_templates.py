@@ -7,8 +7,8 @@ import torch
 
 from eval.search import main as search
 from semfov import EmbeddedScenes, load_detector
-from semfov.detection.architectures import yolov3_tiny
 from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_config import yolov3_tiny
 from semfov.errors import InputError
 from semfov.gaze import ClassTemplates
 from tests.small import Fixed

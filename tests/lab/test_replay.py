@@ -25,7 +25,6 @@ SEMANTIC = (
     PolicyConfig("non-predictive", footprint="soft", saliency="vocus2"),
     "vocus2",
 )
-WITH_CONTEXT = PolicyConfig(SOUGHT, context="both")
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def settings(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(settings):
-    return SearchRun(SearchConfig(**settings, policies=(*SEMANTIC, SOUGHT, WITH_CONTEXT)))
+    return SearchRun(SearchConfig(**settings, policies=(*SEMANTIC, SOUGHT)))
 
 
 def run_and_record_steps(run, module):
@@ -89,9 +88,8 @@ def test_a_replayed_semantic_search_has_the_original_beliefs_and_values(run, sea
                 torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])
 
 
-@pytest.mark.parametrize("policy", [SOUGHT, f"{SOUGHT}, context both"])
-def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, searched, policy):
-    records, steps = searched[policy]
+def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, searched):
+    records, steps = searched[SOUGHT]
     looks, grid = run.detections(0), run.grid(0)
     mapper = LearnedMap(MapEvidence.from_pretrained(run.eye.detector.name))
     for number, record in enumerate(records):
@@ -133,18 +131,12 @@ def test_the_map_of_a_replayed_search_is_that_of_the_recommended_agent(run):
         torch.testing.assert_close(mine.boxes[mine.mask], theirs.boxes[theirs.mask], rtol=1e-5, atol=1e-3)
 
 
-def test_context_and_misses_of_a_run_do_not_change_the_map_of_a_replay(run, searched, settings):
-    """The map uses no context, and no misses, which need a model that the run may not have."""
-    belief = BeliefConfig(columns=4, rows=3, context="both", misses=True)
+def test_misses_of_a_run_do_not_change_the_map_of_a_replay(run, searched, settings):
+    belief = BeliefConfig(columns=4, rows=3, misses=True)
     everywhere = SearchRun(SearchConfig(**{**settings, "belief": belief}, policies=(SOUGHT,)))
-    alone = PolicyConfig("non-predictive", misses=False, context="both")
-    without = SearchRun(SearchConfig(**{**settings, "belief": belief}, policies=(alone,)))
-    assert without.models.observation is None
     record = searched[SOUGHT][0][0]
     expected = replay(run, 0, record).probabilities
     torch.testing.assert_close(replay(everywhere, 0, record).probabilities, expected)
-    (name,) = without.policies
-    torch.testing.assert_close(replay(without, 0, {**record, "policy": name}).probabilities, expected)
 
 
 def test_a_search_with_a_wrong_cue_is_replayed_with_the_belief_about_the_cue(run, searched):

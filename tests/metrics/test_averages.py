@@ -9,10 +9,6 @@ def test_standard_error():
     values = np.array([[1.0, 2.0], [3.0, 2.0], [5.0, 2.0]])
     np.testing.assert_allclose(standard_error(values), [2 / np.sqrt(3), 0])
     assert np.isnan(standard_error(values[:1])).all()
-
-
-def test_standard_error_along_another_axis():
-    values = np.array([[1.0, 2.0], [3.0, 2.0], [5.0, 2.0]])
     np.testing.assert_allclose(standard_error(values.T, axis=1), standard_error(values))
     assert standard_error(values[:, :1], axis=1).shape == (3,)
 

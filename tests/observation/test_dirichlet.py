@@ -27,7 +27,7 @@ def random_case(dtype, shape=(4, 3), components=6, seed=0):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_log_prob_matches_scipy_and_torch(dtype):
+def test_log_prob_matches_torch(dtype):
     alpha, log_scores = random_case(dtype)
     got = dirichlet.log_prob(alpha, log_scores)
     assert got.dtype == dtype
@@ -37,9 +37,6 @@ def test_log_prob_matches_scipy_and_torch(dtype):
     expected = torch.distributions.Dirichlet(alpha.double()).log_prob(double)
     tolerance = 1e-4 if dtype == torch.float32 else 1e-12
     torch.testing.assert_close(got.double(), expected, rtol=tolerance, atol=tolerance)
-    for i, j in np.ndindex(4, 3):
-        reference = scipy.stats.dirichlet.logpdf(double[i, j].numpy(), alpha[i, j].double().numpy())
-        assert float(got[i, j]) == pytest.approx(reference, rel=tolerance, abs=tolerance)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -154,22 +154,6 @@ def test_the_given_table_is_copied():
     assert torch.equal(alpha, table())
 
 
-def test_alpha_can_be_trained_and_stays_positive():
-    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
-    scores, distance = looks(shape=(64,), dtype=torch.float32)
-    labels = scores.argmax(-1)
-    optimiser = torch.optim.Adam(model.parameters(), lr=0.3)
-    losses = []
-    for _ in range(40):
-        optimiser.zero_grad()
-        loss = torch.nn.functional.nll_loss(model.calibrate(scores, distance).clamp(min=1e-12).log(), labels)
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-        assert bool((model.alpha > 0).all())
-    assert losses[-1] < losses[0] / 2
-
-
 def test_calls_use_the_current_parameters():
     model = FovealObservationModel(table(), EDGES, CLASSES).eval()
     scores, distance = looks()
@@ -276,39 +260,6 @@ def test_prior_is_the_frequency_of_the_classes():
     torch.testing.assert_close(prior.sum(0), torch.ones(2, dtype=torch.float64))
     np.testing.assert_allclose(prior[0], [0.9, 0.9], atol=2e-3)
     assert bool((prior > 0).all())
-
-
-@pytest.mark.parametrize("expected", [None, table(torch.float32) / table(torch.float32).sum(-1, keepdim=True)])
-def test_a_saved_model_is_loaded_unchanged(tmp_path, expected):
-    metadata = {"detector": DETECTOR, "sensor": {"sigma": 100.0}, "counts": [[1, 2], [3, 4]]}
-    model = FovealObservationModel(
-        table(torch.float32),
-        EDGES,
-        CLASSES,
-        epsilon=1e-5,
-        log_prior=torch.rand(4, 3),
-        tempering=0.2,
-        expected=expected,
-        metadata=metadata,
-    )
-    path = tmp_path / "model.safetensors"
-    model.save(path)
-    first = path.read_bytes()
-    model.save(path)
-    assert path.read_bytes() == first
-    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
-
-    loaded = FovealObservationModel.from_pretrained(path)
-    assert not loaded.training
-    assert loaded.classes == tuple(CLASSES)
-    assert loaded.epsilon == 1e-5
-    assert loaded.metadata == metadata
-    state = model.state_dict()
-    assert loaded.state_dict().keys() == state.keys()
-    for name, tensor in loaded.state_dict().items():
-        assert torch.equal(tensor, state[name])
-    scores, distance = looks(dtype=torch.float32)
-    assert torch.equal(loaded.calibrate(scores, distance), model.calibrate(scores, distance))
 
 
 def test_header_is_readable_json(tmp_path):

@@ -73,12 +73,6 @@ def test_visibility_falls_as_the_miss_rate_grows(dtype, device):
     assert bool((got.diff(dim=-1) < 0).all())
 
 
-def test_dtypes_agree():
-    torch.testing.assert_close(
-        visibility(make_model().float()).double().detach(), visibility(make_model()).detach(), rtol=1e-4, atol=1e-5
-    )
-
-
 @pytest.mark.parametrize("name", ["yolov3-tiny-published", "yolox-nano-published"])
 def test_visibility_with_the_published_fovea_falls_with_distance(name):
     """For nearly all classes, and on average at every step away from the fovea."""

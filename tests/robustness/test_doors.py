@@ -18,10 +18,9 @@ from semfov import (
     as_image,
     foveate,
 )
-from semfov.data.classes import class_index
+from semfov.data.classes import SYNONYMS, class_index
 from semfov.data.large import open_large
-from semfov.data.synonyms import SYNONYMS
-from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector
 from semfov.errors import SemfovError
 from semfov.zoom import GlimpseEvidence

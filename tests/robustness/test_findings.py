@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from semfov import FovealObservationModel, Grid, InputError, acquisition, read_image
-from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.storage import read_tensors, write_tensors
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

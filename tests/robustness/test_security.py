@@ -11,8 +11,7 @@ import torch
 
 from semfov import load_detector
 from semfov.data.download import _ANNOTATIONS, SPLITS
-from semfov.detection.sources import Address, SourceDistribution
-from semfov.detection.weights import WEIGHTS
+from semfov.detection.weights import WEIGHTS, Address, SourceDistribution
 from semfov.errors import DataError
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ import torch
 from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
 from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
-from semfov.belief import ContextPrior, MapEvidence
+from semfov.belief import MapEvidence
 from semfov.errors import InputError
 from semfov.gaze.acquisition import (
     ExpectedAccuracy,
@@ -32,12 +32,6 @@ FOVEA = 100 / 640
 @pytest.fixture
 def model():
     return FovealObservationModel.identity(["cup", "cat"], [0.2], miss_rate=torch.full((3, 2), 0.5))
-
-
-@pytest.fixture
-def context():
-    weights = {"evidence": (0.5, 0.25), "map": (1.0, 2.0)}
-    return ContextPrior(["cup", "cat"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 1), [], weights=weights)
 
 
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
@@ -117,8 +111,7 @@ def loaded(monkeypatch):
         loaded.append((kind, name))
         return kind
 
-    for kind in ("observation", "context"):
-        monkeypatch.setattr(candidates, f"make_{kind}", lambda name, eye, kind=kind: make(kind, name))
+    monkeypatch.setattr(candidates, "make_observation", lambda name, eye: make("observation", name))
     monkeypatch.setattr(candidates, "make_learned", lambda kind, name, eye: make(kind, name))
     return loaded
 
@@ -132,38 +125,14 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     assert load_models(learned, "exploration", eye) == Models(map=MapEvidence)
     assert loaded == [(MapEvidence, "everything")]
     loaded.clear()
-    guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
+    guided = PolicyConfig("target-evidence", saliency="vocus2")
     every = SearchConfig(
         policies=("random", guided, "predictive-raw"),
-        belief=BeliefConfig(model="mine", target_model="sought", context_model="cooccurrence"),
+        belief=BeliefConfig(model="mine", target_model="sought"),
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", TargetEvidence, {"cooccurrence": "context"})
-    assert set(loaded) == {("context", "cooccurrence"), ("observation", "mine"), (TargetEvidence, "sought")}
-
-
-def test_context_is_loaded_when_a_policy_or_the_run_uses_it(loaded):
-    eye = SimpleNamespace()
-
-    def loads(belief, *choices):
-        return list(load_models(SearchConfig(policies=choices, belief=belief), "search", eye).context)
-
-    both = PolicyConfig("target-evidence", context="both")
-    assert loads(BeliefConfig(), "random", both) == ["coco"]
-    assert loads(BeliefConfig(context="place"), "target-evidence") == ["coco"]
-    assert loads(BeliefConfig(), "target-evidence", PolicyConfig("non-predictive", footprint="soft")) == []
-    assert loads(BeliefConfig(context="place"), PolicyConfig("target-evidence", context="none")) == []
-    own = replace(both, context_model="mine")
-    assert loads(BeliefConfig(context_model="theirs"), both, own, both) == ["theirs", "mine"]
-
-
-def test_each_policy_gets_the_context_that_it_names(context):
-    evidence = TargetEvidence(8, 6, components=3)
-    other = context.permuted(1)
-    given = {"coco": context, "mine": other}
-    for name, prior in ((None, context), ("mine", other)):
-        policy = PolicyConfig("target-evidence", context="both", context_model=name)
-        assert strategy(policy, evidence=evidence, context=given).observer.prior is prior
+    assert models == Models("observation", TargetEvidence)
+    assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
 
 
 @pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
@@ -223,35 +192,6 @@ def test_target_evidence_brings_its_own_belief():
     assert isinstance(sought.policy, policies.NonPredictive)
     with pytest.raises(InputError, match="learned"):
         strategy("target-evidence")
-
-
-def test_context_is_added_when_a_policy_or_the_run_asks_for_it(context):
-    given = {"context": {"coco": context}, "evidence": TargetEvidence(4, 4)}
-    assert isinstance(strategy("non-predictive-raw", **given).observer, observers.Semantic)
-    parts = {"both": (1.0, 2.0), "place": (1.0, 0.0), "cooccurrence": (0.0, 2.0)}
-    for part, expected in parts.items():
-        own = strategy(PolicyConfig("non-predictive", context=part), **given).observer
-        of_the_run = strategy("non-predictive-raw", belief=BeliefConfig(context=part), **given).observer
-        for observer in (own, of_the_run):
-            assert isinstance(observer, observers.Context)
-            assert isinstance(observer.observer, observers.Semantic)
-            assert observer.weights == expected
-    sought = strategy(PolicyConfig("target-evidence", context="both"), **given).observer
-    assert isinstance(sought.observer, observers.Target)
-    assert sought.weights == (0.5, 0.25)
-    none = strategy(PolicyConfig("non-predictive", context="none"), belief=BeliefConfig(context="both"), **given)
-    assert isinstance(none.observer, observers.Semantic)
-    with pytest.raises(InputError, match="context: expected a fitted context"):
-        strategy(PolicyConfig("non-predictive", context="both"))
-
-
-def test_context_is_refused_for_policies_that_cannot_use_it(context, model):
-    for policy, task in (("predictive", "search"), ("random", "search"), ("random", "exploration")):
-        with pytest.raises(
-            InputError,
-            match="context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive'",
-        ):
-            strategy(PolicyConfig(policy, context="both"), task, context=context, observation=model)
 
 
 def test_saliency_alone_keeps_the_belief_of_the_run(model):

@@ -86,15 +86,11 @@ def test_labels_are_unique(task):
 def test_labels_list_the_differences_from_a_preset():
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
-    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine", 9)
-    assert len(fields(PolicyConfig)) == 10
-    expected = (
-        "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, "
-        "context none, context_model mine, samples 9"
-    )
+    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", 9)
+    assert len(fields(PolicyConfig)) == 8
+    expected = "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, samples 9"
     assert label(everything, "search") == expected
     assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"
-    assert label(PolicyConfig("target-evidence", context="place"), "search") == "target-evidence, context place"
     assert label(PolicyConfig("kl", saliency="itti-koch"), "exploration") == "kl-raw, saliency itti-koch"
 
 
@@ -111,7 +107,6 @@ def test_labels_list_the_differences_from_a_preset():
         (PolicyConfig("kl", footprint="box-centre"), "exploration", "box_centre"),
         (PolicyConfig("kl", saliency="vocus"), "exploration", "vocus2"),
         (PolicyConfig("kl", "calibratd"), "exploration", "calibrated"),
-        (PolicyConfig("non-predictive", context="cooccurence"), "search", "cooccurrence"),
     ],
     ids=str,
 )

@@ -2,8 +2,6 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from semfov import Foveation, foveate
 from semfov.errors import InputError
@@ -15,66 +13,22 @@ CONVENTIONS = ("kornia", "opencv")
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("growth", [1.0, 2.0])
-@pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6), (2, 3)])
+@pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6), pytest.param((164, 171), marks=pytest.mark.slow)])
 def test_foveation_equals_plain_loops(reference_sensor, convention, growth, size):
-    image = draw(1, 2, *size)
-    for gaze in ((3.0, 5.5), (-4.0, 30.0)):
-        sigma = (4.0, 2.5)
-        result = foveate(
-            image,
-            torch.tensor(gaze),
-            sigma=torch.tensor([sigma]),
-            levels=3,
-            growth=growth,
-            convention=convention,
-        )
-        close(result[0], reference_sensor.foveate(image[0].numpy(), gaze, sigma, 3, growth, convention))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("growth", [1.0, 2.0])
-def test_foveation_of_a_large_image_equals_plain_loops(reference_sensor, convention, growth):
-    image = draw(1, 1, 164, 171)
-    gaze, sigma = (100.5, 20.0), (30.0, 30.0)
-    result = foveate(image, torch.tensor(gaze), sigma=30.0, growth=growth, convention=convention)
-    close(result[0], reference_sensor.foveate(image[0].numpy(), gaze, sigma, 5, growth, convention))
+    image, sigma = draw(1, 2, *size), (4.0, 2.5) if max(size) < 100 else (30.0, 30.0)
+    settings = {"levels": 3, "growth": growth, "convention": convention}
+    for gaze in ((3.0, 5.5), (-4.0, 30.0)) if max(size) < 100 else ((100.5, 20.0),):
+        result = foveate(image, torch.tensor(gaze), sigma=torch.tensor([sigma]), **settings)
+        close(result[0], reference_sensor.foveate(image[0].numpy(), gaze, sigma, *settings.values()))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@given(size=st.tuples(st.integers(1, 40), st.integers(1, 40)), levels=st.integers(0, 6))
-def test_infinite_sigma_leaves_the_image_unchanged(convention, size, levels):
-    image = draw(1, 2, *size, dtype=torch.float32)
-    gaze = torch.tensor([3.0, 4.0])
-    close(foveate(image, gaze, sigma=math.inf, levels=levels, convention=convention), image, 1e-5)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(480, 640), (333, 257), (131, 1), (1, 300)])
-@pytest.mark.parametrize("sigma", [math.inf, 1e7])
-def test_very_large_sigma_leaves_a_large_image_unchanged(convention, size, sigma, device):
-    image = draw(1, 3, *size, dtype=torch.float32, device=device)
-    gaze = torch.tensor([[100.0, 50.0]], device=device)
-    close(foveate(image, gaze, sigma=sigma, convention=convention), image, 1e-5)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_many_fixations_equal_a_loop_over_them(convention, size, device):
-    image = draw(2, 3, *size, device=device)
-    gaze = 30 * draw(2, 4, 2, device=device)
-    many = foveate(image, gaze, sigma=9.0, convention=convention)
-    assert many.shape == (2, 4, 3, *size)
-    for g in range(4):
-        close(many[:, g], foveate(image, gaze[:, g], sigma=9.0, convention=convention))
-        for b in range(2):
-            one = foveate(image[b : b + 1], gaze[b, g], sigma=9.0, convention=convention)
-            close(many[b, g], one[0])
-
-
-def test_one_fixation_for_all_images():
-    image, gaze = draw(3, 1, 12, 16), torch.tensor([4.0, 8.0])
-    close(foveate(image, gaze, sigma=3.0), foveate(image, gaze.expand(3, 2), sigma=3.0), 0)
+@pytest.mark.parametrize("size", [(5, 1), (20, 33), (333, 257), (131, 1)])
+def test_very_large_sigma_leaves_the_image_unchanged(convention, size):
+    image, gaze = draw(1, 3, *size, dtype=torch.float32), torch.tensor([[100.0, 50.0]])
+    for sigma in (math.inf, 1e7):
+        for levels in (0, 1, 6):
+            close(foveate(image, gaze, sigma=sigma, levels=levels, convention=convention), image, 1e-5)
 
 
 def test_no_fixations_and_no_levels():
@@ -113,9 +67,8 @@ def test_a_fixation_far_outside_shows_only_the_coarsest_level(size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_pyramid_can_be_reused(convention, size):
-    image = draw(2, 3, *size)
+def test_pyramid_can_be_reused(convention):
+    image = draw(2, 3, 170, 164)
     sensor = Foveation(8.0, levels=4, growth=1.5, convention=convention)
     bands = sensor.pyramid(image)
     with torch.no_grad():
@@ -132,15 +85,13 @@ def test_pyramid_can_be_reused(convention, size):
 
 
 @pytest.mark.parametrize("levels", [0, 3])
-@pytest.mark.parametrize("size", [(20, 27), (170, 164), (163, 2)])
+@pytest.mark.parametrize("size", [(170, 164), (163, 2)])
 def test_arguments_are_not_modified(levels, size):
-    image, gaze, sigma = draw(1, 3, *size), torch.tensor([[5.0, 6.0]]), torch.tensor([[4.0, 5.0]])
-    before = [t.clone() for t in (image, gaze, sigma)]
+    given = draw(1, 3, *size), torch.tensor([[5.0, 6.0]])
+    before = [t.clone() for t in given]
     with torch.no_grad():
-        result = foveate(image, gaze, sigma=sigma, levels=levels)
-        result.add_(1)
-    for now, then in zip((image, gaze, sigma), before, strict=True):
-        assert torch.equal(now, then)
+        foveate(*given, sigma=4.0, levels=levels).add_(1)
+    assert all(map(torch.equal, given, before))
 
 
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
@@ -170,14 +121,12 @@ def test_gradients(convention, size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (170, 164), (141, 200)])
+@pytest.mark.parametrize("size", [(20, 27), (141, 200)])
 def test_view_is_equal_with_and_without_gradients(convention, size):
     image, gaze = draw(2, 3, *size), 20 * draw(2, 3, 2)
     recorded = foveate(image.clone().requires_grad_(), gaze, sigma=8.0, convention=convention)
     assert recorded.requires_grad
     close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
-    with torch.no_grad():
-        close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
     with torch.inference_mode():
         close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
 
@@ -249,9 +198,8 @@ def test_learnable_sigma():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_dtype_and_device_follow_the_image(dtype, size, device):
-    image = draw(1, 3, *size, device=device)
+def test_dtype_and_device_follow_a_large_image(dtype, device):
+    image = draw(1, 3, 170, 164, device=device)
     expected = foveate(image, torch.tensor([9.0, 8.0], device=device), sigma=6.0)
     result = foveate(image.to(dtype), torch.tensor([9, 8], device=device), sigma=6.0)
     assert result.dtype == dtype
@@ -280,9 +228,9 @@ def test_module_equals_the_function():
     expected = foveate(image, gaze, sigma=6.0, levels=3, growth=1.0, convention="opencv")
     close(sensor(image, gaze), expected, 1e-6)
     assert sensor.extra_repr() == "sigma=6, levels=3, growth=1, convention='opencv'"
-    copy = Foveation(1.0, levels=3, growth=1.0, convention="opencv")
-    copy.load_state_dict(sensor.state_dict())
-    assert torch.equal(copy(image, gaze), sensor(image, gaze))
+    for setting in ({"sigma": 0.0}, {"growth": 0.0}, {"levels": -1}, {"convention": "korina"}):
+        with pytest.raises(InputError, match=next(iter(setting))):
+            Foveation(**{"sigma": 3.0} | setting)
 
 
 IMAGE = torch.rand(2, 3, 8, 8)
@@ -292,15 +240,7 @@ GAZE = torch.tensor([4.0, 4.0])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"gaze": torch.tensor([4.0, math.nan])}, "gaze: expected finite numbers"),
-        ({"gaze": torch.tensor([[[math.inf, 1.0]]] * 2)}, "gaze: expected finite numbers"),
-        ({"gaze": torch.rand(3)}, "gaze: expected a tensor of shape"),
-        ({"gaze": torch.tensor(1.0)}, "gaze: expected a tensor of shape"),
-        ({"gaze": torch.rand(3, 2)}, "gaze: expected a tensor of shape"),
-        ({"gaze": torch.rand(1, 4, 2)}, "gaze: expected a tensor of shape"),
-        ({"gaze": torch.rand(1, 2, 4, 2)}, "gaze: expected a tensor of shape"),
         ({"image": torch.rand(2, 8, 8)}, "image: expected a picture of shape"),
-        ({"image": torch.rand(1, 3, 0, 8)}, "image: expected at least one pixel"),
         ({"levels": -1}, "levels: expected 0 or more, got -1"),
         ({"sigma": 0.0}, "sigma: expected a positive number, got 0.0"),
         ({"sigma": -2}, "sigma: expected a positive number, got -2"),
@@ -318,11 +258,3 @@ def test_bad_input(arguments, message):
     arguments = {"image": IMAGE, "gaze": GAZE, "sigma": 3.0} | arguments
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         foveate(**arguments)
-
-
-@pytest.mark.parametrize(
-    "setting", [{"sigma": 0.0}, {"growth": 0.0}, {"levels": -1}, {"convention": "korina"}], ids=str
-)
-def test_bad_settings(setting):
-    with pytest.raises(InputError, match=next(iter(setting))):
-        Foveation(**{"sigma": 3.0} | setting)

@@ -79,27 +79,12 @@ def test_many_windows_equal_a_loop_over_windows():
             torch.testing.assert_close(together[b, g], glimpse(image[b : b + 1], boxes[b, g][None], (16, 12))[0])
 
 
-def test_fine_stripes_do_not_alias():
-    stripes = (torch.arange(256) % 2).double().expand(1, 1, 256, 256)
-    view = glimpse(stripes, torch.tensor([[0.0, 0, 256, 256]]).double(), (29, 29), padding_mode="border")
-    assert float((view[..., 1:-1, 1:-1] - 0.5).abs().max()) < 0.02
-    aliased = F.interpolate(stripes, (29, 29), mode="bilinear", align_corners=False)
-    assert float((aliased[..., 1:-1, 1:-1] - 0.5).abs().max()) > 0.3
-
-
 def test_gradients_in_image_position_and_magnification():
     image = picture(12, 14, 1).requires_grad_()
     points = torch.tensor([[[5.13, 4.37], [8.71, 6.29]]], dtype=torch.float64, requires_grad=True)
     magnification = torch.tensor([[0.73, 1.61]], dtype=torch.float64, requires_grad=True)
     sensor = Glimpse((6, 5), fill_value=0.3)
     assert torch.autograd.gradcheck(sensor, (image, points, magnification))
-
-
-def test_dtype_follows_the_image(device):
-    for dtype in (torch.float32, torch.float64):
-        view = glimpse(picture(dtype=dtype).to(device), torch.tensor([[0.0, 0, 20, 20]]), (7, 7))
-        assert view.dtype == dtype
-        assert view.device.type == device.type
 
 
 def test_windows_and_ladder_of_magnifications():

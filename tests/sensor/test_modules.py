@@ -1,10 +1,14 @@
 """Sensors as submodules of other modules."""
 
+import copy
+
+import pytest
 import torch
 
+from semfov.errors import InputError
 from semfov.sensor import Foveation, Glimpse, LogPolar, MultiScaleFovea, Perspective, RandomFoveation
 from tests.base_tester import GraphTester, TensorTester
-from tests.small import rand
+from tests.small import close, draw, rand
 
 # Fixations off the centres of pixels, where bilinear interpolation has no derivative.
 GAZES = torch.tensor([[20.3, 30.1], [45.7, 9.4]])
@@ -40,15 +44,47 @@ class TestLogPolar(GraphTester):
         return rand(2, 3, 48, 64), GAZES
 
 
-class TestMultiScaleFovea(GraphTester):
-    batched = (0, 1)
-    differentiable = (0, 1)
-
+class TestMultiScaleFovea(TestFoveation):
     def make(self):
         return MultiScaleFovea(16, 3)
 
-    def inputs(self):
-        return rand(2, 3, 48, 64), GAZES
+
+of_each_sensor = pytest.mark.parametrize(
+    ("sensor", "prepare"),
+    [
+        (Foveation(9.0, levels=2), "pyramid"),
+        (Foveation(9.0, levels=2, convention="opencv"), "pyramid"),
+        (LogPolar(9.0), "pyramid"),
+        (MultiScaleFovea(16, 3), "means"),
+    ],
+)
+
+
+@of_each_sensor
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
+def test_many_fixations_equal_a_loop_over_them(sensor, prepare, size, device):
+    """Also of an image that was prepared before."""
+    image, gaze = draw(2, 3, *size, device=device), (30 * draw(2, 4, 2)).to(device)
+    sensor = copy.deepcopy(sensor).double().to(device)
+    many, state = sensor(image, gaze), getattr(sensor, prepare)(image)
+    assert many.shape[:2] == (2, 4)
+    for g in range(4):
+        close(many[:, g], sensor(state, gaze[:, g]))
+        close(many[1, g], sensor(image[1:], gaze[1, g])[0])
+
+
+@of_each_sensor
+def test_bad_input(sensor, prepare):
+    image, gaze = torch.rand(2, 3, 8, 8), torch.tensor([4.0, 4.0])
+    for arguments, message in (
+        ((image, gaze * torch.nan), "gaze: expected finite numbers"),
+        ((image, torch.tensor([[[torch.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
+        *(((image, torch.zeros(shape)), "gaze: expected") for shape in ((3,), (), (3, 2), (1, 4, 2), (1, 2, 4, 2))),
+        ((image[0, 0, 0], gaze), "image: expected"),
+        ((image[:, :, :0], gaze), "image: expected at least one pixel"),
+    ):
+        with pytest.raises(InputError, match=message):
+            sensor(*arguments)
 
 
 class TestPerspective(TensorTester):

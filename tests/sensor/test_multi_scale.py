@@ -71,24 +71,6 @@ def test_far_outside_the_picture_everything_is_black(far):
     assert not gaze.grad.any()
 
 
-def test_many_fixations_equal_a_loop_over_them(device):
-    image, gaze, sensor = draw(2, 3, 20, 27, device=device), 30 * draw(2, 4, 2, device=device), MultiScaleFovea(8, 3)
-    many, means = sensor(image, gaze), sensor.means(image)
-    assert many.shape == (2, 4, 3, 3, 8, 8)
-    for g in range(4):
-        close(many[:, g], sensor(means, gaze[:, g]))
-        close(many[1, g], sensor(image[1:], gaze[1, g])[0])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_and_device_follow_the_image(dtype, device):
-    image, sensor = draw(1, 3, 60, 83, device=device), MultiScaleFovea(16, 3)
-    expected = sensor(image, torch.tensor([9.0, 8.0], device=device))
-    result = sensor(image.to(dtype), torch.tensor([9, 8], device=device))
-    assert (result.dtype, result.device.type) == (dtype, device.type)
-    torch.testing.assert_close(result, expected.to(dtype), rtol=0, atol=1e-6 if dtype == torch.float32 else 1e-12)
-
-
 def lamp(x1, y1, x2, y2, size=(96, 128)):
     """A black picture with one red box."""
     image = torch.zeros(1, 3, *size)
@@ -154,20 +136,6 @@ def test_settings_of_numbers_without_a_fraction():
 def test_bad_settings(settings, message):
     with pytest.raises(InputError, match=message):
         MultiScaleFovea(**settings)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((torch.rand(2, 3, 8, 8), torch.tensor([4.0, math.nan])), "gaze: expected finite numbers"),
-        ((torch.rand(2, 3, 8, 8), torch.rand(3, 2)), "gaze: expected a tensor of shape"),
-        ((torch.rand(3, 8, 8), torch.rand(2)), "image: expected a tensor of shape"),
-        ((torch.rand(1, 3, 0, 8), torch.rand(2)), "image: expected at least one pixel"),
-    ],
-)
-def test_bad_input(arguments, message):
-    with pytest.raises(InputError, match=message):
-        MultiScaleFovea(4)(*arguments)
 
 
 def test_a_network_with_a_fixed_input_takes_no_other_crops(tmp_path):

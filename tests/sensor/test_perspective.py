@@ -109,13 +109,11 @@ def test_rows_are_averaged_as_by_a_brute_force():
             torch.testing.assert_close(found[:, row, column], mean, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_module_accepts_batches_and_keeps_the_dtype(dtype, device):
-    panorama = torch.rand(2, 3, 16, 32, dtype=dtype, device=device)
-    poses = torch.tensor([[0.0, 0, 60], [90, 30, 40]], device=device).expand(2, 2, 3)
+def test_the_module_accepts_several_views_of_a_batch():
+    panorama = torch.rand(2, 3, 16, 32)
+    poses = torch.tensor([[0.0, 0, 60], [90, 30, 40]]).expand(2, 2, 3)
     views = Perspective((8, 6))(panorama, poses)
     assert views.shape == (2, 2, 3, 6, 8)
-    assert views.dtype == dtype
     torch.testing.assert_close(views[1, 1], perspective(panorama[1:], poses[1:, 1], (8, 6))[0])
 
 

@@ -13,14 +13,14 @@ from tests.small import draw
 
 CONVENTIONS = ("kornia", "opencv")
 # Sides of one pixel, even and odd ones, and both in either order; `test_pyramid_equals_plain_loops` draws more.
-SIZES = [(1, 1), (2, 1), (1, 9), (3, 3), (5, 4), (6, 7), (37, 50)]
+SIZES = [(1, 1), (2, 1), (1, 9), (3, 3), (6, 7)]
 # Another algorithm is used for more than 160 pixels.
-LARGE = [(162, 163), (163, 162), (161, 3), (1, 301), (256, 160), (481, 639)]
+LARGE = [(162, 163), (163, 162), (161, 3), (1, 301)]
 # Which sides of an enlarged image are shorter by a pixel: each with some sizes, all of them with small and large ones.
 SHORTER = [(0, 0), (1, 0), (0, 1), (1, 1)]
 ENLARGED = sorted(
     {(size, SHORTER[number % 4]) for number, size in enumerate(SIZES + LARGE)}
-    | {(size, shorter) for size in ((1, 1), (5, 4), (163, 162)) for shorter in SHORTER}
+    | {(size, shorter) for size in ((1, 1), (163, 162)) for shorter in SHORTER}
 )
 sizes = st.tuples(st.integers(1, 24), st.integers(1, 24))
 
@@ -30,14 +30,9 @@ def close(a, b, tolerance=2e-6):
 
 
 @pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 3])
-def test_pyrdown_equals_kornia(size, device):
+def test_pyrdown_and_pyrup_equal_those_of_kornia(size, device):
     image = draw(2, 3, *size, dtype=torch.float32, device=device)
     close(pyrdown(image), kornia.pyrdown(image))
-
-
-@pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 2])
-def test_pyrup_equals_kornia(size, device):
-    image = draw(2, 3, *size, dtype=torch.float32, device=device)
     close(pyrup(image, (2 * size[0], 2 * size[1])), kornia.pyrup(image))
 
 
@@ -50,21 +45,6 @@ def kornia_everywhere(monkeypatch):
 def levels_of(image, levels=4):
     bands = laplacian_pyramid(image, levels)
     return [*bands.details, bands.base]
-
-
-@pytest.mark.parametrize(
-    ("size", "dtype"),
-    [(size, (torch.float32, torch.float64)[number % 2]) for number, size in enumerate([*SIZES, *LARGE, (480, 640)])],
-)
-def test_pyramids_by_kornia_and_by_matrices_are_equal(monkeypatch, dtype, size, device):
-    image = draw(2, 3, *size, dtype=dtype, device=device)
-    results = []
-    for ahead in (frozenset(), frozenset({device.type})):
-        monkeypatch.setattr(pyramid, "_AHEAD", ahead)
-        results.append(levels_of(image))
-    for by_kornia, by_matrices in zip(*results, strict=True):
-        assert by_kornia.dtype == dtype
-        close(by_kornia, by_matrices, 1e-5 if dtype == torch.float32 else 1e-10)
 
 
 @pytest.mark.parametrize("requires_grad", [False, True])
@@ -93,14 +73,8 @@ def test_kornia_is_called_only_where_it_can_be_used(monkeypatch, requires_grad):
 
 
 @pytest.mark.usefixtures("kornia_everywhere")
-@pytest.mark.parametrize("size", [(6, 5), (12, 7)])
-def test_gradients_by_kornia(size):
-    image = draw(1, 2, *size).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: levels_of(x, 2), image)
-
-
-@pytest.mark.usefixtures("kornia_everywhere")
-def test_gradients_of_the_sensor_by_kornia():
+def test_gradients_by_kornia():
+    assert torch.autograd.gradcheck(lambda x: levels_of(x, 2), draw(1, 2, 6, 5).requires_grad_())
     image = draw(1, 2, 8, 12).requires_grad_()
     gaze = (4 * draw(1, 3, 2)).requires_grad_()
     sigma = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
@@ -109,9 +83,8 @@ def test_gradients_of_the_sensor_by_kornia():
 
 
 @pytest.mark.usefixtures("kornia_everywhere")
-@pytest.mark.parametrize("requires_grad", [False, True])
-def test_compiles_to_one_graph_by_kornia(requires_grad):
-    image, gaze = draw(1, 2, 40, 36).requires_grad_(requires_grad), 20 * draw(1, 3, 2)
+def test_compiles_to_one_graph_by_kornia():
+    image, gaze = draw(1, 2, 40, 36).requires_grad_(), 20 * draw(1, 3, 2)
     torch.compiler.reset()
 
     def sensor(image, gaze):
@@ -133,7 +106,7 @@ def test_strided_images_empty_batches_and_vmap_by_kornia():
     assert [level.shape[0] for level in levels_of(image[:0], 2)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize("levels", [1, 3, 5])
+@pytest.mark.parametrize("levels", [1, 5])
 def test_sums_of_bands_equal_the_gaussian_pyramid_of_kornia(levels):
     image = draw(1, 3, 160, 224)
     bands = laplacian_pyramid(image, levels)
@@ -171,7 +144,7 @@ def test_pyramid_equals_plain_loops(reference_sensor, convention, size, wider):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(7, 11), (172, 165), (164, 192)])
+@pytest.mark.parametrize("size", [(7, 11), (172, 165)])
 def test_sum_of_expanded_bands_is_the_image(convention, size):
     image = draw(1, 3, *size)
     bands = laplacian_pyramid(image, 5, convention)
@@ -180,24 +153,6 @@ def test_sum_of_expanded_bands_is_the_image(convention, size):
     for band in reversed(bands.details):
         result = band + pyrup(result, tuple(band.shape[-2:]), convention)
     close(result, image, 1e-14)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(9, 12), (166, 200)])
-def test_constant_image_has_no_bands(convention, size):
-    bands = laplacian_pyramid(torch.full((1, 1, *size), 0.7, dtype=torch.float64), 4, convention)
-    close(bands.base, torch.full_like(bands.base, 0.7), 1e-14)
-    for band in bands.details:
-        close(band, torch.zeros_like(band), 1e-14)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_and_device_follow_the_image(convention, dtype, device):
-    bands = laplacian_pyramid(draw(2, 3, 150, 40, dtype=dtype, device=device), 3, convention)
-    for level in (*bands.details, bands.base):
-        assert level.dtype == dtype
-        assert level.device.type == device.type
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -236,9 +191,8 @@ def test_gradients(convention, size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(163, 172), (172, 164)])
-def test_pyramid_is_equal_with_and_without_gradients(convention, size):
-    image = draw(1, 2, *size)
+def test_pyramid_is_equal_with_and_without_gradients(convention):
+    image = draw(1, 2, 163, 172)
     recorded = laplacian_pyramid(image.clone().requires_grad_(), 3, convention)
     with torch.no_grad():
         plain = laplacian_pyramid(image, 3, convention)
@@ -254,20 +208,6 @@ def test_images_in_any_memory_layout(convention):
         bands = laplacian_pyramid(same, 3, convention)
         for a, b in zip((*bands.details, bands.base), (*expected.details, expected.base), strict=True):
             close(a, b, 1e-14)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 30), (180, 164), (161, 170)])
-def test_image_and_earlier_pyramids_are_not_modified(convention, size):
-    image = draw(1, 3, *size)
-    before = image.clone()
-    with torch.no_grad():
-        bands = laplacian_pyramid(image, 4, convention)
-        kept = [level.clone() for level in (*bands.details, bands.base)]
-        laplacian_pyramid(image + 1, 4, convention)
-    assert torch.equal(image, before)
-    for level, then in zip((*bands.details, bands.base), kept, strict=True):
-        assert torch.equal(level, then)
 
 
 def test_bad_input():

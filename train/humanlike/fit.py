@@ -1,8 +1,9 @@
-"""Fit a model of how people choose their next fixation, and evaluate it on other people and pictures."""
+"""Fit a model of how people choose their next fixation, evaluate it on other people and pictures, and report it."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,14 +21,15 @@ from semfov.errors import DataError, check, lookup
 from semfov.eye import Eye
 from semfov.fit.outputs import model_path, write_outputs
 from semfov.fit.settings import FitConfig
+from semfov.gaze.habits import GazeHabits
 from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig, SaliencyConfig
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.settings import Count, Positive
 from semfov.runs.setup import prepare_worker
-from train.humanlike.habits import Halves, fit_terms, habits_of
-from train.humanlike.report import humanlike_report
+from semfov.runs.tables import table
+from train.humanlike.habits import AGES, EDGES, FittedTerms, Halves, fit_terms, habits_of
 from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 
@@ -160,3 +162,47 @@ class Viewing(PolicyLooking):
                 values[name] = values_in(StoredLooks(detections, grid), candidate.observer, acquire, cells, count)
         subject = torch.tensor([int(each.subject) for each in records])
         return replace(choices_in(cells, count, grid, number, subject), values=values)
+
+
+_TERMS = {"policy": "policy", "centre": "centre bias", "steps": "saccade length", "return": "return"}
+
+
+def humanlike_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
+    """Write the report as Markdown."""
+    sizes = halves.sizes
+    rows = [
+        [
+            model.policy or "none",
+            " + ".join(_TERMS[term] for term in model.terms),
+            f"{model.gain:+.3f} ± {model.error:.3f}",
+            f"{model.even:.3f}",
+            f"{model.fitted:.3f}",
+        ]
+        for model in models
+    ]
+    head = ["policy", "terms", "over the centre bias", "over a uniform choice", "over a uniform choice, fitted half"]
+    steps = [f"up to {edge:g}" for edge in EDGES] + ["more"]
+    ages = [f"{'' if low == high else f'{low:g} to '}{high:g}" for low, high in zip((1, 2, 3, 4), AGES, strict=True)]
+    best = habits.metadata["policy"]
+    return "\n".join(
+        [
+            "Information gain about people's next fixation, in bits per fixation (± standard error over pictures). "
+            f"The models are fitted on {sizes['fitted_choices']} fixations of {sizes['fitted_people']} people in "
+            f"{sizes['fitted_pictures']} pictures, and evaluated on {sizes['held_out_choices']} fixations of "
+            f"{sizes['held_out_people']} other people in {sizes['held_out_pictures']} other pictures.",
+            "",
+            *table([head, *rows]),
+            "",
+            f"The model with all terms for the policy {best}: up to a constant, the log probability of a cell is the "
+            f"sum of {float(habits.pull):.3f} times the policy's value (in standard deviations over the cells), the "
+            "centre bias, and the following terms.",
+            "",
+            *table([["saccade length", *steps], ["steps", *(f"{v:+.2f}" for v in habits.step.tolist())]]),
+            "",
+            *table([["age in fixations", *ages, "more"], ["return", *(f"{v:+.2f}" for v in habits.back.tolist())]]),
+            "",
+            "Saccade lengths are in units of the image's longer side. The age of a cell is the number of fixations "
+            "since it was last fixated.",
+            "",
+        ]
+    )

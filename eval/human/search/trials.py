@@ -80,10 +80,15 @@ def in_cells(search: Fixations, grid: Grid) -> _Array:
     """
     step = np.array(search.size) / (grid.columns, grid.rows)
     path = merge_close(np.clip(np.floor(search.points / step), 0, (grid.columns - 1, grid.rows - 1)), (1, 1))
+    return path[: _steps_to_target(path, search, grid)]
+
+
+def _steps_to_target(path: _Array, search: Fixations, grid: Grid) -> int | None:
+    """Number of fixations `(n, 2)`, column and row, up to the first in a cell of the target; None if none is."""
     left, right, top, bottom = goal_rectangle(search, grid)
     x, y = path.T
     on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
-    return path[: on.argmax() + 1] if on.any() else path
+    return int(on.argmax()) + 1 if on.any() else None
 
 
 def drawn_searches(
@@ -119,20 +124,8 @@ def drawn_searches(
         weights[first] = 0
         others = weights.multinomial(longest - 1, generator=generator).numpy()
         cells = np.concatenate([[first], others])
-        left, right, top, bottom = goal_rectangle(each, grid)
-        x, y = cells % grid.columns, cells // grid.columns
-        on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
-        cells = cells[: on.argmax() + 1] if on.any() else cells
-        drawn.append(
-            Fixations(
-                each.picture,
-                name,
-                centres[cells].astype(np.float64),
-                each.size,
-                None,
-                each.target,
-                each.box,
-                bool(on.any()),
-            )
-        )
+        steps = _steps_to_target(np.stack([cells % grid.columns, cells // grid.columns], -1), each, grid)
+        points = centres[cells[:steps]].astype(np.float64)
+        found = steps is not None
+        drawn.append(Fixations(each.picture, name, points, each.size, None, each.target, each.box, found))
     return drawn

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eval.comparison.summary import announce, sensing, write_files
-from eval.human.viewing.rows import PEOPLE, Half
+from eval.human.viewing.rows import MEASURES, PEOPLE, Half, Scored
 from eval.human.viewing.run import ViewingRun
-from eval.human.viewing.scores import MEASURES, Scored
 from eval.human.viewing.sequences import drawn_scanpaths
 from semfov.io.files import clean
 from semfov.metrics.averages import standard_error

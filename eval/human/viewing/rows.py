@@ -9,16 +9,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
-from eval.human.viewing.density import DensityWeights, fit_density, log_densities, standardised_maps
-from eval.human.viewing.raster import Events, Habits, blurred, enlarged
+from eval.human.viewing.density import (
+    HABITS,
+    DensityWeights,
+    Events,
+    Habits,
+    blurred,
+    fit_density,
+    log_densities,
+    standardised_maps,
+)
 from eval.human.viewing.run import ViewingRun
+from semfov.errors import check
+from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 
 _Array = NDArray[np.float64]
 
-HABITS = ("centre bias", "distance", "return")
-"""Predictors of fixations in any picture: position, distance from the last fixation, and earlier visits."""
 PEOPLE = "other people"
 """Fixations of all other people in the same picture."""
 
@@ -85,12 +94,8 @@ class Half:
             if name == PEOPLE:  # a density is used as its logarithm, after a small constant is added
                 smooth = (smooth / smooth.sum((-1, -2), keepdim=True) + 0.1 / (height * width)).log()
             terms.append(standardised_maps(smooth).expand(len(chosen), -1, -1))
-        habit_maps = {
-            "centre bias": lambda: self.habits.centre.expand(len(chosen), -1, -1),
-            "distance": lambda: self.habits.near(events.before[chosen]),
-            "return": lambda: enlarged(events.visited[chosen], self.run.grid(self.pictures[place]), height, width),
-        }
-        return terms + [habit_maps[name]() for name in row.habits]
+        before, visited, grid = events.before[chosen], events.visited[chosen], self.run.grid(self.pictures[place])
+        return terms + [self.habits.term(name, before, visited, grid) for name in row.habits]
 
 
 def people_maps(events: Events, rows: int, columns: int) -> Tensor:
@@ -139,3 +144,60 @@ def score_row(row: Row, weights: DensityWeights, half: Half, place: int) -> _Arr
     log = density.double().numpy()
     figures = nss(np.exp(log), x, y), auc(log, x, y), log_likelihood(log, x, y)
     return np.concatenate(figures, axis=1)
+
+
+MEASURES = ("NSS", "AUC", "log likelihood")
+"""Conditional scores of each fixation; the log likelihood is in bits above a uniform density."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A row with its fitted weights and its scores.
+
+    Attributes:
+        row: the row.
+        weights: the fitted weights of its terms.
+        pictures: `(P, 3)`, mean of each of `MEASURES` over the fixations of each picture.
+        shifts: `(P, N, 3)`, the same over the fixations after 1, 2, … gaze shifts; NaN where a picture has none.
+    """
+
+    row: Row
+    weights: DensityWeights
+    pictures: _Array
+    shifts: _Array
+
+    def difference(self, other: Scored, figure: int = 0) -> tuple[float, float]:
+        """Mean difference of a score from that of another row, paired by picture, and its standard error."""
+        gap = self.pictures[:, figure] - other.pictures[:, figure]
+        return float(gap.mean()), float(standard_error(gap))
+
+
+def halves(run: ViewingRun) -> tuple[Half, Half]:
+    """Split the pictures alternately into a half for fitting and a half for reporting; habits are from the first."""
+    order = list(range(len(run.scenes)))
+    check(len(order) >= 2, "data", "at least two pictures, one to fit on and one to report on", len(order))
+    fitted, reported = (order[1::2], order[::2]) if run.config.swap else (order[::2], order[1::2])
+    events = {index: run.events(index) for index in order}
+    density = run.config.density
+    habits = Habits.of([events[index] for index in fitted], density.columns, density.rows)
+    first, second = (Half(run, part, [events[index] for index in part], habits) for part in (fitted, reported))
+    return first, second
+
+
+def score_all(run: ViewingRun, fitted: Half, reported: Half, *, longest: int = 8) -> dict[tuple[str, str], Scored]:
+    """Fit and score every row; results by name and group (`Row.group`)."""
+    scored = {}
+    for row in tqdm(rows_of(run.names, run.config.models), desc="scoring", unit="row"):
+        weights = fit_row(row, fitted)
+        means, shifts = [], []
+        for place, events in enumerate(reported.events):
+            figures = score_row(row, weights, reported, place)
+            means.append(figures.mean(0))
+            number = events.number.numpy()
+            shifts.append([_mean(figures[number == n]) for n in range(longest)])
+        scored[row.name, row.group] = Scored(row, weights, np.array(means), np.array(shifts))
+    return scored
+
+
+def _mean(values: _Array) -> Sequence[float]:
+    return list(values.mean(0)) if len(values) else [float("nan")] * values.shape[1]

@@ -4,35 +4,187 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from eval.human.viewing.config import ViewingConfig
-from eval.human.viewing.follow import FineLooks, MapStore, evaluate_along
-from eval.human.viewing.raster import Events, enlarged, events_of
+from eval.human.viewing.density import Events, enlarged, events_of
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Landing
+from semfov.belief.observers import Landing, Look, Observer
+from semfov.belief.observers.gathering import Gatherer
 from semfov.data.classes import class_index
 from semfov.data.fixations import Fixations, by_picture, read_osie, read_table
 from semfov.data.pictures import Pictures
 from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
 from semfov.detection.load import check_detector
-from semfov.episode import Looks, Stopwatch, StoredLooks
+from semfov.episode import Looks, Sight, Stopwatch, StoredLooks, rollout
 from semfov.errors import DataError, InputError
+from semfov.gaze.acquisition import Uniform
+from semfov.gaze.choice import Given
 from semfov.gaze.policies import ObjectSeeking, Task
+from semfov.io.schema import Field, Schema
 from semfov.runs.candidates import Candidate
-from semfov.runs.config import PolicyConfig
+from semfov.runs.config import PolicyConfig, RunConfig, SaliencyConfig, SaliencyModel
 from semfov.runs.looks import one_thread
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.scene_run import digest_of, store_folder
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole
+from semfov.runs.store import SceneStore, looks_digest
 from semfov.strategy import Strategy
+
+
+@dataclass(frozen=True)
+class PicturesConfig(Settings):
+    """The pictures that people saw.
+
+    Args:
+        root: folder of the pictures.
+        limit: use only this many pictures, the first ones.
+    """
+
+    root: Path = Path()
+    limit: Count | None = None
+
+
+@dataclass(frozen=True)
+class DensityConfig(Settings):
+    """How maps are turned into densities of the next fixation; all models have the same kinds of free parameters.
+
+    Args:
+        columns: number of columns of the raster; fixations are assigned to its bins.
+        rows: number of rows of the raster.
+        blurs: standard deviations, in bins, of Gaussian blurs; the best-fitting one is used.
+        events: number of randomly drawn fixations on which the weights are fitted.
+        seed: random seed of this draw.
+    """
+
+    columns: Side = 40
+    rows: Side = 30
+    blurs: tuple[Annotated[float, Range(0, 20)], ...] = (0.0, 1.0, 2.0)
+    events: Count = 4000
+    seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class ViewingConfig(RunConfig):
+    """Comparison of people and policies that view the same pictures without a task.
+
+    Args:
+        people: fixations of all people: the JSON file of OSIE, or a table (`.csv`) as `semfov.data.fixations` reads it.
+        data: the pictures.
+        belief: the belief of the policies; looks are taken from the centres of its cells.
+        saliency: settings of the saliency maps that policies have as priors.
+        protocol: the protocol; its seed draws the scanpaths.
+        density: how maps are turned into densities.
+        policies: exploration policies, by preset or settings (`python -m eval.explore --help`). The policy `landing`,
+            on the cells of the raster, is always included.
+        models: saliency models.
+        swap: exchange the two halves of the pictures: report on the half that is otherwise used for fitting.
+        sequences: models whose scanpaths are drawn and compared with those of people.
+        files: scanpaths of other models in these pictures, as tables (`.csv`), to compare with those of people.
+        drawings: number of pictures for which scanpaths of people and of `landing` are shown side by side.
+        bandwidth: bandwidth of the clusters of fixations that make up the letters of a sequence, as a fraction of the
+            picture's longer side.
+        longest: number of fixations of a scanpath that are used, the first ones.
+        out: folder for tables, figures and the manifest.
+        cache: folder for the stored detections from every cell and for maps (None: the user's cache).
+        store: keep detections and maps on disk; false computes them anew in each run.
+    """
+
+    people: Path = Path("fixations.json")
+    data: PicturesConfig = field(default_factory=PicturesConfig)  # type: ignore[assignment]
+    saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture"))
+    density: DensityConfig = field(default_factory=DensityConfig)
+    policies: tuple[str | PolicyConfig, ...] = (
+        "kl-calibrated",
+        "negative-entropy-calibrated",
+        "two-peaks-calibrated",
+        "surprise-calibrated",
+        "closer-look-learned",
+        "expected-gain-learned",
+        "objects-calibrated",
+    )
+    models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")  # type: ignore[assignment]
+    swap: bool = False
+    sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "kl-calibrated", "landing")
+    files: tuple[Path, ...] = ()
+    drawings: Whole = 2
+    bandwidth: Positive = 0.08
+    longest: Annotated[int, Range(2, 1000)] = 20
+    out: Path = Path("runs/human_viewing")
+
+
+_SOURCES = ("semfov.runs.candidates", "semfov.gaze.policies", "semfov.gaze.saliency", "semfov.episode", __name__)
+"""Modules that the maps depend on, in addition to those of a look."""
+
+
+def map_store(folder: Path, what: Mapping[str, object], cells: int) -> SceneStore:
+    """A store of the values of all cells after each fixation of all people, by the settings that they depend on."""
+    return SceneStore(folder, what, looks_digest(*_SOURCES), Schema({"values": Field(("E", cells))}))
+
+
+class FineLooks(Looks):
+    """Looks from the centres of coarse cells, for a belief about finer cells.
+
+    Args:
+        detections: detections from every coarse cell, as a batch.
+        grid: the grid of coarse cells.
+        fine: the grid of the belief.
+    """
+
+    def __init__(self, detections: Detections, grid: Grid, fine: Grid) -> None:
+        self.detections, self.coarse, self.grid = detections, grid, fine
+        self.like = detections.scores
+        self._weighed: tuple[Observer, Look] | None = None
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """The look from the coarse cell in which the centre of each fine cell lies."""
+        if self._weighed is None or self._weighed[0] is not observer:
+            centres = self.coarse.centres.to(self.like)
+            self._weighed = observer, observer.weigh(self.detections, centres, self.grid)
+        row = self.coarse.cell_of(self.grid.centres[cell])
+        return Sight(self._weighed[1][row], lambda: self.detections[row], Stopwatch().seconds)
+
+
+def evaluate_along(looks: Looks, candidates: Mapping[str, Candidate], scanpaths: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Evaluate policies along given scanpaths.
+
+    The scanpaths are given, so policies with the same kind of observer have the same belief: one rollout serves them
+    all.
+
+    Args:
+        looks: the looks at the picture.
+        candidates: policies by name; their observers have the same settings.
+        scanpaths: for each scanpath `(n,)`, the fixated cells.
+
+    Returns:
+        For each policy `(E, X·Y)`, the values of the cells after each fixation except the last of each scanpath, one
+        scanpath after the other.
+    """
+    longest = max(map(len, scanpaths))
+    padded = torch.stack([torch.cat([path, path[-1:].expand(longest - len(path))]) for path in scanpaths])
+    observer = next(iter(candidates.values())).observer
+    if isinstance(observer, Gatherer):
+        # The batch always consists of all people, so the bits of the result never change.
+        observer.together = True
+    tables: dict[str, list[Tensor]] = {name: [] for name in candidates}
+    most = max(longest - 1, 1)
+    for step in rollout(looks, observer, Uniform(), padded[:, 0], Given(padded), most=most):
+        for name, candidate in candidates.items():
+            tables[name].append(candidate.acquisition(None, looks.grid, step.cell)(step.belief, step.visited))
+    rows = [(person, len(path) - 1) for person, path in enumerate(scanpaths)]
+    stacked = {name: torch.stack(values, 1) for name, values in tables.items()}
+    return {name: torch.cat([table[person, :count] for person, count in rows]) for name, table in stacked.items()}
+
 
 LANDING = "landing"
 """The exploration policy `objects` with a `Landing` observer, on the cells of the raster."""
@@ -55,11 +207,11 @@ class ViewingRun(PolicyLooking):
         cache, common = store_folder(config.cache) / "viewing", self._what()
         beliefs = {name: asdict(policy) for name, policy in self.policies.items()}
         self.map_stores = {
-            name: MapStore(cache, {**common, "policy": policy}, cells) for name, policy in beliefs.items()
+            name: map_store(cache, {**common, "policy": policy}, cells) for name, policy in beliefs.items()
         }
-        self.map_stores[LANDING] = MapStore(cache, {**common, "policy": LANDING, "bins": bins}, bins)
+        self.map_stores[LANDING] = map_store(cache, {**common, "policy": LANDING, "bins": bins}, bins)
         for name in config.models:
-            self.map_stores[name] = MapStore(cache, {"saliency": name, "raster": self._raster_size}, bins)
+            self.map_stores[name] = map_store(cache, {"saliency": name, "raster": self._raster_size}, bins)
 
     def check_sources(self) -> None:
         """Check that the detector exists; pictures are looked for after people's files have been read."""

@@ -8,10 +8,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from eval.human.viewing.density import DensityWeights, log_densities, standardised_maps
-from eval.human.viewing.raster import Habits, bins_of, blurred, enlarged
-from eval.human.viewing.rows import PEOPLE, Half
-from eval.human.viewing.scores import Scored
+from eval.human.viewing.density import (
+    HABITS,
+    DensityWeights,
+    Habits,
+    bins_of,
+    blurred,
+    enlarged,
+    log_densities,
+    standardised_maps,
+)
+from eval.human.viewing.rows import PEOPLE, Half, Scored
 from semfov.belief.grid import Grid
 from semfov.data.fixations import by_picture, read_table
 from semfov.episode import rollout
@@ -62,15 +69,10 @@ class DensityChoice(Choice):
         visited = torch.zeros(count, len(self.grid))
         for points in self.points:
             visited.scatter_(1, self.grid.cell_of(points)[:, None], 1.0)
-        habit_maps = {
-            "centre bias": lambda: self.habits.centre.expand(count, -1, -1),
-            "distance": lambda: self.habits.near(bins_of(self.raster, last)),
-            "return": lambda: enlarged(visited, self.grid, height, width),
-        }
         terms = []
         for name in self.weights.terms:
-            if name in habit_maps:
-                terms.append(habit_maps[name]())
+            if name in HABITS:
+                terms.append(self.habits.term(name, bins_of(self.raster, last), visited, self.grid))
             elif maps is not None:
                 terms.append(standardised_maps(blurred(maps, self.weights.blur)).expand(count, -1, -1))
         flat = torch.zeros(count, height, width)

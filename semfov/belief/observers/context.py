@@ -78,7 +78,7 @@ class Context(Observer):
     Args:
         observer: the inner observer.
         prior: the context.
-        weights: weights of place and co-occurrence; None takes those fitted for the kind of observer.
+        weights: weights of place and co-occurrence; None takes those of the prior for the kind of observer.
 
     >>> from semfov.belief.observers import Semantic
     >>> place = torch.zeros(2, 2, 2)

@@ -4,12 +4,17 @@ Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfo
 screen, in pixels of a picture, or in cells. `Letterbox` and `Fixations.resized` convert between these.
 """
 
-from semfov.data.fixations.cocosearch import read_cocosearch, write_cocosearch
-from semfov.data.fixations.osie import read_osie, write_osie
+from semfov.data.fixations.formats import (
+    coco_name,
+    read_cocosearch,
+    read_osie,
+    read_ruarte,
+    write_cocosearch,
+    write_osie,
+    write_ruarte,
+)
 from semfov.data.fixations.pysaliency import from_pysaliency, to_pysaliency
-from semfov.data.fixations.record import Fixations, by_picture
-from semfov.data.fixations.ruarte import coco_name, read_ruarte, write_ruarte
-from semfov.data.fixations.screen import Letterbox
+from semfov.data.fixations.record import Fixations, Letterbox, by_picture
 from semfov.data.fixations.table import read_table, write_table
 
 __all__ = [

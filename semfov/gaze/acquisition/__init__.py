@@ -1,9 +1,8 @@
 """Acquisition functions: the value of fixating each cell next, given the belief."""
 
-from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
+from semfov.gaze.acquisition.accuracy import ExpectedAccuracy, ExpectedGain
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
-from semfov.gaze.acquisition.expected_gain import ExpectedGain
 from semfov.gaze.acquisition.exploration import (
     BayesianSurprise,
     KLDivergence,

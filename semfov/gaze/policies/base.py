@@ -12,8 +12,6 @@ from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.accuracy import SightedModel
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.ideal import SignalModel
-from semfov.gaze.acquisition.lookahead import LevelledModel
-from semfov.gaze.acquisition.place import MissModel
 from semfov.gaze.acquisition.samples import DrawnModel, sampled_likelihoods
 
 Task = Literal["search", "exploration"]
@@ -22,7 +20,7 @@ Table = Literal["saliency", "attention"]
 """What a policy can need of every scene: the saliency of its cells, or attention to every class in its cells."""
 
 
-class GazeModel(DrawnModel, LevelledModel, MissModel, SightedModel, SignalModel, Protocol):
+class GazeModel(DrawnModel, SightedModel, SignalModel, Protocol):
     """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
 
 

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
-from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
+from semfov.gaze.acquisition.accuracy import ExpectedAccuracy, ExpectedGain
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
-from semfov.gaze.acquisition.expected_gain import ExpectedGain
 from semfov.gaze.acquisition.exploration import (
     BayesianSurprise,
     KLDivergence,
@@ -31,9 +30,8 @@ class KL(SamplingPolicy):
     Args:
         model: observation model.
         prior: Dirichlet parameter of every class before the first look.
-        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
-            look with the expected scores, as published.
-        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+        samples: number of drawn looks for each class and level; None takes the look with the expected scores.
+        calibrated: whether the scores of a drawn look are calibrated (`SamplingPolicy`).
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -67,9 +65,8 @@ class Surprise(SamplingPolicy):
 
     Args:
         model: observation model.
-        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
-            look with the expected scores, as published.
-        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+        samples: number of drawn looks for each class and level; None takes the look with the expected scores.
+        calibrated: whether the scores of a drawn look are calibrated (`SamplingPolicy`).
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -91,9 +88,8 @@ class Negentropy(SamplingPolicy):
 
     Args:
         model: observation model.
-        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
-            look with the expected scores, as published.
-        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+        samples: number of drawn looks for each class and level; None takes the look with the expected scores.
+        calibrated: whether the scores of a drawn look are calibrated (`SamplingPolicy`).
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -115,9 +111,8 @@ class Peaks(SamplingPolicy):
 
     Args:
         model: observation model.
-        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
-            look with the expected scores, as published.
-        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+        samples: number of drawn looks for each class and level; None takes the look with the expected scores.
+        calibrated: whether the scores of a drawn look are calibrated (`SamplingPolicy`).
 
     >>> import torch
     >>> from semfov import FovealObservationModel

@@ -56,9 +56,8 @@ class Predictive(SamplingPolicy):
 
     Args:
         model: observation model.
-        samples: number of looks that are drawn for each class and level, for the expectation over them; None takes the
-            look with the expected scores, as published.
-        calibrated: whether the scores of a drawn look are calibrated before they update the belief.
+        samples: number of drawn looks for each class and level; None takes the look with the expected scores.
+        calibrated: whether the scores of a drawn look are calibrated (`SamplingPolicy`).
 
     >>> import torch
     >>> from semfov import FovealObservationModel

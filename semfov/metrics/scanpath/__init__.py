@@ -21,9 +21,9 @@ from semfov.metrics.scanpath.sequence import (
     cell_labels,
     cluster_labels,
     edit_distance,
+    merge_close,
     sequence_score,
 )
-from semfov.metrics.scanpath.simplify import merge_close
 
 __all__ = [
     "BesidePeople",

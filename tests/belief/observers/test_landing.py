@@ -60,20 +60,12 @@ def test_belief_keeps_the_strongest_evidence_and_the_smallest_distance():
     torch.testing.assert_close(belief.evidence[0], look.evidence.amax(0))
     torch.testing.assert_close(belief.closest[0], grid.distance(points).amin(0))
     torch.testing.assert_close(belief.probability(2), belief.evidence[..., 1])
-    assert (belief.class_probabilities() >= 0).all()
+    shares = belief.class_probabilities()
+    torch.testing.assert_close(shares[..., 0], 1 - belief.evidence.amax(-1))
+    assert (shares >= 0).all()
     values = ObjectEvidence()(belief, torch.zeros(1, 20, dtype=torch.bool))
     torch.testing.assert_close(values, belief.evidence.sum(-1))
     torch.testing.assert_close(ObjectSeeking()(None, grid)(belief, belief.closest < 0), values)
-
-
-def test_total_evidence_of_an_object_grows_with_its_side_length():
-    """Sums over a fine grid, of objects that are large enough and far enough from the picture's border."""
-    grid = Grid(200, 150, (800, 600))
-    boxes = torch.tensor([[[100.0, 100.0, 180.0, 180.0]], [[300.0, 200.0, 620.0, 520.0]]])
-    seen = Detections(boxes, torch.tensor([[[0.0, 0.0, 1.0]]]).expand(2, 1, 3), torch.ones(2, 1).bool())
-    sums = Landing(2).weigh(seen, torch.zeros(2, 2), grid).evidence.sum((1, 2))
-    # σ is four times as large: the area is 16 times as large, and the height a quarter.
-    assert sums[1] / sums[0] == pytest.approx(4, rel=0.02)
 
 
 def test_no_detections_give_no_evidence_and_other_beliefs_are_refused():
@@ -95,22 +87,6 @@ def test_no_detections_give_no_evidence_and_other_beliefs_are_refused():
 def test_invalid_settings_are_refused(bad):
     with pytest.raises(InputError, match=rf"^{next(iter(bad))}:"):
         Landing(**{"classes": 3} | bad)
-
-
-def test_looks_and_beliefs_can_be_indexed_and_joined():
-    grid, seen = Grid(5, 4, (400, 300)), draw()
-    observer, points = Landing(4), torch.tensor([[0.0, 0.0], [399.0, 299.0], [200.0, 10.0]], dtype=torch.float64)
-    start, look = observer.start(3, grid, seen.scores), observer.weigh(seen, points, grid)
-    assert start.evidence.shape == look.evidence.shape == (3, 20, 4)
-    belief = observer.update(start, look)
-    torch.testing.assert_close(belief.class_probabilities()[..., 0], 1 - belief.evidence.amax(-1))
-    assert torch.equal(belief[1:].closest, belief.closest[1:])
-    assert torch.equal(belief[1:].evidence, belief.evidence[1:])
-    joined = type(look).join([look[1:], look[:1]])
-    assert torch.equal(joined.evidence, look.evidence[[1, 2, 0]])
-    assert torch.equal(joined.distance, look.distance[[1, 2, 0]])
-    nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 5), torch.zeros(2, 0).bool())
-    assert observer.weigh(nothing, torch.zeros(2, 2), grid).evidence.shape == (2, 20, 4)
 
 
 def test_evidence_is_computed_in_the_precision_of_the_scores():

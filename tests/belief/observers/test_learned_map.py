@@ -7,14 +7,13 @@ import pytest
 import scipy.special
 import torch
 
-from semfov import Detections, FovealObservationModel, Grid
+from semfov import FovealObservationModel, Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, MapBelief, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import KLDivergence
-from tests import small
 
 GRID = Grid(6, 4, (90, 60))
 FIXATED = [0, 9, 20, 5]
@@ -120,31 +119,6 @@ def sequence(looks):
     for order in ([0, 1, 2, 3], [1, 2, 3, 0], [3, 3, 0, 2]):
         index = torch.tensor(order)
         yield looks[index], FIXATIONS[index]
-
-
-def test_several_classes_share_a_cell():
-    """A cup on a table: the cell holds both, and neither lowers the probability of the other."""
-    observer, cell = LearnedMap(small.score_evidence(MapEvidence)), 9
-    x, y = GRID.centres[cell].tolist()
-    boxes = torch.tensor([[[x - 7, y - 7, x + 7, y + 7], [x - 7, y - 7, x + 37, y + 7]]])
-    scores = torch.tensor([[[0.02, 0.94, 0.02, 0.02], [0.02, 0.02, 0.94, 0.02]]])
-    both = Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool))
-    one = Detections(boxes[:, :1], scores[:, :1], both.mask[:, :1])
-    beliefs = {}
-    for name, seen in (("both", both), ("one", one)):
-        belief = observer.start(1, GRID, boxes)
-        for _ in range(3):
-            belief = observer(belief, seen, GRID.centres[[cell]], GRID)
-        beliefs[name] = belief.probabilities[0, cell]
-    assert float(beliefs["both"][1]) > 0.9
-    assert float(beliefs["both"][2]) > 0.85
-    assert float(beliefs["both"].sum()) > 1.5
-    assert float(beliefs["both"][3]) < 0.1
-    assert float(beliefs["both"][0]) < 0.1
-    assert torch.equal(beliefs["one"][1], beliefs["both"][1])
-    assert float(beliefs["one"][2]) < 0.1
-    # A cell where nothing was seen is believed to be empty.
-    assert float(belief.probabilities[0, 23, 0]) > 0.9
 
 
 def test_gradients_reach_every_parameter(random_looks, toy_map):

@@ -88,16 +88,6 @@ def test_repeating_a_look_does_not_change_a_memory_of_the_closest_look(looks):
     assert torch.equal(observer.update(once, look).beta, once.beta)
 
 
-def test_misses_move_cells_without_detections_towards_background():
-    nothing = Detections.empty(1, 3)
-    observer = Semantic(4, misses=MISSES)
-    look = observer.weigh(nothing, FIXATIONS[:1], GRID)
-    after = observer.update(observer.start(1, GRID, torch.empty(0)), look).beta
-    background = after[0, :, 0] / after[0].sum(-1)
-    assert background.argmax() == 0
-    assert (background > 0.25).all()
-
-
 def test_models_are_submodules_of_the_observer():
     """The parameters of a fitted model are listed once, even if it is used twice; other objects are kept."""
     model = FovealObservationModel.identity(["a", "b"], [0.2], miss_rate=torch.full((3, 2), 0.5))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data.fixations import Fixations, Letterbox, coco_name, read_ruarte
-from semfov.data.fixations.screen import resized_box, resized_points
+from semfov.data.fixations.record import resized_box, resized_points
 from semfov.errors import InputError
 
 sides = st.integers(1, 3000)

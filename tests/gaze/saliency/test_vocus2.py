@@ -111,15 +111,6 @@ def test_any_size_and_uniform_images(
         assert vocus2_saliency(uniform, fusion=fusion, color_space=color_space).abs().max() == 0
 
 
-def test_a_batch_equals_a_loop_over_images(dtype: torch.dtype, device: torch.device) -> None:
-    images = torch.rand(3, 3, 40, 52, dtype=dtype, device=device)
-    images[1] *= 0.2
-    for fusion in ("mean", "max"):
-        model = VOCUS2(fusion=fusion)
-        loop = torch.cat([model(image[None]) for image in images])
-        torch.testing.assert_close(model(images), loop, atol=1e-5, rtol=0)
-
-
 def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     for model in (VOCUS2(), VOCUS2(3.0, 13.0), VOCUS2(fusion="max")):
         row, column = divmod(int(model(pop_out).argmax()), 320)

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from semfov import FovealObservationModel
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.fixations import Fixations, write_table
 from semfov.runs.config import DetectorConfig, SensorConfig
@@ -67,10 +67,6 @@ def write_material(folder: Path) -> None:
         GlimpseEvidence(3, 8).save(folder / "zoom.safetensors")
         model = FovealObservationModel(0.5 + torch.rand(4, 3, 4), [0.2, 0.5], CLASSES, metadata=settings)
         model.save(folder / "observation.safetensors")
-        for name in ("counted", "noise"):
-            weights, pairs = {"evidence": (1.0, 1.0), "map": (1.0, 1.0)}, torch.randn(4, 4, 2)
-            prior = ContextPrior(CLASSES, torch.randn(4, 3, 3), pairs, [0.3], weights=weights)
-            prior.save(folder / f"{name}.safetensors")
     (folder / "people").mkdir()
     draw, viewed, record = np.random.default_rng(0), [], {}
     for number in range(4):
@@ -135,13 +131,6 @@ COMMANDS = {
                   "--target_model", "HERE/target.safetensors", "--map_model", "HERE/map.safetensors"),
         files=("beliefs.md", "beliefs.csv", "beliefs.json"),
         others=("calibration.md", "config.yaml", "manifest.json", "reliability.png", "beliefs.png"),
-    ),
-    "eval.words": Command(
-        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
-                  "--policy", "{policy: non-predictive, tempering: 0.25}",
-                  "--counted", "HERE/counted.safetensors", "--tables", "[HERE/noise.safetensors]"),
-        files=("episodes.jsonl", "words.md"),
-        refused=((("--context", "none"), "context"), (("--tables", "[nothing.safetensors]"), "nothing.safetensors")),
     ),
     "eval.figures": Command(
         refused=(
@@ -221,12 +210,6 @@ COMMANDS = {
         parts="cache/samples/*/*.safetensors",
     ),
     "train.fit_templates": Command(workers=False),
-    "train.fit_context": Command(
-        settings=("--data.limit", "6", "--holdout", "2", "--min_objects", "1"),
-        files=("coco.safetensors", "judged.json", "report.md"),
-        parts="",
-        refused=tuple((("--name", name), "name: expected ") for name in ("../x", "/x", "a/b", "", "x\0")),
-    ),
     "train.fit_humanlike": Command(
         settings=(*NETWORK, *GRID, "--root", "HERE/people", "--fixations", "HERE/people.json",
                   "--policies", "[closer-look-raw, vocus2-raw]"),

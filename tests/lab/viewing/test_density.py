@@ -8,8 +8,16 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
-from eval.human.viewing.density import fit_density, log_densities, standardised_maps, values_in_bins
-from eval.human.viewing.raster import Habits, blurred, enlarged, events_of
+from eval.human.viewing.density import (
+    Habits,
+    blurred,
+    enlarged,
+    events_of,
+    fit_density,
+    log_densities,
+    standardised_maps,
+    values_in_bins,
+)
 from eval.human.viewing.rows import people_maps
 from semfov import Grid
 from semfov.data.fixations import Fixations

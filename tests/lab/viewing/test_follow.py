@@ -2,7 +2,7 @@
 
 import torch
 
-from eval.human.viewing.follow import FineLooks, evaluate_along
+from eval.human.viewing.run import FineLooks, evaluate_along
 from semfov import Detections, Grid
 from semfov.belief.observers import Landing, Semantic
 from semfov.episode import StoredLooks, rollout

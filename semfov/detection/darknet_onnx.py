@@ -1,12 +1,28 @@
-"""The ONNX model of a Darknet network, with decoded boxes."""
+"""A Darknet network in ONNX: its graph with decoded boxes, kept in the cache, and run where no gradients are needed."""
 
-from typing import Any
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd import forward_ad
 
-from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_layers import Convolution, Head, MaxPool, Route, Shortcut, Upsample
+from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut, Upsample
+from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.scores import Candidates
+from semfov.detection.weights import cache_folder
+from semfov.errors import DataError, values_known
+from semfov.io.files import sha256, write_bytes
+
+Runtime = Literal["auto", "torch", "onnxruntime"]
+
+RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 VERSION = 1
 """Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
@@ -141,20 +157,7 @@ class _NetworkGraph(Graph):
 
 
 def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None) -> Any:
-    """Make the ONNX model of a network: from `images` `(B, 3, H, W)` to all boxes of all heads, the `OUTPUTS`.
-
-    Args:
-        network: the network; its weights are stored as float32.
-        name: name of the graph.
-        size: `(width, height)` of the single image that the model takes; None for any batch and any size that the
-            network takes.
-
-    Returns:
-        An `onnx.ModelProto`.
-
-    Raises:
-        ModuleNotFoundError: the package onnx is not installed.
-    """
+    """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None)."""
     try:
         from onnx import TensorProto, helper
     except ImportError as error:
@@ -190,3 +193,102 @@ def _build(network: Darknet) -> _NetworkGraph:
         graph.add("Concat", *outputs, axis=1)
         graph.name_last(name)
     return graph
+
+
+class OnnxTwin:
+    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
+
+    The ONNX model is made when it is first needed (`exported`). A session has as many threads as torch has at that
+    time. Every process opens its own session, because the threads of a pool do not survive a fork.
+
+    Args:
+        digest: `network_digest` of the network with its weights.
+    """
+
+    def __init__(self, digest: str) -> None:
+        self.digest = digest
+        self._versions: tuple[object, ...] | None = None
+        self._same = False
+        self._opened: tuple[tuple[int, int], OnnxSession] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return OnnxTwin, (self.digest,)
+
+    def obstacle(self, network: Darknet) -> str | None:
+        """The reason, in words, why onnxruntime cannot run the network as it is now; None if it can."""
+        parameters = list(network.parameters())
+        dtype, devices = parameters[0].dtype, {parameter.device.type for parameter in parameters}
+        if devices != {"cpu"}:
+            return f"a network on {', '.join(sorted(devices))}"
+        if dtype != torch.float32:
+            return f"a network of {dtype}"
+        if network.channels != 3:
+            return f"a network that takes {network.channels} channels"
+        versions = tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
+        if versions != self._versions:
+            self._versions, self._same = versions, network_digest(network) == self.digest
+        return None if self._same else "weights that were changed after loading"
+
+    def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
+        """The reason, in words, why onnxruntime cannot run the network on a canvas; None if it can."""
+        if not values_known(canvas, *network.parameters()) or torch.jit.is_tracing():  # type: ignore[attr-defined]
+            return "graphs that are traced, and function transforms"
+        tensors = [canvas, *network.parameters()]
+        if any(type(tensor) not in (Tensor, nn.Parameter) for tensor in tensors):
+            return "subclasses of tensors"
+        reverse = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+        if reverse or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+            return "gradients"
+        if canvas.device.type != "cpu":
+            return f"a canvas on {canvas.device}"
+        return self.obstacle(network)
+
+    def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
+        """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
+        network.check_image(canvas)
+        outputs = self._session(network)(canvas.float())
+        return Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+
+    def _session(self, network: Darknet) -> OnnxSession:
+        key = (os.getpid(), torch.get_num_threads())
+        if self._opened is None or self._opened[0] != key:
+            self._opened = key, self._open(network)
+        return self._opened[1]
+
+    def _open(self, network: Darknet) -> OnnxSession:
+        try:
+            path = exported(network, cache_folder() / "exported")
+        except DataError:  # the cache cannot be written to
+            with tempfile.TemporaryDirectory() as folder:
+                return OnnxSession(exported(network, Path(folder)), checked=False)
+        return OnnxSession(path, checked=False)
+
+
+def network_digest(network: Darknet) -> str:
+    """Compute the sha256 of a network's cfg and of its parameters as float32."""
+    digest = hashlib.sha256(network.cfg_digest().encode())
+    for parameter in network.parameters():
+        digest.update(parameter.detach().float().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def exported(network: Darknet, folder: Path) -> Path:
+    """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
+    source = json.dumps([network_digest(network), VERSION, torch.__version__])
+    key = hashlib.sha256(source.encode()).hexdigest()[:16]
+    whole = _whole(folder.glob(f"{key}.*.onnx"))
+    if whole is not None:
+        return whole
+    content = network_model(network, "darknet").SerializeToString()
+    path = folder / f"{key}.{hashlib.sha256(content).hexdigest()}.onnx"
+    write_bytes(path, content)
+    return path
+
+
+def _whole(paths: Iterable[Path]) -> Path | None:
+    """The first file that can be read and whose sha256 is the one in its name."""
+    for path in sorted(paths):
+        with suppress(OSError):
+            if sha256(path) == path.name.split(".")[1]:
+                return path
+    return None

@@ -11,21 +11,9 @@ import torch
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp
 
-from semfov.detection.export_graph import VERSION, network_model
+from semfov.detection.darknet_onnx import VERSION, OnnxTwin, exported, network_digest, network_model
 from semfov.detection.load import load_yolo
-from semfov.detection.onnx_twin import OnnxTwin, exported, network_digest
 from semfov.errors import InputError
-
-CLASSES = ("cat", "dog")
-
-
-@pytest.fixture
-def make(small_cfg, write_weights):
-    """A function that loads the small network."""
-    weights = write_weights()
-    return lambda runtime="auto", **options: load_yolo(
-        str(small_cfg), weights=weights, classes=CLASSES, stride=16, runtime=runtime, **options
-    )
 
 
 @pytest.fixture
@@ -41,7 +29,7 @@ def looks(monkeypatch):
 def folder(tmp_path, monkeypatch):
     """An empty cache for one test."""
     path = tmp_path / "cache"
-    monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: path)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.cache_folder", lambda: path)
     return path
 
 
@@ -59,9 +47,9 @@ def same_as(network, canvas, found, side):
 
 @pytest.mark.parametrize("shape", [(1, 3, 32, 64), (1, 3, 64, 64), (3, 3, 16, 48)])
 @pytest.mark.parametrize("runtime", ["auto", "onnxruntime"])
-def test_onnxruntime_equals_torch(make, looks, shape, runtime):
-    detector, canvas = make(runtime), canvases(*shape)
-    same_as(make("torch"), canvas, detector.propose(canvas), 64)
+def test_onnxruntime_equals_torch(make_small, looks, shape, runtime):
+    detector, canvas = make_small(runtime), canvases(*shape)
+    same_as(make_small("torch"), canvas, detector.propose(canvas), 64)
     assert len(looks) == 1
     assert detector.settings()["runtime"] == "onnxruntime"
 
@@ -78,8 +66,8 @@ def test_onnxruntime_equals_torch_with_published_weights(tiny_weights, looks):
     assert len(looks) == 1
 
 
-def test_gradients_are_computed_by_torch(make, looks):
-    detector = make()
+def test_gradients_are_computed_by_torch(make_small, looks):
+    detector = make_small("auto")
     canvas = canvases(1, 3, 32, 64).requires_grad_()
     detector.propose(canvas).classes.sum().backward()
     assert bool(canvas.grad.any())
@@ -95,8 +83,8 @@ def test_gradients_are_computed_by_torch(make, looks):
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:FutureWarning")  # raised by jvp of torch
-def test_forward_gradients_and_transforms_are_computed_by_torch(make, looks):
-    detector, canvas = make(), canvases(2, 3, 32, 64)
+def test_forward_gradients_and_transforms_are_computed_by_torch(make_small, looks):
+    detector, canvas = make_small("auto"), canvases(2, 3, 32, 64)
     tangent = torch.ones_like(canvas)
     with forward_ad.dual_level():
         dual = forward_ad.unpack_dual(detector.propose(forward_ad.make_dual(canvas, tangent)).classes).tangent
@@ -108,17 +96,17 @@ def test_forward_gradients_and_transforms_are_computed_by_torch(make, looks):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore:.*torch.jit.trace")
-def test_compiled_and_traced_graphs_use_torch(make, looks):
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+def test_compiled_and_traced_graphs_use_torch(make_small, looks):
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     compiled = torch.compile(lambda x: detector.propose(x).classes, fullgraph=True, backend="eager")(canvas)
     traced = torch.jit.trace(lambda x: detector.propose(x).classes, canvas, check_trace=False)(canvas)
     assert not looks
     for classes in (compiled, traced):
-        torch.testing.assert_close(classes, make("torch").propose(canvas).classes)
+        torch.testing.assert_close(classes, make_small("torch").propose(canvas).classes)
 
 
-def test_networks_of_other_precision_use_torch(make, looks):
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+def test_networks_of_other_precision_use_torch(make_small, looks):
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     exact = detector.double().propose(canvas)
     assert exact.boxes.dtype == torch.float64
     assert detector.settings()["runtime"] == "torch"
@@ -129,20 +117,20 @@ def test_networks_of_other_precision_use_torch(make, looks):
     torch.testing.assert_close(found.classes.double(), exact.classes, atol=1e-5, rtol=0)
 
 
-def test_other_devices_and_tensor_subclasses_use_torch(make, looks):
+def test_other_devices_and_tensor_subclasses_use_torch(make_small, looks):
     class Marked(torch.Tensor):
         pass
 
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     marked = detector.propose(canvas.as_subclass(Marked)).classes
-    torch.testing.assert_close(marked.as_subclass(torch.Tensor), make("torch").propose(canvas).classes)
+    torch.testing.assert_close(marked.as_subclass(torch.Tensor), make_small("torch").propose(canvas).classes)
     assert detector.to("meta").propose(canvas.to("meta")).boxes.is_meta
     assert detector.settings()["runtime"] == "torch"
     assert not looks
 
 
-def test_changed_weights_use_torch(make, looks):
-    detector, network, canvas = make(), make("torch"), canvases(1, 3, 32, 64)
+def test_changed_weights_use_torch(make_small, looks):
+    detector, network, canvas = make_small("auto"), make_small("torch"), canvases(1, 3, 32, 64)
     before = detector.propose(canvas).classes
     kept = copy.deepcopy(detector.state_dict())
     with torch.no_grad():
@@ -158,39 +146,36 @@ def test_changed_weights_use_torch(make, looks):
     assert len(looks) == 3
 
 
-def test_runtime_onnxruntime_refuses_what_it_does_not_support(make):
+def test_runtime_onnxruntime_refuses_what_it_does_not_support(make_small):
     canvas = canvases(1, 3, 32, 64)
     with pytest.raises(InputError, match="runtime: expected 'auto' or 'torch' or 'onnxruntime', got 'onnx'"):
-        make("onnx")
+        make_small("onnx")
     with pytest.raises(InputError, match="runtime: expected 'auto' or 'torch' for gradients, got 'onnxruntime'"):
-        make("onnxruntime").propose(canvas.clone().requires_grad_())
+        make_small("onnxruntime").propose(canvas.clone().requires_grad_())
     with pytest.raises(InputError, match=r"'torch' for a network of torch.float64, got"):
-        make("onnxruntime", dtype=torch.float64).propose(canvas)
+        make_small("onnxruntime", dtype=torch.float64).propose(canvas)
     with pytest.raises(InputError, match="'torch' for a canvas on meta, got"):
-        make("onnxruntime").propose(canvas.to("meta"))
-    detector = make("onnxruntime")
+        make_small("onnxruntime").propose(canvas.to("meta"))
+    detector = make_small("onnxruntime")
+    for size in ((3, 32, 60), (1, 32, 64)):
+        with pytest.raises(InputError, match="image: expected"):
+            detector.propose(torch.zeros(1, *size))
     detector.network.layers[0].weight.mul_(2)
     with pytest.raises(InputError, match="'torch' for weights that were changed after loading, got"):
         detector.propose(canvas)
 
 
-@pytest.mark.parametrize("size", [(3, 32, 60), (1, 32, 64)])
-def test_refuses_images_of_unsuitable_size(make, size):
-    with pytest.raises(InputError, match="image: expected"):
-        make().propose(torch.zeros(1, *size))
-
-
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda detector: pickle.loads(pickle.dumps(detector))])
-def test_copies_give_the_same_outputs(make, looks, duplicate):
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+def test_copies_give_the_same_outputs(make_small, looks, duplicate):
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     classes = detector.propose(canvas).classes
     assert torch.equal(duplicate(detector).propose(canvas).classes, classes)
     assert len(looks) == 2
 
 
-def test_outputs_do_not_depend_on_the_number_of_threads_or_the_batch(make, threads):
+def test_outputs_do_not_depend_on_the_number_of_threads_or_the_batch(make_small, threads):
     canvas = canvases(3, 3, 64, 64)
-    detector = make()
+    detector = make_small("auto")
     one, two = [detector.propose(canvas) for _ in threads()]
     assert torch.equal(one.classes, two.classes)
     alone = detector.propose(canvas[1:2])
@@ -198,8 +183,8 @@ def test_outputs_do_not_depend_on_the_number_of_threads_or_the_batch(make, threa
     assert torch.equal(alone.boxes[0], one.boxes[1])
 
 
-def test_another_number_of_threads_or_process_opens_a_new_session(make, threads, monkeypatch):
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+def test_another_number_of_threads_or_process_opens_a_new_session(make_small, threads, monkeypatch):
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     for number in threads():
         detector.propose(canvas)
         session = detector._twin._opened[1]
@@ -213,8 +198,8 @@ def test_another_number_of_threads_or_process_opens_a_new_session(make, threads,
 
 
 @pytest.mark.parametrize("damage", [b"", b"half", None])
-def test_a_damaged_export_is_replaced(make, folder, damage):
-    network = make("torch").network
+def test_a_damaged_export_is_replaced(make_small, folder, damage):
+    network = make_small("torch").network
     path = exported(network, folder)
     whole = path.read_bytes()
     content = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:] if damage is None else damage
@@ -224,40 +209,41 @@ def test_a_damaged_export_is_replaced(make, folder, damage):
     assert os.listdir(folder) == [path.name]
 
 
-def test_every_network_and_version_has_its_own_export(make, folder, monkeypatch):
-    network = make("torch").network
+def test_every_network_and_version_has_its_own_export(make_small, folder, monkeypatch):
+    network = make_small("torch").network
     path = exported(network, folder)
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
     assert exported(network, folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.export_graph.VERSION", VERSION + 1)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", VERSION + 1)
     assert exported(network, folder) != path
+    assert network_digest(copy.deepcopy(network).double()) == network_digest(network)
     with torch.no_grad():
         network.layers[0].weight.mul_(2)
     assert exported(network, folder) != path
     assert len(os.listdir(folder)) == 3
 
 
-def test_onnxruntime_works_without_a_writable_cache(make, folder, looks):
+def test_onnxruntime_works_without_a_writable_cache(make_small, folder, looks):
     folder.write_text("a file where the folder should be")
     canvas = canvases(1, 3, 32, 64)
-    same_as(make("torch"), canvas, make().propose(canvas), 64)
+    same_as(make_small("torch"), canvas, make_small("auto").propose(canvas), 64)
     assert len(looks) == 1
 
 
-def test_only_the_first_call_needs_the_package_onnx(make, folder, monkeypatch):
+def test_only_the_first_call_needs_the_package_onnx(make_small, folder, monkeypatch):
     canvas = canvases(1, 3, 32, 64)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "onnx", None)
         with pytest.raises(ModuleNotFoundError, match="pip install onnx"):
-            make().propose(canvas)
-    found = make().propose(canvas)
+            make_small("auto").propose(canvas)
+    found = make_small("auto").propose(canvas)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    assert torch.equal(make().propose(canvas).classes, found.classes)
+    assert torch.equal(make_small("auto").propose(canvas).classes, found.classes)
 
 
-def test_exporting_does_not_change_random_state_or_depend_on_default_dtype(make, folder):
-    detector, canvas = make(), canvases(1, 3, 32, 64)
+def test_exporting_does_not_change_random_state_or_depend_on_default_dtype(make_small, folder):
+    detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     torch.manual_seed(3)
     before = torch.get_rng_state()
     detector.propose(canvas)
@@ -281,34 +267,26 @@ print(hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobyt
 
 
 @pytest.mark.slow
-def test_processes_can_export_at_the_same_time(small_cfg, write_weights, make, tmp_path):
+def test_processes_can_export_at_the_same_time(small_cfg, small_weights, make_small, tmp_path):
     environment = {**os.environ, "SEMFOV_CACHE": str(tmp_path / "cold"), "PYTHONWARNINGS": "error"}
-    call = [sys.executable, "-c", LOOK, str(small_cfg), str(write_weights())]
+    call = [sys.executable, "-c", LOOK, str(small_cfg), str(small_weights)]
 
     def run(_):
         return subprocess.run(call, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
     with ThreadPoolExecutor(2) as pool:
         digests = set(pool.map(run, range(2)))
-    found = make().propose(canvases(1, 3, 64, 64))
+    found = make_small("auto").propose(canvases(1, 3, 64, 64))
     ours = hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobytes()).hexdigest()
     assert digests == {ours}
     assert len(os.listdir(tmp_path / "cold" / "exported")) == 1
 
 
-def test_the_digest_depends_on_the_weights_but_not_on_the_dtype(make):
-    network = make("torch").network
-    before = network_digest(network)
-    assert network_digest(copy.deepcopy(network).double()) == before
-    network.layers[0].bias.data[0] += 1
-    assert network_digest(network) != before
-
-
-def test_a_change_of_the_graph_needs_a_new_version(make):
+def test_a_change_of_the_graph_needs_a_new_version(make_small):
     """If the graph changes, increase VERSION and update the digest here."""
     from onnx.helper import get_attribute_value
 
-    graph = network_model(make("torch").network, "darknet").graph
+    graph = network_model(make_small("torch").network, "darknet").graph
     nodes = "\n".join(
         f"{node.op_type} {[*node.input]} {[*node.output]} {[(a.name, get_attribute_value(a)) for a in node.attribute]}"
         for node in graph.node

@@ -1,8 +1,0 @@
-"""`python -m eval.words`."""
-
-import sys
-
-from eval.words import main
-
-if __name__ == "__main__":
-    sys.exit(main())
