@@ -29,12 +29,12 @@ from semfov.gaze.choice import select_fixation
 from semfov.gaze.policies import KL, Predictive
 from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.observation.matching import box_iou
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
-from semfov.runs.remembered import look_everywhere
 from semfov.runs.saliency_store import open_at_reference
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
+from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor
 from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
 from semfov.viz.drawing import (
@@ -345,10 +345,7 @@ FIGURES: dict[str, Callable[[Example], Figure | None]] = {
 """The figures by their labels in the source of the paper."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(figures, FiguresConfig, __doc__, arguments)
-
+main = command(figures, FiguresConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

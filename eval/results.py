@@ -13,19 +13,18 @@ Detections are computed once and shared by all experiments. To continue a stoppe
 
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.config import CalibrationConfig
-from eval.calibration.evaluation import judge_beliefs
+from eval.calibration.evaluation import CalibrationConfig, judge_beliefs
 from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
-from eval.decide.config import DecideConfig
+from eval.decide.run import DecideConfig
 from eval.explore import explore
-from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreConfig
 from eval.page.curves import OBJECTS
 from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
@@ -46,10 +45,10 @@ from eval.page.tables import (
 )
 from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
 from eval.search import search
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from semfov.runs.presets import label
 from semfov.runs.workers import shared_processes
 
@@ -193,10 +192,7 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
 """Tables of one experiment."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(results, ResultsConfig, __doc__, arguments)
-
+main = command(results, ResultsConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

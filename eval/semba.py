@@ -9,7 +9,6 @@ vislab-tecnico-lisboa/SemBA). To continue a stopped run, give the same command a
 """
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,14 +22,14 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.files import write_text
 from semfov.metrics.bootstrap import Bootstrap
-from semfov.runs.command import run_command
-from semfov.runs.config import BeliefConfig, DetectorConfig, ProtocolConfig, ScenesConfig, SensorConfig
+from semfov.runs.command import command
+from semfov.runs.config import BeliefConfig, DetectorConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.remembered import RememberedLooks
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Share
+from semfov.runs.store import RememberedLooks
 from semfov.runs.tables import percent, table
 
 _RULES = ("kaplan", "semba")
@@ -38,7 +37,7 @@ _SHIFTS = (1, 3, 6)
 
 
 @dataclass(frozen=True)
-class SembaConfig(ScenesConfig):
+class SembaConfig(LookingConfig):
     """Search as SemBA does, with both rules of fusion.
 
     Args:
@@ -145,10 +144,7 @@ def search_scene(config: SembaConfig, run: Looking, index: int) -> list[Tensor]:
     return list(torch.stack(results, 1))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(search_as_semba, SembaConfig, __doc__, arguments)
-
+main = command(search_as_semba, SembaConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

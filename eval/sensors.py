@@ -11,23 +11,19 @@ give the same command again.
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.comparison.summary import Curve, collect_records
-from eval.explore.config import ExploreConfig
 from eval.explore.report import success
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.report import performance
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
@@ -40,14 +36,14 @@ from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.presence import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
-from semfov.runs.command import run_command
-from semfov.runs.config import DataConfig, ProtocolConfig, ScenesConfig, SensorConfig
+from semfov.runs.command import command
+from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
-from semfov.runs.setup import plain
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import percent, plus_minus, table
 
 
 class SensorChoice(NamedTuple):
@@ -84,7 +80,7 @@ _SCORE, _OVERLAP = 0.1, 0.5
 
 
 @dataclass(frozen=True)
-class SensorsConfig(ScenesConfig):
+class SensorsConfig(LookingConfig):
     """Compare sensors, each with models of its own.
 
     Args:
@@ -134,7 +130,7 @@ def compare_sensors(config: SensorsConfig) -> None:
     head += [f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS]
     text = "\n".join(table([head, *rows])) + "\n"
     write_text(config.out / "summary.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     print(text)
 
 
@@ -164,7 +160,7 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
         f"{pixels:,}",
         f"{1e3 * seconds:.0f}",
         *(percent(*_at(performances[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
-        *(f"{float(value):.3f} ± {float(error):.3f}" for value, error in zip(five.value, five.error, strict=True)),
+        *(plus_minus(float(value), float(error), 3) for value, error in zip(five.value, five.error, strict=True)),
         *(percent(*_at(map_curves[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
     ]
 
@@ -210,7 +206,7 @@ def _evidence(config: SensorsConfig, name: str) -> Path:
     return file
 
 
-def _curves(run: Run, name: str, measure: Any) -> dict[str, Curve]:
+def _curves(run: PolicyLooking, name: str, measure: Any) -> dict[str, Curve]:
     """Finish a run, and average its records."""
     finish(run, name)
     curves: dict[str, Curve] = measure(collect_records(run)[0])
@@ -291,10 +287,7 @@ def cost(eye: Eye, image: Tensor, looks: int = 12) -> tuple[int, float]:
         return len(canvases) * canvases.shape[-2] * canvases.shape[-1], min(seconds)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(compare_sensors, SensorsConfig, __doc__, arguments)
-
+main = command(compare_sensors, SensorsConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,6 +1,9 @@
 """Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
 import hashlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +13,10 @@ from semfov.belief import Belief, ContextPrior, DirichletBelief, MapEvidence, Ta
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
 from semfov.data.scene import Annotation, Scene
+from semfov.data.scenes import EmbeddedScenes
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import NonPredictive, Random
+from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 
 CLASSES = ("cat", "cup", "person")
 GRID = Grid(4, 3, (64, 48))
@@ -40,6 +45,26 @@ def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections
     boxes = torch.cat([corner, corner + 20 + torch.rand(cells, most, 2, generator=generator) * 150], -1)
     scores = (3 * torch.rand(cells, most, classes + 1, generator=generator)).softmax(-1)
     return Detections(boxes, scores, torch.rand(cells, most, generator=generator) < 0.6)
+
+
+def run_settings(folder: Path, scenes: int = 1, columns: int = 4, rows: int = 3, **protocol: int) -> dict[str, Any]:
+    """Settings of a small run on embedded scenes, which keeps everything in a folder."""
+    return {
+        "data": DataConfig(limit=scenes),
+        "belief": BeliefConfig(columns=columns, rows=rows),
+        "protocol": ProtocolConfig(**protocol),
+        "cache": folder / "cache",
+        "out": folder / "out",
+        "workers": 1,
+    }
+
+
+def looking(classes: tuple[str, ...], grid: Grid, count: int) -> SimpleNamespace:
+    """A stand-in for a run with stored looks at embedded scenes, whose detections are random."""
+    scenes = EmbeddedScenes(classes, count=count)
+    return SimpleNamespace(
+        scenes=scenes, grid=lambda index: grid, detections=lambda index: scattered(index, grid, len(classes))
+    )
 
 
 def values_of(acquisition: nn.Module, beta: Tensor) -> Tensor:

@@ -14,16 +14,11 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.observation import FitObservationConfig, fit_fom
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_fom, FitObservationConfig, __doc__, arguments)
-
+main = command(fit_fom, FitObservationConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

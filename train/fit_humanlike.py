@@ -12,16 +12,11 @@ draws fixations from the model.
 """
 
 import sys
-from collections.abc import Sequence
 
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from train.humanlike.fit import FitHumanlikeConfig, fit_humanlike
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_humanlike, FitHumanlikeConfig, __doc__, arguments)
-
+main = command(fit_humanlike, FitHumanlikeConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

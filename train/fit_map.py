@@ -13,16 +13,11 @@ Use it with `python -m eval.explore --policies [learned-map] --belief.map_model 
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.map import FitMapConfig, fit_map
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_map, FitMapConfig, __doc__, arguments)
-
+main = command(fit_map, FitMapConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -14,16 +14,11 @@ Use the model with `--policies [target-evidence] --belief.target_model runs/fit_
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.evidence import FitSearchConfig, fit_search
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_search, FitSearchConfig, __doc__, arguments)
-
+main = command(fit_search, FitSearchConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

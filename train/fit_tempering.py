@@ -13,16 +13,11 @@ Use the best exponent with `--belief.tempering τ`, or as the `tempering` of one
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.tempering import FitTemperingConfig, fit_tempering
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_tempering, FitTemperingConfig, __doc__, arguments)
-
+main = command(fit_tempering, FitTemperingConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

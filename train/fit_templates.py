@@ -12,16 +12,11 @@ Use the model with `--policies [ivsn] --templates runs/fit_templates/<name>.safe
 """
 
 import sys
-from collections.abc import Sequence
 
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from train.templates import FitTemplatesConfig, fit_templates
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_templates, FitTemplatesConfig, __doc__, arguments)
-
+main = command(fit_templates, FitTemplatesConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,16 +13,11 @@ looks are stored, photograph by photograph, in the folder `cache`: the same comm
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.verification import FitVerificationConfig, fit_verification
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_verification, FitVerificationConfig, __doc__, arguments)
-
+main = command(fit_verification, FitVerificationConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

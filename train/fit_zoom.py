@@ -12,16 +12,11 @@ continue.
 """
 
 import sys
-from collections.abc import Sequence
 
 from semfov.fit.windows import FitZoomConfig, fit_zoom
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(fit_zoom, FitZoomConfig, __doc__, arguments)
-
+main = command(fit_zoom, FitZoomConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -16,27 +16,23 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detector import Detector
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
-from semfov.fit.settings import NameConfig
+from semfov.fit.settings import FitConfig
 from semfov.gaze.templates import ClassTemplates, at_points, unit
-from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker
 from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
-class FitTemplatesConfig(NameConfig):
+class FitTemplatesConfig(FitConfig):
     """Average a detector's features over the objects of each class.
 
     Args:
-        data: photographs to learn from (by default all of them, however many objects they have).
         detector: the detector that computes the features (one of the YOLOv3 family).
         holdout: one in every n photographs is held out for the evaluation.
-        out: folder for the model and the report.
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    unused = ("sensor", "seed", "cache", "workers", "scheduler")
     holdout: Annotated[int, Range(2, 10**9)] = 10
     out: Path = Path("runs/fit_templates")
 

@@ -12,13 +12,7 @@ and by distance from the closest fixation. The beliefs use raw scores, calibrate
 and learned evidence. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
-from collections.abc import Sequence
+from eval.calibration.evaluation import CalibrationConfig, judge_calibration
+from semfov.runs.command import command
 
-from eval.calibration.config import CalibrationConfig
-from eval.calibration.evaluation import judge_calibration
-from semfov.runs.command import run_command
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(judge_calibration, CalibrationConfig, __doc__, arguments)
+main = command(judge_calibration, CalibrationConfig, __doc__)

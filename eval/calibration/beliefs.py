@@ -5,32 +5,30 @@ All beliefs are updated with the looks of the same searches.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.decide.run import detected_on_landing, landing
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.episode import Step, Stopwatch, rollout
 from semfov.errors import InputError
-from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import choose_classes
-from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_map_evidence, make_target_evidence
+from semfov.runs.search_protocol import DrawnSearch, choose_searches
+from semfov.runs.setup import Learned, make_learned
 
 COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""
@@ -55,10 +53,8 @@ ALL_CLASSES = {
 
 LEARNED, MAP = "learned", "learned map"
 
-_Model = TypeVar("_Model")
 
-
-class BeliefCalibrationRun(Run):
+class BeliefCalibrationRun(PolicyLooking):
     """Two searches in every scene, for a present class and for an absent class, that do not stop at the target.
 
     The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief
@@ -79,8 +75,8 @@ class BeliefCalibrationRun(Run):
         super().__init__(replace(config, policies=tuple(ALL_CLASSES.values())))
         self.left_out: dict[str, str] = {}
         belief = self.config.belief
-        evidence = self._if_shipped(LEARNED, make_target_evidence, belief.target_model)
-        evidence_map = self._if_shipped(MAP, make_map_evidence, belief.map_model)
+        evidence = self._if_shipped(LEARNED, TargetEvidence, belief.target_model)
+        evidence_map = self._if_shipped(MAP, MapEvidence, belief.map_model)
         self.models = replace(self.models, evidence=evidence, map=evidence_map)
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
@@ -90,10 +86,10 @@ class BeliefCalibrationRun(Run):
         if evidence_map is not None:
             self.observers[MAP] = LearnedMap(evidence_map)
 
-    def _if_shipped(self, name: str, make: Callable[[str | None, Eye], _Model], model: str | None) -> _Model | None:
+    def _if_shipped(self, name: str, kind: type[Learned], model: str | None) -> Learned | None:
         """Load the model that the settings name, or else the shipped model; None where none is shipped."""
         try:
-            return make(model, self.eye)
+            return make_learned(kind, model, self.eye)
         except InputError as error:
             if model is not None:
                 raise
@@ -111,35 +107,31 @@ class BeliefCalibrationRun(Run):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run both searches of a scene; returns their records, and the seconds that each stage took."""
-        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
-        watch = Stopwatch()
+        watch, grid = Stopwatch(), self.grid(index)
         area = self.config.data.max_target_area or 1.0
-        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
-        if not classes:
+        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
+        if not searches:
             return [], watch.seconds
-        covered = grid.footprint(annotation.boxes)
         detections = self.detections(index)
         watch.lap("look")
         records: list[ResultRecord] = []
-        for target in classes:
-            scene = self.scenes.ids[index]
-            start = torch.randint(len(grid), (1,), generator=generator_for("start", protocol.seed, scene, target))
-            noise = noise_for(protocol, len(grid), scene, target, 0)[None]
-            goal = covered[annotation.labels == target].any(0)
+        for search in searches:
             with torch.inference_mode():
-                looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, target)
-                search = self._search(target, start, noise, goal, looks)
-            records.append({"scene": scene, "target": target, "present": bool(goal.any()), **search})
+                looks = CellLooks(lambda cell: detections[cell : cell + 1], grid, detections.scores, search.target)
+                beliefs = self._search(search, looks)
+            common = {"scene": self.scenes.ids[index], "target": search.target, "present": search.present}
+            records.append({**common, **beliefs})
         watch.lap("believe")
         return records, watch.seconds
 
-    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: CellLooks) -> ResultRecord:
+    def _search(self, search: DrawnSearch, looks: CellLooks) -> ResultRecord:
+        target, goal = search.target, search.goal
         most = min(self.config.protocol.shifts + 1, COUNTS[-1])
 
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
-            return list(rollout(looks, self.observers[name], acquisition, start, choice, most=most))
+            return list(rollout(looks, self.observers[name], acquisition, search.start, choice, most=most))
 
-        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(noise)))
+        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(search.noise)))
         path = torch.cat([step.cell for step in led])
         beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:

@@ -1,25 +1,63 @@
 """How well scores, and beliefs about a target, agree with the annotated objects."""
 
-from dataclasses import asdict, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
-import yaml
 
 import semfov
 from eval.calibration.beliefs import COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import write_belief_report
-from eval.calibration.config import CalibrationConfig
 from eval.comparison.summary import announce
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
-from semfov.runs.config import BeliefConfig, ProtocolConfig
+from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig, SensorConfig, WorkConfig
 from semfov.runs.samples import Samples, SampleSettings, collect_samples
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import make_observation, plain
+from semfov.runs.settings import Count, Seed, Share, Side
+from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
+
+
+@dataclass(frozen=True)
+class CalibrationConfig(WorkConfig):
+    """Evaluate how well scores, and beliefs about a target, agree with the annotated objects.
+
+    Args:
+        data: photographs to evaluate on, by default all of them.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        model: fitted observation model, by name or file (None: the one shipped for the detector and sensor).
+        fixations: number of random fixations in each photograph.
+        iou: smallest intersection over union at which a detection matches an object.
+        seed: random seed of the fixations and of the searches.
+        beliefs: evaluate beliefs, too, for which every cell of every photograph is fixated once.
+        grid: `[columns, rows]` of the grid of the beliefs.
+        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
+        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        target_area: a class is searched for only if its boxes cover at most this share of the image.
+        out: folder for the tables and the figures.
+        cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the
+            former, the user's cache for the latter).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    model: str | None = None
+    fixations: Count = 6
+    iou: Share = 0.5
+    seed: Seed = 0
+    beliefs: bool = True
+    grid: tuple[Side, Side] = (10, 10)
+    target_model: str | None = None
+    map_model: str | None = None
+    target_area: Share = 0.2
+    out: Path = Path("runs/calibration")
 
 
 def judge_calibration(config: CalibrationConfig) -> None:
@@ -40,7 +78,7 @@ def judge_scores(config: CalibrationConfig) -> None:
     predictions = {"raw": samples.scores, "calibrated": calibrated}
     text = "\n".join(calibration_table(model, predictions, samples)) + "\n"
     write_text(config.out / "calibration.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     figure = plot_reliability({name: (p, samples.labels) for name, p in predictions.items()})
     written = [config.out / "calibration.md", config.out / "config.yaml"]
     announce(text, [*written, save_figure(figure, config.out / "reliability.png")])

@@ -1,20 +1,21 @@
 """Replays recorded episodes, with the detections and the belief at each fixation."""
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 
-from eval.comparison.run import Run
+from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
-from semfov.errors import InputError
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import make_map_evidence
+from semfov.runs.setup import if_shipped, make_learned
 
 
-def replay(run: Run, index: int, record: ResultRecord) -> Scanpath:
+def replay(run: PolicyLooking, index: int, record: ResultRecord) -> Scanpath:
     """Replay a recorded episode.
 
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
@@ -43,16 +44,10 @@ def replay(run: Run, index: int, record: ResultRecord) -> Scanpath:
     )
     beside: Observer | None = None
     if not isinstance(candidate.observer, Semantic | LearnedMap):
-        beside = _map_beside(run)
+        model = if_shipped(partial(make_learned, MapEvidence), run.config.belief.map_model, run.eye)
+        beside = Semantic(len(run.scenes.classes) + 1, tempering=0.5) if model is None else LearnedMap(model)
     with torch.no_grad():
         scanpath = trace(steps, grid, ("background", *run.scenes.classes), cue, beside)
     found = record.get("found_at", -1) >= 0
     # The time to read the store is not the duration of the episode.
     return replace(scanpath, target=record.get("target"), found=found, seconds=())
-
-
-def _map_beside(run: Run) -> Observer:
-    try:
-        return LearnedMap(make_map_evidence(run.config.belief.map_model, run.eye))
-    except InputError:
-        return Semantic(len(run.scenes.classes) + 1, tempering=0.5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import yaml
 
 from eval.comparison.curves_html import curves_html
 from eval.comparison.replay import replay
-from eval.comparison.run import Run
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
 from semfov.paths import Stimulus
@@ -21,15 +19,15 @@ from semfov.report.episode import Data, episode_data
 from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import plain
 
 MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""
 
 
 def write_run_report(
-    run: Run,
+    run: PolicyLooking,
     records: list[ResultRecord],
     curves: Mapping[str, dict[str, Curve]],
     *,
@@ -67,7 +65,7 @@ def write_run_report(
         title = escape(titles[average])
         sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
         sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
-    values = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
+    values = {name: value for name, value in run.config.plain().items() if name not in WHERE}
     settings = escape(yaml.safe_dump(values, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
     data = _episodes(run, choose_episodes(records, list(run.policies), episodes))
@@ -101,7 +99,7 @@ def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count:
     return chosen
 
 
-def _episodes(run: Run, records: Sequence[ResultRecord]) -> list[Data]:
+def _episodes(run: PolicyLooking, records: Sequence[ResultRecord]) -> list[Data]:
     data, size, settings, pictures = [], 0, run.eye.settings(), set[str]()
     for record in records:
         if sum(map(len, pictures)) + size > MOST_BYTES:

@@ -5,23 +5,22 @@ import platform
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-import yaml
 
-from eval.comparison.run import Run
 from semfov.io.code import commit
 from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import FloatArray, standard_error
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
-from semfov.runs.setup import observation_name, plain
+from semfov.runs.setup import observation_name
 from semfov.runs.tables import csv_text, percent
 from semfov.version import __version__
 
@@ -59,7 +58,7 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
     return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(rows))
 
 
-def collect_records(run: Run) -> tuple[list[ResultRecord], dict[str, float]]:
+def collect_records(run: PolicyLooking) -> tuple[list[ResultRecord], dict[str, float]]:
     """Records of all scenes, sorted by policy, and the seconds that each stage took."""
     records, seconds = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
@@ -103,7 +102,7 @@ def json_lines(records: Iterable[ResultRecord]) -> str:
 
 
 def write_files(
-    run: Run,
+    run: PolicyLooking,
     program: str,
     tables: dict[str, str],
     records: list[ResultRecord],
@@ -113,7 +112,7 @@ def write_files(
     files = {
         **tables,
         "episodes.jsonl": json_lines(records),
-        "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
+        "config.yaml": run.config.yaml(),
         MANIFEST: manifest(run, program, seconds),
     }
     return write_texts(run.config.out, files)
@@ -160,7 +159,7 @@ MANIFEST = "manifest.json"
 """Name of the file that says where the results of a run come from; it is written when the run has ended."""
 
 
-def manifest(run: Run, program: str, seconds: dict[str, float]) -> str:
+def manifest(run: PolicyLooking, program: str, seconds: dict[str, float]) -> str:
     """Provenance of the results as JSON: commit, day, versions, checksums, seed, and the time of each stage."""
     record = {
         "command": ["python", "-m", program, *sys.argv[1:]],
@@ -187,7 +186,7 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> str:
     return json.dumps(record, indent=2) + "\n"
 
 
-def sensing(run: Run) -> str:
+def sensing(run: PolicyLooking) -> str:
     """Detector, sensor and observation model of a run, as text for titles."""
     sensor, model, seeing = run.config.sensor, run.config.belief.model, run.eye.sensor
     what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"

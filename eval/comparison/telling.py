@@ -11,7 +11,7 @@ from semfov.data.scene import Scenes
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.calibration import calibration_error, errors_by_chance
 from semfov.metrics.presence import area_under_roc, hits_at
-from semfov.runs.tables import table
+from semfov.runs.tables import plus_minus, table
 
 SHARES = (0.01, 0.02, 0.05)
 """False alarm rates at which the tables give the hit rate."""
@@ -80,7 +80,7 @@ class Telling:
         low, high = self.figures.interval()
         return [
             [
-                f"{value[0]:.3f} ± {error[0]:.3f}" if value[0].isfinite() else "-",
+                plus_minus(float(value[0]), float(error[0]), 3) if value[0].isfinite() else "-",
                 *(spanned(*span) for span in zip(value[1:-1], least[1:-1], most[1:-1], strict=True)),
             ]
             for value, error, least, most in zip(self.figures.value, self.figures.error, low, high, strict=True)
@@ -101,7 +101,7 @@ class Telling:
             if other == name:
                 continue
             value, error = apart.value[way], apart.error[way]
-            area = f"{value[0]:+.3f} ± {error[0]:.3f}" if value[0].isfinite() else "-"
+            area = plus_minus(float(value[0]), float(error[0]), 3, sign="+") if value[0].isfinite() else "-"
             spans = zip(value[1:], low[way, 1:], high[way, 1:], [0] * len(SHARES) + [1], strict=True)
             cells = [spanned(middle, least, most, digits=digits, sign="+") for middle, least, most, digits in spans]
             rows.append([other, area, *cells[: len(heads) - 1]])

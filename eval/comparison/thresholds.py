@@ -13,7 +13,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.eye import Eye, View
-from semfov.runs.config import ScenesConfig
+from semfov.runs.config import LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread, tight
 from semfov.runs.results import ResultRecord
@@ -81,7 +81,7 @@ class ThresholdEyes:
 
 
 @dataclass(frozen=True)
-class ThresholdLooksConfig(ScenesConfig):
+class ThresholdLooksConfig(LookingConfig):
     """Look at scenes from every cell, and store the looks for each of several score thresholds.
 
     Args:

@@ -9,16 +9,12 @@ belief by Kaplan's rule with the same thresholds and with the rule of the publis
 whole photograph. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
-from collections.abc import Sequence
-from dataclasses import fields
-
 from eval.comparison.model_folder import with_models
 from eval.comparison.summary import announce, sensing, write_files
-from eval.decide.config import DecideConfig, DecisionConfig
 from eval.decide.report import decision_summary, probabilities
-from eval.decide.run import DecisionRun
+from eval.decide.run import DecideConfig, DecisionRun
 from semfov.errors import DataError
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 from semfov.runs.scene_run import finish, gather
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
@@ -26,8 +22,7 @@ from semfov.viz.style import save_figure
 
 def search_and_decide(config: DecideConfig) -> None:
     """Run the searches, and write their tables, records and ROC curves."""
-    settings = {each.name: getattr(config, each.name) for each in fields(config)}
-    run = DecisionRun(with_models(DecisionConfig(**settings)))
+    run = DecisionRun(with_models(config))
     finish(run, "deciding")
     records, seconds = gather(run)
     if not records:
@@ -37,6 +32,4 @@ def search_and_decide(config: DecideConfig) -> None:
     announce(text, [*written, save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")])
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(search_and_decide, DecideConfig, __doc__, arguments)
+main = command(search_and_decide, DecideConfig, __doc__)

@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any, Self
 
 import torch
 from torch import Tensor
 
-from eval.comparison.run import Run
 from eval.comparison.telling import class_frequencies
-from eval.decide.config import DecisionConfig
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import CandidateCells, Verifier, conclude, confirms, decide
+from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks
-from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
-from semfov.observation.foveal import FovealObservationModel
+from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
+from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looks import BoxKey, photograph_looks
-from semfov.runs.remembered import RememberedLooks
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import choose_classes, search_steps
-from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_observation, make_verification
+from semfov.runs.search_protocol import choose_searches, search_steps
+from semfov.runs.settings import Range, Share
+from semfov.runs.setup import if_shipped, make_learned, make_observation
+from semfov.runs.store import RememberedLooks
 from semfov.strategy import Strategy
 
 _Rule = Callable[[Step, int, Grid], Tensor]
@@ -48,7 +48,44 @@ GAZE_SCORE = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
 
 
-class DecisionRun(Run):
+@dataclass(frozen=True)
+class DecideConfig(RunConfig):
+    """Search for present and for absent classes, each until a decision.
+
+    Args:
+        belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
+        protocol: the protocol; `shifts` and `seed` are used.
+        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
+            in the image for a search without closer looks (None: the model's own threshold).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (None: the model's own threshold).
+        place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
+            for a find (None: the model's own threshold).
+        closer: largest number of closer looks in a search; 0 decides without them.
+        verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
+            one that is shipped for detector and sensor, if there is one).
+        out: folder for tables, records and the figure.
+        models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
+            verification.
+    """
+
+    unused = ("saliency", "policies")
+    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
+    confirm: Share | None = None
+    give_up: Share | None = None
+    place: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
+    verification: str | None = None
+    out: Path = Path("runs/decide")
+
+    def complete(self, folder: ModelFolder) -> Self:
+        """The settings with the folder's model of verification, if its agent uses one and none is given explicitly."""
+        if self.verification is not None or not folder.used("verification"):
+            return self
+        return replace(self, verification=str(folder.file("verification")))
+
+
+class DecisionRun(PolicyLooking):
     """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
 
     The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
@@ -60,9 +97,9 @@ class DecisionRun(Run):
     """
 
     task: Task = "search"
-    config: DecisionConfig
+    config: DecideConfig
 
-    def __init__(self, config: DecisionConfig) -> None:
+    def __init__(self, config: DecideConfig) -> None:
         # The key of the run, which the base makes first, depends on this model.
         self.verification: Verification | None = None
         super().__init__(config)
@@ -72,7 +109,7 @@ class DecisionRun(Run):
         self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
         # The shipped model was fitted with the shipped evidence.
         if config.closer and (config.verification or config.belief.target_model is None):
-            self.verification = make_verification(config.verification, self.eye)
+            self.verification = if_shipped(partial(make_learned, Verification), config.verification, self.eye)
         self.verified = {AGENT, RANDOM} if self.verification is not None else set()
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
@@ -82,7 +119,7 @@ class DecisionRun(Run):
             **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
             RANDOM: (random, self._by_thresholds),
         }
-        model = self._published()
+        model = if_shipped(make_observation, config.belief.model, self.eye)
         if model is not None:
             self.models = replace(self.models, observation=model)
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
@@ -111,16 +148,6 @@ class DecisionRun(Run):
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
         )
 
-    def _published(self) -> FovealObservationModel | None:
-        """The observation model of the settings or of the eye; None if the settings name none and none is shipped."""
-        name = self.config.belief.model
-        try:
-            return make_observation(name, self.eye)
-        except InputError:
-            if name is not None:
-                raise
-            return None
-
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
@@ -129,13 +156,12 @@ class DecisionRun(Run):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
-        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
+        annotation, grid = self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
-        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
-        covered = grid.footprint(annotation.boxes)
+        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
         records: list[ResultRecord] = []
-        if not classes:
+        if not searches:
             return records, watch.seconds
         detections = self.detections(index)
         with torch.inference_mode():
@@ -146,15 +172,12 @@ class DecisionRun(Run):
         closer: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid)
         )
-        for target in classes:
-            goal = covered[annotation.labels == target].any(0)
-            start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
-            cell = torch.randint(len(grid), (1,), generator=start)
-            noise = noise_for(protocol, len(grid), self.scenes.ids[index], target, 0)[None]
+        for search in searches:
+            target, goal = search.target, search.goal
             common = {
                 "scene": self.scenes.ids[index],
                 "target": target,
-                "present": bool(goal.any()),
+                "present": search.present,
                 "sharp": float(highest_score(sharp, target)),
                 "frequency": float(self.frequencies[index][target]),
                 "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)),
@@ -168,7 +191,7 @@ class DecisionRun(Run):
 
                 verifier = self._verifier(closer, grid, target) if name in self.verified else None
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
+                    steps = search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
                         decision = verifier.conclude()

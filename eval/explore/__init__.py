@@ -8,13 +8,10 @@ Detections from every cell are stored and shared with `python -m eval.search`. T
 command again.
 """
 
-from collections.abc import Sequence
-
 from eval.comparison.model_folder import with_models
-from eval.explore.config import ExploreConfig
 from eval.explore.report import exploration_report
-from eval.explore.run import ExploreRun
-from semfov.runs.command import run_command
+from eval.explore.run import ExploreConfig, ExploreRun
+from semfov.runs.command import command
 from semfov.runs.scene_run import finish
 
 
@@ -25,6 +22,4 @@ def explore(config: ExploreConfig, *, pictures: bool = True) -> None:
     exploration_report(run, pictures=pictures)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(explore, ExploreConfig, __doc__, arguments)
+main = command(explore, ExploreConfig, __doc__)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
-from eval.comparison.run import Run
-from eval.explore.config import ExploreConfig
-from eval.explore.references import sharp_maps
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Semantic
+from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
+from semfov.runs.config import PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.exploration_protocol import (
     Exploration,
     Progress,
@@ -19,10 +25,74 @@ from semfov.runs.exploration_protocol import (
     explore_noise,
     run_explorations,
 )
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 
+FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
 
-class ExploreRun(Run):
+# Among 0.2, 0.3 and 0.4, the score that named most cells right on the fit set, with background as an answer.
+_SURE = 0.2
+
+
+def sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
+    """Maps of what is where from one sharp look at the whole picture.
+
+    - fused: scores are used as likelihoods and fused by Kaplan's rule from a uniform prior, as published.
+    - boxes: every cell gets the scores of the boxes that overlap it, class by class the highest; its answer is
+      background where no score is higher than 0.2.
+
+    Args:
+        sharp: detections in the sharp picture, a batch of one.
+        grid: the grid over the picture.
+
+    Returns:
+        Maps `(1, X·Y, K+1)` by their names in tables.
+    """
+    observer = Semantic(sharp.scores.shape[-1])
+    middle = grid.centres.to(sharp.scores).mean(0, keepdim=True)
+    fused = observer(observer.start(1, grid, sharp.scores), sharp, middle, grid)
+    cells = grid.footprint(sharp.boxes) & sharp.mask[..., None]
+    scores = sharp.scores[..., 1:] * sharp.mask[..., None]
+    each = cells[..., None] * scores[:, :, None]
+    highest = each.amax(1) if each.shape[1] else each.sum(1)
+    background = torch.full_like(highest[..., :1], _SURE)
+    return {FUSED: fused.class_probabilities(), PAINTED: torch.cat([background, highest], -1)}
+
+
+@dataclass(frozen=True)
+class ExploreConfig(RunConfig):
+    """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
+
+    Args:
+        policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
+            calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
+            (kl-calibrated); and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
+            `vocus2` or `itti-koch`, each followed by `-raw` or `-calibrated`. With the learned map: `random-learned`,
+            `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
+            `itti-koch-learned`.
+        out: folder for tables, figures, per-episode records and the manifest.
+    """
+
+    task: ClassVar[Task] = "exploration"
+    protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=20))
+    policies: tuple[str | PolicyConfig, ...] = (
+        "random-raw",
+        "kl-raw",
+        "negative-entropy-raw",
+        "two-peaks-raw",
+        "vocus2-raw",
+        "random-calibrated",
+        "kl-calibrated",
+        "negative-entropy-calibrated",
+        "two-peaks-calibrated",
+        "vocus2-calibrated",
+        "recommended",
+    )
+    out: Path = Path("runs/explore")
+
+
+class ExploreRun(PolicyLooking):
     """Scene exploration."""
 
     task: Task = "exploration"

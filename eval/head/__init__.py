@@ -11,13 +11,8 @@ give search results by seconds and by passes, and the success rate of exploratio
 same command again.
 """
 
-from collections.abc import Sequence
-
 from eval.head.report import head
 from eval.head.run import HeadConfig
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(head, HeadConfig, __doc__, arguments)
+main = command(head, HeadConfig, __doc__)

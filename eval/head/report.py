@@ -15,7 +15,7 @@ from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import percent, plus_minus, table
 from semfov.viz.style import line_style, save_figure
 
 _Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what
             lambda r: float(r["passes"]) if r["found"] else float(config.passes),
         ):
             mean, error, apart, error_apart = compared(group, ours, measure)
-            row += [f"{mean:.2f} ± {error:.2f}", "" if way == OURS else f"{apart:.2f} ± {error_apart:.2f}"]
+            row += [plus_minus(mean, error, 2), "" if way == OURS else plus_minus(apart, error_apart, 2)]
         rows.append(row)
     scenes = len({record["scene"] for record in ours})
     return [
@@ -112,7 +112,7 @@ def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, 
         for second in times:
             mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: value_by(r, s, "success"))  # type: ignore[misc]
             row.append(percent(mean, error))
-        row.append("" if way == OURS else f"{100 * apart:.1f} ± {100 * error_apart:.1f}")
+        row.append("" if way == OURS else plus_minus(100 * apart, 100 * error_apart))
         mean, error, *_ = compared(group, ours, lambda r: value_by(r, last, "objects"))
         looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
         rows.append([*row, percent(mean, error), f"{looks:.1f}"])

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
@@ -31,12 +32,11 @@ from semfov.head.world import Places, World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
-from semfov.runs.remembered import RememberedLooks
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
-from semfov.runs.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
-from semfov.runs.store import DetectionStore
+from semfov.runs.setup import make_eye, make_learned, make_scenes
+from semfov.runs.store import DetectionStore, RememberedLooks
 
 OURS = "ours"
 """Name of the method that the others are compared with."""
@@ -109,10 +109,8 @@ class HeadRun(SceneRun):
         check(0 < config.prior < 1, "prior", "a probability above 0 and below 1", config.prior)
         self.eye = make_eye(config.detector, SensorConfig())
         self.fovea = SensorConfig().fovea
-        self.target_evidence, self.map_evidence = (
-            make_target_evidence(None, self.eye),
-            make_map_evidence(None, self.eye),
-        )
+        self.target_evidence = make_learned(TargetEvidence, None, self.eye)
+        self.map_evidence = make_learned(MapEvidence, None, self.eye)
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
             raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")

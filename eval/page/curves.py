@@ -13,6 +13,7 @@ from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
 from semfov.runs.results import ResultRecord
+from semfov.runs.tables import plus_minus
 
 OBJECTS = "right_without_background"
 
@@ -68,7 +69,7 @@ def difference(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArr
 
 def points(mean: FloatArray, error: FloatArray, shifts: Sequence[int]) -> list[str]:
     """Differences after these gaze shifts, in percentage points, with their standard errors."""
-    return [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
+    return [plus_minus(100 * mean[n], 100 * error[n], sign="+") for n in shifts]
 
 
 def behind(mean: FloatArray, error: FloatArray) -> list[int]:

@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.config import CalibrationConfig
+from eval.calibration.evaluation import CalibrationConfig
 from eval.comparison.thresholds import ThresholdLooksConfig
-from eval.decide.config import DecideConfig
-from eval.explore.config import ExploreConfig
-from eval.search.config import SearchConfig
+from eval.decide.run import DecideConfig
+from eval.explore.run import ExploreConfig
+from eval.search.run import SearchConfig
 from semfov.runs.config import (
     BeliefConfig,
     DataConfig,

@@ -1,5 +1,8 @@
 """The paper's findings, and whether they hold here: sizes and verdicts by detector, fovea and measure."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +12,6 @@ from eval.page import paper
 from eval.page.curves import OBJECTS, behind, corrected_signs, paired_difference, points, spans
 from eval.page.experiments import DETECTORS
 from eval.page.tables import Runs, published_columns
-from eval.page.verdicts import Answer, gain_verdict, overtaken_verdict
 from semfov.metrics.averages import FloatArray
 from semfov.runs.tables import table
 
@@ -17,6 +19,91 @@ LAST = {"search": 30, "explore": 20}
 
 NO_DETECTOR = ("random", "vocus2")
 """Policies that use no detector."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a run to a finding.
+
+    Attributes:
+        sizes: sizes of the difference, or the gaze shifts at which it is found.
+        verdict: one of `VERDICTS`.
+    """
+
+    sizes: str
+    verdict: str
+
+    def __str__(self) -> str:
+        return f"{self.sizes}: {self.verdict}"
+
+
+VERDICTS = {
+    "holds": "every difference is as the finding says, or the policy is first ahead and later behind",
+    "holds in part": "some differences have the sign, and none the opposite one",
+    "not overtaken": "ahead at some shifts, and behind at none",
+    "level": "every difference is within two standard errors of zero",
+    "open": "some difference is beyond two standard errors, and none stands the correction",
+    "differs": "the finding is that there is no difference, and there is one",
+    "reversed in part": "some differences have the opposite sign, and none that of the finding",
+    "reversed": "every difference has the opposite sign, or behind from the first and never ahead",
+    "mixed": "both signs, in another order than the finding has them",
+}
+"""Verdicts and their meanings; signs are corrected for all differences that are shown."""
+
+
+def gain_verdict(signs: set[int], expected: int, within: bool) -> str:
+    """The verdict on a finding about differences.
+
+    Args:
+        signs: the signs of the differences; 0 for a difference that the correction does not tell from zero.
+        expected: the sign that the finding claims.
+        within: whether every difference is within two standard errors of zero.
+
+    Returns:
+        The verdict.
+
+    >>> [gain_verdict(signs, 1, False) for signs in ({1}, {1, 0}, {-1}, {-1, 0}, {1, -1}, {0})]
+    ['holds', 'holds in part', 'reversed', 'reversed in part', 'mixed', 'open']
+    >>> gain_verdict({0}, 1, True), gain_verdict({0}, 0, True), gain_verdict({1, 0}, 0, False)
+    ('level', 'holds', 'differs')
+    """
+    if signs == {0}:
+        return "open" if not within else "level" if expected else "holds"
+    if not expected:
+        return "differs"
+    words = {frozenset({1}): "holds", frozenset({1, 0}): "holds in part"}
+    words |= {frozenset({-1}): "reversed", frozenset({-1, 0}): "reversed in part"}
+    return words.get(frozenset(signs), "mixed")
+
+
+def overtaken_verdict(leads: Sequence[int], trails: Sequence[int], within: bool) -> str:
+    """The verdict on a finding about who leads at first.
+
+    Args:
+        leads: gaze shifts at which the policy is ahead.
+        trails: gaze shifts at which it is behind.
+        within: whether it is within two standard errors at all shifts.
+
+    Returns:
+        The verdict.
+
+    >>> overtaken_verdict([1, 2], [9], False), overtaken_verdict([1], [], False), overtaken_verdict([], [4], False)
+    ('holds', 'not overtaken', 'reversed')
+    >>> overtaken_verdict([], [], True), overtaken_verdict([5], [2], False)
+    ('level', 'mixed')
+    """
+    if not leads and not trails:
+        return "level" if within else "open"
+    if not trails:
+        return "not overtaken"
+    if not leads:
+        return "reversed"
+    return "holds" if leads[-1] < trails[0] else "mixed"
+
+
+def legend(used: Iterable[str]) -> list[str]:
+    """Verdicts and their meanings, in the order of `VERDICTS`."""
+    return table([["verdict", "meaning"], *([word, VERDICTS[word]] for word in VERDICTS if word in set(used))])
 
 
 @dataclass(frozen=True)
@@ -133,96 +220,45 @@ class Finding:
 
 SEARCH, EXPLORE = paper.TABLE_SHIFTS, (1, 5, 15)
 
+_CALIBRATED = "calibrated less raw at 5 / 15 / 30 shifts"
+
 TESTED = (
-    Finding(
-        "Calibration is considerably beneficial for non-predictive search.",
-        "search",
-        "calibrated less raw at 5 / 15 / 30 shifts",
-        Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH),
-    ),
-    Finding(
-        "Calibration does not influence predictive search.",
-        "search",
-        "calibrated less raw at 5 / 15 / 30 shifts",
-        Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0),
-    ),
-    Finding(
-        "Predictive search comfortably outperforms non-predictive search on raw scores",
-        "search",
-        "predictive less non-predictive at 5 / 15 / 30 shifts",
-        Advantage("predictive-raw", "non-predictive-raw", SEARCH),
-    ),
-    Finding(
-        "… and on calibrated scores.",
-        "search",
-        "the same",
-        Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH),
-    ),
-    Finding(
-        "Calibrated predictive search leads random gaze at first and is overtaken",
-        "search",
-        "gaze shifts",
-        Overtaken("predictive-calibrated", "random", "ahead to the 13th"),
-    ),
-    Finding(
-        "… calibrated non-predictive search too,",
-        "search",
-        "gaze shifts",
-        Overtaken("non-predictive-calibrated", "random", "ahead to the 10th"),
-    ),
-    Finding(
-        "… and raw non-predictive search.",
-        "search",
-        "gaze shifts",
-        Overtaken("non-predictive-raw", "random", "ahead initially"),
-    ),
-    Finding(
-        "KL divergence leads random gaze at first; random gaze overtakes it (calibrated).",
-        "explore",
-        "gaze shifts",
-        Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th"),
-    ),
-    Finding(
-        "The same with raw scores.",
-        "explore",
-        "gaze shifts",
-        Overtaken("kl-raw", "random-raw", "ahead to about the 4th"),
-    ),
-    Finding(
-        "Exploration has no particular advantage from calibration.",
-        "explore",
-        "KL, calibrated less raw at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0),
-    ),
-)
+    Finding("Calibration is considerably beneficial for non-predictive search.", "search", _CALIBRATED,
+            Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH)),
+    Finding("Calibration does not influence predictive search.", "search", _CALIBRATED,
+            Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0)),
+    Finding("Predictive search comfortably outperforms non-predictive search on raw scores", "search",
+            "predictive less non-predictive at 5 / 15 / 30 shifts",
+            Advantage("predictive-raw", "non-predictive-raw", SEARCH)),
+    Finding("… and on calibrated scores.", "search", "the same",
+            Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH)),
+    Finding("Calibrated predictive search leads random gaze at first and is overtaken", "search", "gaze shifts",
+            Overtaken("predictive-calibrated", "random", "ahead to the 13th")),
+    Finding("… calibrated non-predictive search too,", "search", "gaze shifts",
+            Overtaken("non-predictive-calibrated", "random", "ahead to the 10th")),
+    Finding("… and raw non-predictive search.", "search", "gaze shifts",
+            Overtaken("non-predictive-raw", "random", "ahead initially")),
+    Finding("KL divergence leads random gaze at first; random gaze overtakes it (calibrated).", "explore",
+            "gaze shifts", Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th")),
+    Finding("The same with raw scores.", "explore", "gaze shifts",
+            Overtaken("kl-raw", "random-raw", "ahead to about the 4th")),
+    Finding("Exploration has no particular advantage from calibration.", "explore",
+            "KL, calibrated less raw at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
+)  # fmt: skip
 """Findings that are tested at every score threshold."""
 
 BASELINES = (
-    Finding(
-        "VOCUS2 is far below random gaze in search.",
-        "search",
-        "random less VOCUS2 at 5 / 15 / 30 shifts",
-        Advantage("random", "vocus2", SEARCH),
-    ),
-    Finding(
-        "KL divergence consistently outperforms negative entropy (calibrated).",
-        "explore",
-        "KL less negative entropy at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE),
-    ),
-    Finding(
-        "KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
-        "explore",
-        "KL less two-peak at 1 / 2 / 4 shifts",
-        Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4)),
-    ),
-    Finding(
-        "KL divergence outperforms VOCUS2 in exploration (calibrated).",
-        "explore",
-        "KL less VOCUS2 at 1 / 5 / 15 shifts",
-        Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE),
-    ),
-)
+    Finding("VOCUS2 is far below random gaze in search.", "search", "random less VOCUS2 at 5 / 15 / 30 shifts",
+            Advantage("random", "vocus2", SEARCH)),
+    Finding("KL divergence consistently outperforms negative entropy (calibrated).", "explore",
+            "KL less negative entropy at 1 / 5 / 15 shifts",
+            Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE)),
+    Finding("KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
+            "explore", "KL less two-peak at 1 / 2 / 4 shifts",
+            Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4))),
+    Finding("KL divergence outperforms VOCUS2 in exploration (calibrated).", "explore",
+            "KL less VOCUS2 at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE)),
+)  # fmt: skip
 """Findings that are tested at the default threshold alone."""
 
 FINDINGS = (*TESTED[:7], *BASELINES, *TESTED[7:])

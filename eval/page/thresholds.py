@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 from eval.page.curves import points
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
-from eval.page.findings import COUNTED, EXPLORE, SEARCH, TESTED, Finding, Measure
+from eval.page.findings import COUNTED, EXPLORE, SEARCH, TESTED, VERDICTS, Answer, Finding, Measure, legend
 from eval.page.tables import Runs
-from eval.page.verdicts import VERDICTS, Answer, legend
 from semfov.metrics.averages import FloatArray
 from semfov.runs.tables import table
 

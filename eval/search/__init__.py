@@ -9,13 +9,10 @@ Without arguments it searches the embedded scenes, which need no data set. With 
 To continue a stopped run, give the same command again.
 """
 
-from collections.abc import Sequence
-
 from eval.comparison.model_folder import with_models
-from eval.search.config import SearchConfig
 from eval.search.report import search_report
-from eval.search.run import SearchRun
-from semfov.runs.command import run_command
+from eval.search.run import SearchConfig, SearchRun
+from semfov.runs.command import command
 from semfov.runs.scene_run import finish
 
 
@@ -26,6 +23,4 @@ def search(config: SearchConfig, *, pictures: bool = True) -> None:
     search_report(run, pictures=pictures)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(search, SearchConfig, __doc__, arguments)
+main = command(search, SearchConfig, __doc__)

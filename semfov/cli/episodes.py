@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from semfov.report import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
-from semfov.runs.setup import plain, prepare_worker
+from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 
 
@@ -158,7 +158,7 @@ class PictureFiles:
         self.results = ResultsFile(file, kind or ".json", searched=self.job.title.startswith("search"))
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several:
-            settings = {name: value for name, value in plain(asdict(self.job.options)).items() if name not in WHERE}
+            settings = {name: value for name, value in self.job.options.plain().items() if name not in WHERE}
             key = hashlib.sha256(f"{digest_of(settings)} {package_digest()}".encode()).hexdigest()[:32]
             versions = [source.version() for source in self.job.sources]
             folder = file.with_name(f"{file.name}.unfinished")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -24,8 +24,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import choose_classes, episodes_of, looks_of, run_episodes, search_steps, tie_noise
-from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.search_protocol import choose_searches, episodes_of, looks_of, run_episodes, search_steps, tie_noise
 from semfov.strategy import Strategy
 
 Ways = Mapping[str, Strategy]
@@ -191,29 +190,20 @@ def decisions(
     results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
     for index in track(scenes, "deciding", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
-        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, protocol.seed, classes)
-        detections = run.detections(index) if chosen else None
-        for target in chosen:
-            assert detections is not None
-            generator = generator_for("start", protocol.seed, run.scenes.ids[index], target)
-            start = torch.randint(len(grid), (1,), generator=generator)
-            noise = noise_for(protocol, len(grid), run.scenes.ids[index], target, 0)[None]
-            looks = StoredLooks(detections, grid, torch.tensor([target]))
-            there = bool((annotation.labels == target).any())
+        searches = choose_searches(run.scenes, index, grid, protocol, classes, max_area, classes)
+        if not searches:
+            continue
+        detections = run.detections(index)
+        for search in searches:
+            looks = StoredLooks(detections, grid, torch.tensor([search.target]))
+            there = bool((annotation.labels == search.target).any())
             for name, (strategy, rule) in ways.items():
-                ends = partial(rule, target=target, grid=grid)
-                outcome, count = _search(looks, strategy, target, start, noise, ends)
-                results[name].append((there, outcome, count))
+                ends = partial(rule, target=search.target, grid=grid)
+                with torch.inference_mode():
+                    steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
+                    outcome = OUTCOMES[int(ends(steps[-1]))]
+                results[name].append((there, outcome, len(steps)))
     return {name: _rates(each) for name, each in results.items()}
-
-
-@torch.inference_mode()
-def _search(
-    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
-) -> tuple[str, int]:
-    """Run one search and return its outcome and its number of looks."""
-    steps = search_steps(looks, strategy, target, start, noise, rule)
-    return OUTCOMES[int(rule(steps[-1]))], len(steps)
 
 
 def by_detection(step: Step, target: int, grid: Grid) -> Tensor:

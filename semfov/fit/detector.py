@@ -2,13 +2,12 @@
 
 import logging
 import time
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from semfov.agent import ActivePerception
 from semfov.errors import InputError
@@ -21,7 +20,8 @@ from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.looking import Looking, looking_of
 from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import detector_options, plain
+from semfov.runs.settings import plain
+from semfov.runs.setup import detector_options
 from semfov.runs.workers import available_cores
 
 _log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     text = detector_report(config, run, folder.results, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     figures = [figure for fitted in folder.results.values() for figure in fitted.figures]
     models = [fitted.part.file for fitted in folder.results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")

@@ -13,14 +13,14 @@ from semfov.fit.parts.base import PartResult
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import percent, plus_minus, table
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
     """Format a paired difference, times `scale`, with its unit, its standard error and its number of photographs."""
     digits = 1 if scale > 1 else 3
     return (
-        f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
+        f"{plus_minus(scale * gain.mean, scale * gain.error, digits, sign='+')} {unit} "
         f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
     )
 
@@ -76,7 +76,7 @@ def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
 def detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, PartResult], seconds: float) -> str:
     """Write the report as Markdown."""
     photographs = len(run.scenes)
-    holdout = config.observation.holdout
+    holdout = config.holdout or 5
     held_out = [index for index in range(photographs) if index % holdout == 0]
     counts = class_counts(run, (index for index in range(photographs) if index % holdout))
     rows = [["part", "used", "result on held-out photographs"]]

@@ -5,27 +5,16 @@ from pathlib import Path
 from typing import Annotated
 
 from semfov.errors import InputError
-from semfov.fit.evidence import FitSearchConfig
-from semfov.fit.map import FitMapConfig
-from semfov.fit.observation import FitObservationConfig
-from semfov.fit.settings import FovealFitConfig
-from semfov.fit.tempering import FitTemperingConfig
-from semfov.fit.verification import FitVerificationConfig
-from semfov.fit.windows import FitZoomConfig
-from semfov.runs.config import DetectorConfig, WorkConfig
+from semfov.fit.settings import FitConfig
+from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
-FEW = 8
-"""Detectors with fewer classes also learn from photographs that contain none of them."""
 MANY = 100
 """With at least this many photographs, one in five is held out and training takes all its steps."""
 
-_FOR_MOSAICS = 360
-"""The number of mosaics grows up to this number of photographs to learn from."""
-
 
 @dataclass(frozen=True)
-class FitDetectorConfig(FovealFitConfig, WorkConfig):
+class FitDetectorConfig(FitConfig):
     """Fit all models that the agent needs to your own detector.
 
     Args:
@@ -49,6 +38,7 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
     """
 
+    unused = ("name",)
     model: Path | None = None
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     columns: Side = 10
@@ -94,95 +84,4 @@ class FitDetectorConfig(FovealFitConfig, WorkConfig):
             holdout=self.holdout or (3 if few else 5),
             steps=self.steps or max(250, round(500 * share)),
             map_steps=self.map_steps or max(300, round(1000 * share)),
-        )
-
-    @property
-    def _common(self) -> dict[str, object]:
-        shared = {name: getattr(self, name) for name in ("data", "detector", "sensor", "seed", "out")}
-        return {**shared, "holdout": self.holdout or 5}
-
-    @property
-    def observation(self) -> FitObservationConfig:
-        """Settings of the observation model."""
-        return FitObservationConfig(**self._common, fixations=self.fixations)  # type: ignore[arg-type]
-
-    @property
-    def tempering(self) -> FitTemperingConfig:
-        """Settings for choosing the exponent of the likelihoods."""
-        return FitTemperingConfig(
-            **self._common,  # type: ignore[arg-type]
-            fixations=self.fixations,
-            columns=self.columns,
-            rows=self.rows,
-            min_objects=1,
-            max_target_area=self.max_target_area,
-        )
-
-    def evidence(self, classes: int) -> FitSearchConfig:
-        """Return the settings of the target evidence for a detector with so many classes."""
-        return FitSearchConfig(
-            **self._common,  # type: ignore[arg-type]
-            absent=2 if classes < FEW else None,
-            columns=self.columns,
-            rows=self.rows,
-            max_target_area=self.max_target_area,
-            steps=self.steps or 500,
-        )
-
-    def verification(self, classes: int) -> FitVerificationConfig:
-        """Return the settings of the verification for a detector with so many classes."""
-        shared = {name: each for name, each in self._common.items() if name != "holdout"}
-        return FitVerificationConfig(
-            **shared,  # type: ignore[arg-type]
-            absent=2 if classes < FEW else None,
-            columns=self.columns,
-            rows=self.rows,
-            max_target_area=self.max_target_area,
-        )
-
-    @property
-    def map(self) -> FitMapConfig:
-        """Settings of the learned map."""
-        return FitMapConfig(
-            **self._common,  # type: ignore[arg-type]
-            columns=self.columns,
-            rows=self.rows,
-            steps=self.map_steps or 1000,
-            gain_steps=max(1, (self.map_steps or 1000) // 5),
-        )
-
-    def mosaics(self, photographs: int, tile: int) -> FitZoomConfig:
-        """Return the settings of the evidence for large pictures, with mosaics for so many photographs.
-
-        Args:
-            photographs: number of photographs, held-out ones included.
-            tile: width in pixels of the slot of a photograph.
-
-        Returns:
-            The settings. Each photograph to learn from is in about four mosaics, unless there are very many.
-        """
-        holdout = self.holdout or 5
-        held_out = -(-photographs // holdout)
-        training = min(photographs - held_out, _FOR_MOSAICS)
-        return FitZoomConfig(
-            data=self.data,
-            detector=self.detector,
-            holdout=holdout,
-            mosaics=max(1, training // 5),
-            far=max(1, training // 60),
-            crowded=max(1, training // 10),
-            judged=max(8, min(held_out // 3, 30)),
-            judged_far=1,
-            kinds=(),
-            searched=max(8, training // 12),
-            sought=3,
-            passes=16,
-            tile=tile,
-            steps=self.window_steps,
-            survey_steps=self.window_steps,
-            seed=self.seed,
-            out=self.out,
-            cache=self.cache,
-            workers=self.workers,
-            scheduler=self.scheduler,
         )

@@ -1,34 +1,55 @@
-"""Train the target evidence on the looks of whole searches."""
+"""Train the target evidence on the looks of whole searches, and compare it with raw scores."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief import TargetEvidence
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Target, TargetBelief
-from semfov.belief.target_evidence import Thresholds
-from semfov.decision import place_known
+from semfov.belief.look_features import highest_score, look_features
+from semfov.belief.observers import Observer, Semantic, TargetBelief
+from semfov.belief.observers.base import own
+from semfov.belief.observers.target import Target, TargetLook
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.decision import decide, place_known
 from semfov.episode import Step
+from semfov.errors import DataError
+from semfov.fit.comparison import Difference, Rule, by_detection, decisions, search_curves
 from semfov.fit.descent import descend
-from semfov.fit.evidence_examples import TargetExamples, make_examples
-from semfov.fit.examples import example_episodes
+from semfov.fit.detector_report import curves_figure, in_words, mean_percent, percent_of, section
+from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.policies import NonPredictive
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.looking import Looking
+from semfov.runs.progress import track
+from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import table
+from semfov.strategy import Strategy
+from semfov.viz.style import save_figure
 
 JUDGED = (1, 5, 15)
 """Numbers of looks after which a belief is evaluated."""
+_ABSENT = 1000
+"""Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
+SUREST, SUREST_OF_FEW = 0.99, 0.9
+"""Upper limit of the threshold for reporting a target as found. The second value is for few expected false alarms.
+
+If the threshold were higher than any search reaches, nothing would ever be found. With few searches, a single false
+alarm could push it that high.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,6 +79,78 @@ class FitSearchConfig(FitOnLooksConfig):
     surest: Share = 1.0
     lost: Share = 0.02
     out: Path = Path("runs/fit_search")
+
+
+@dataclass(frozen=True)
+class TargetExamples(Examples):
+    """One example for each pair of photograph and class to search for. The class may be absent.
+
+    Attributes:
+        features: `(E, X·Y, X·Y, F)`, `look_features` of the looks from every cell, in half precision.
+        score: `(E, X·Y)`, highest score of the class in the look from each cell.
+        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; all False if the class is absent.
+        target: `(E,)`, the class.
+    """
+
+    goal: Tensor
+    target: Tensor
+
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> TargetLook:
+        """Process stored looks with the model in training; see `Examples.look`."""
+        return TargetLook(
+            own(observer, Target, "observer").model.evidence(self.features[episodes, cell].float()),
+            self.distance[episodes, cell],
+            self.score[episodes, cell],
+            cell,
+            self.target[episodes],
+            columns,
+        )
+
+
+def make_examples(
+    run: Looking,
+    classes: int,
+    max_area: float,
+    seed: int,
+    *,
+    absent: int | None = None,
+    scenes: Sequence[int] | None = None,
+) -> TargetExamples:
+    """Make examples from photographs for present and for absent classes.
+
+    Args:
+        run: the finished looks from every cell.
+        classes: maximum number of present classes in a photograph.
+        max_area: classes that cover a larger share of the image are left out.
+        seed: seed of the random choice of classes.
+        absent: maximum number of absent classes in a photograph (None: as many as present ones).
+        scenes: indices of the photographs (None: all).
+
+    Returns:
+        The examples.
+
+    Raises:
+        DataError: no photograph has a class that may be searched for.
+    """
+    rows = []
+    for index in track(range(len(run.scenes)) if scenes is None else scenes, "describing looks", "scene"):
+        annotation, grid = run.scenes.annotation(index), run.grid(index)
+        covered = grid.footprint(annotation.boxes)
+        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed, absent)
+        detections = run.detections(index) if chosen else None
+        for target in chosen:
+            assert detections is not None
+            goal = covered[annotation.labels == target].any(0)
+            if goal.all():
+                continue
+            with torch.inference_mode():
+                features = look_features(detections, grid.centres, grid, target).half()
+            score = highest_score(detections, target)
+            row = features, score, grid.cell_distance, torch.tensor(index), goal, torch.tensor(target)
+            rows.append(row)
+    if not rows:
+        raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
+    return TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
 def fit_search(config: FitSearchConfig) -> None:
@@ -298,3 +391,104 @@ def evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, trai
             "",
         ]
     )
+
+
+class EvidenceFit(PartFit):
+    """Train the target evidence, and choose its thresholds."""
+
+    name: ClassVar[str] = "evidence"
+
+    @property
+    def settings(self) -> FitSearchConfig:
+        """The settings of the training."""
+        own = self.config
+        return FitSearchConfig(
+            **self.inputs.common,
+            holdout=self.inputs.holdout,
+            absent=self.inputs.absent,
+            max_target_area=own.max_target_area,
+            steps=own.steps or 500,
+        )
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        judged = len(self.inputs.judged)
+        return {
+            "describing looks": 0.05 * len(self.run.scenes),
+            "training": 0.1 * self.settings.steps,
+            "searching": judged,
+            "deciding": judged,
+        }
+
+    def choose_thresholds(self, model: TargetEvidence) -> Thresholds:
+        """Choose the thresholds of decisions on the held-out photographs."""
+        config, inputs = self.settings, self.inputs
+        grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
+        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
+        area, scenes = config.max_target_area, inputs.held_out
+        wide = make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
+        surest = SUREST_OF_FEW if expected < 10 else SUREST
+        return judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
+
+    def fit(self) -> PartResult:
+        """Train, and compare searches and their decisions with those of raw scores."""
+        config, run, inputs = self.settings, self.run, self.inputs
+        fit = fit_evidence(config, run)
+        fit.model.thresholds = thresholds = self.choose_thresholds(fit.model)
+        learned = strategy(Target(fit.model), NonPredictive())
+        ways = {
+            "fitted": learned,
+            "raw": strategy(Semantic(inputs.components), NonPredictive()),
+            "fused": strategy(inputs.semantic, NonPredictive()),
+        }
+        protocol, judged = inputs.protocol, inputs.judged
+        curves = search_curves(run, judged, ways, protocol, config.max_target_area)
+        if not len(curves["raw"]):
+            raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
+        at = min(MAP_SHIFTS, protocol.shifts)
+        gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
+        why = (
+            f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
+            f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
+        )
+        rules: dict[str, tuple[Strategy, Rule]] = {
+            "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
+            "raw": (ways["raw"], by_detection),
+        }
+        decided = decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
+        shifts = (1, at, protocol.shifts)
+        rows = [["belief", *(f"CP@{n}" for n in shifts)]]
+        rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
+        outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
+        outcomes += [
+            [name, percent_of(d.found), percent_of(d.false_alarms), percent_of(d.undecided), f"{d.looks:.1f}"]
+            for name, d in decided.items()
+        ]
+        report = "\n".join(
+            [
+                section(
+                    f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} held-out photographs with "
+                    f"{protocol.starts} starting points for each target. `raw` fuses the raw scores; `fused` uses the "
+                    "exponent chosen under Tempering.",
+                    rows,
+                ),
+                section(
+                    f"Decisions of {decided['fitted'].searches} searches for present and for absent classes. A target "
+                    f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
+                    f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
+                    "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "
+                    "search gives up.",
+                    outcomes,
+                ),
+                evidence_report(fit.judged, thresholds, fit.trained, fit.held_out),
+            ]
+        )
+        save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
+        return PartResult(self.write(fit.model, gain.better, why), report, ["search.png"])
+
+
+def _by_thresholds(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> torch.Tensor:
+    return decide(step, target, thresholds)

@@ -1,9 +1,11 @@
-"""Train the map of all classes on the looks of whole explorations."""
+"""Train the map of all classes on the looks of whole explorations, and compare it with raw scores."""
+
+from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -11,20 +13,28 @@ from torch.nn import functional as F
 
 from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
-from semfov.belief.observers import LearnedMap, MapBelief
+from semfov.belief.look_features import class_features, highest_score
+from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Observer, Semantic
+from semfov.belief.observers.base import own
 from semfov.episode import Step
-from semfov.errors import check
+from semfov.errors import DataError, InputError, check
+from semfov.fit.comparison import Difference, explore_curves
 from semfov.fit.descent import descend
-from semfov.fit.examples import example_episodes
-from semfov.fit.map_examples import MapExamples, make_map_examples
+from semfov.fit.detector_report import curves_figure, in_words, mean_percent, section
+from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
+from semfov.gaze.policies import Closer, Random
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
 from semfov.runs.looking import Looking
+from semfov.runs.progress import track
+from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.tables import table
+from semfov.viz.style import save_figure
 
 _JUDGED = (1, 2, 3, 5, 10, 15)
 """Numbers of looks after which a map is evaluated."""
@@ -49,6 +59,84 @@ class FitMapConfig(FitOnLooksConfig):
     gain_steps: Count = 200
     batch: Count = 12
     out: Path = Path("runs/fit_map")
+
+
+@dataclass(frozen=True)
+class MapExamples(Examples):
+    """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
+
+    Attributes:
+        features: `(E, X·Y, T, X·Y, F)`, `class_features` of the looks from every cell, in half precision.
+        score: `(E, X·Y, T)`, highest score of each class in the look from each cell.
+        answers: `(E, X·Y, T+1)` boolean, whether a cell is background (first), and whether an object of each class
+            overlaps it.
+        targets: `(E, T)`, the classes.
+        stands_for: `(E, T)`, number of classes that each class represents.
+    """
+
+    answers: Tensor
+    targets: Tensor
+    stands_for: Tensor
+
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> MapLook:
+        """Process stored looks with the model in training; see `Examples.look`."""
+        return MapLook(
+            own(observer, LearnedMap, "observer").model.evidence(self.features[episodes, cell].float()),
+            self.distance[episodes, cell],
+            self.score[episodes, cell],
+            cell,
+            self.targets[episodes],
+            columns,
+            self.stands_for[episodes],
+        )
+
+
+def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> MapExamples:
+    """Make examples from all photographs with objects.
+
+    Args:
+        run: the finished looks from every cell.
+        classes: number of classes in each example: the present ones, then those with the highest scores, then random
+            ones.
+        others: number of random classes. Together they represent all classes that are not in the example.
+        seed: seed of the random choice.
+
+    Returns:
+        The examples.
+
+    Raises:
+        DataError: no photograph has an object.
+    """
+    rows = []
+    components = len(run.scenes.classes) + 1
+    for index in track(range(len(run.scenes)), "describing looks", "scene"):
+        annotation, grid = run.scenes.annotation(index), run.grid(index)
+        if not len(annotation.labels):
+            continue
+        detections = run.detections(index)
+        every = torch.arange(1, components)
+        score = highest_score(detections, every)
+        held = torch.isin(every, annotation.labels)
+        order = (score.amax(0) + 2 * held).argsort(descending=True)
+        chosen, rest = order[: classes - others], order[classes - others :]
+        drawn = torch.randperm(len(rest), generator=generator_for("others", seed, run.scenes.ids[index]))[:others]
+        chosen = torch.cat([chosen, rest[drawn]])
+        stands_for = torch.ones(len(chosen))
+        stands_for[classes - others :] = len(rest) / max(len(drawn), 1)
+        with torch.inference_mode():
+            features = torch.cat(
+                [
+                    class_features(detections[place], grid.centres[place], grid, every[chosen]).half()
+                    for place in torch.arange(len(grid)).split(10)
+                ]
+            )
+        answers = answers_of(annotation, grid, components)
+        answers = torch.cat([~answers.any(-1, keepdim=True), answers[:, every[chosen]]], -1)
+        row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), answers, every[chosen], stands_for
+        rows.append(row)
+    if not rows:
+        raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")
+    return MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
 def fit_map(config: FitMapConfig) -> None:
@@ -248,3 +336,71 @@ def map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> s
             "",
         ]
     )
+
+
+class MapFit(PartFit):
+    """Train the map of all classes."""
+
+    name: ClassVar[str] = "map"
+
+    @property
+    def settings(self) -> FitMapConfig:
+        """The settings of the training."""
+        steps = self.config.map_steps or 1000
+        holdout, gain_steps = self.inputs.holdout, max(1, steps // 5)
+        return FitMapConfig(**self.inputs.common, holdout=holdout, steps=steps, gain_steps=gain_steps)
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        return {
+            "describing looks": 0.05 * len(self.run.scenes),
+            "training": 0.25 * self.settings.steps,
+            "learning the gain of looks": 0.1 * self.settings.gain_steps,
+            "exploring": len(self.inputs.judged),
+        }
+
+    def fit(self) -> PartResult:
+        """Train, and compare explorations with those of raw scores and random gaze."""
+        inputs, run = self.inputs, self.run
+        if inputs.components < 3:
+            raise InputError("detector: a map of all classes needs at least 2 classes, got a detector with 1 class")
+        fit = fit_map_evidence(self.settings, run)
+        fovea = self.config.sensor.fovea
+        ways = {
+            "fitted": strategy(LearnedMap(fit.model), Closer(fovea)),
+            "raw": strategy(Semantic(inputs.components), Random()),
+            "fused": strategy(inputs.semantic, Closer(fovea)),
+        }
+        protocol = inputs.protocol
+        curves = explore_curves(run, inputs.judged, ways, protocol)
+        at = min(MAP_SHIFTS, protocol.shifts)
+        every, objects = curves["all"], curves["objects"]
+        if not len(objects["raw"]):
+            raise DataError("data: none of the held-out photographs contains an object; give more photographs")
+        gain = Difference.of(objects["fitted"][:, at], objects["raw"][:, at])
+        # A map that answers background everywhere is right for most cells, and one that never answers background may
+        # be right for all objects. Therefore both measures are compared.
+        loss = Difference.of(every["raw"][:, at], every["fitted"][:, at])
+        why = (
+            f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are classified correctly after "
+            f"{at} gaze shifts, {100 * objects['raw'][:, at].mean():.1f} % with raw scores and random gaze; "
+            f"{in_words(gain, 'points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
+            f"{100 * every['raw'][:, at].mean():.1f} %"
+        )
+        sections = []
+        for what, words in (("objects", "cells with objects, the published success rate"), ("all", "all cells")):
+            rows = [["map", *(f"after {n}" for n in (1, at, protocol.shifts))]]
+            rows += [
+                [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
+                for name, curve in curves[what].items()
+            ]
+            sections.append(section(f"Classified correctly after n gaze shifts, in % of {words}:", rows))
+        head = (
+            f"On {len(objects['raw'])} held-out photographs. `raw` fuses raw scores with random gaze; `fused` uses the "
+            "exponent chosen under Tempering, with the gaze policy of the fitted map. The answer for a cell may be "
+            "background.\n"
+        )
+        save_figure(curves_figure(objects, "exploration"), self.config.out / "explore.png")
+        part = self.write(fit.model, gain.better and not loss.better, why)
+        return PartResult(part, "\n".join([head, *sections, fit.report]), ["explore.png"])

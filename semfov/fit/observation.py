@@ -1,5 +1,7 @@
 """Fit a foveal observation model to labelled detections, and report on it."""
 
+from __future__ import annotations
+
 import json
 import platform
 import sys
@@ -8,31 +10,29 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import torch
-import yaml
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.errors import DataError, check
 from semfov.eye import Eye
-from semfov.fit.misses import count_misses
-from semfov.fit.outputs import model_path
-from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words, section
+from semfov.fit.outputs import model_path, split
+from semfov.fit.parts.base import IOU, PartFit, PartResult
+from semfov.fit.settings import FitConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
-from semfov.metrics.calibration import Calibration, calibration
+from semfov.metrics.calibration import Calibration, calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.config import WorkConfig
-from semfov.runs.samples import Samples, SampleSettings, collect_samples
+from semfov.runs.samples import CellsOfLook, Sampler, Samples, SampleSettings, collect_samples, whole_photograph
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
-from semfov.runs.setup import plain
 from semfov.runs.tables import csv_text, table
-from semfov.runs.zoom_samples import MosaicSettings
+from semfov.runs.zoom_samples import MosaicSampler
 from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
@@ -40,7 +40,7 @@ from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
-class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
+class FitObservationConfig(FitConfig):
     """Fit p(scores | class, distance to the fovea) on photographs with boxes.
 
     Args:
@@ -81,7 +81,7 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
     shrinkage: Weight = 10.0
     enough: Whole | None = None
     holdout: Annotated[int, Range(2, 10**9)] = 10
-    iou: Share = 0.5
+    iou: Share = IOU
     most: Count = 1_000_000
     shard: Count = 32
     out: Path = Path("runs/fit_fom")
@@ -101,17 +101,10 @@ class FitObservationConfig(FovealFitConfig, NameConfig, WorkConfig):
 
 def fit_fom(config: FitObservationConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    kind = MosaicSettings if config.mosaics else SampleSettings
-    settings = kind.of(config)
-    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
+    sampler = collect_samples(SampleSettings.of(config), folder, config.where, "looking", kind)
     samples = sampler.drawn(config.most)
-    held_out = samples.scene % config.holdout == 0
-    if not held_out.any() or held_out.all():
-        raise DataError(
-            f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
-            "detections in all; give more photographs"
-        )
+    held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
     statistics = statistics_of(config, sampler, training)
     model = fit_model(config, sampler, statistics, samples[~held_out])
@@ -238,6 +231,35 @@ def fit_all(
     return models
 
 
+def count_misses(
+    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: CellsOfLook
+) -> MissCounts:
+    """Count cells without any detection over all looks at some photographs.
+
+    Args:
+        photographs: the photographs.
+        samples: the labelled detections of the looks.
+        scenes: indices of the photographs to count.
+        edges: `(N-1,)`, borders between levels of distance, or of magnification.
+        cells: gives the cells of each look in which misses are counted.
+
+    Returns:
+        The counts by class and level.
+    """
+    counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
+    misses = MissCounts(samples.scores.shape[-1], len(edges) + 1)
+    for look, boxes in enumerate(samples.boxes.split(counts)):
+        index = int(samples.scenes[look])
+        if index not in scenes:
+            continue
+        annotation = photographs.annotation(index)
+        grid, distance, in_view = cells(annotation.size, samples.fixations[look])
+        level = torch.bucketize(distance, edges)[in_view]
+        detected, objects = grid.footprint(boxes).any(0), grid.footprint(annotation.boxes)
+        misses.update(detected[in_view], objects[:, in_view], annotation.labels, level)
+    return misses
+
+
 _Models = dict[str, FovealObservationModel]
 
 
@@ -259,7 +281,7 @@ def write_report(
     text = report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
     print(text)
     write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "config.yaml", config.yaml())
     write_text(config.out / "manifest.json", json.dumps(fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
     write_text(config.out / "counts.csv", counts_csv(model))
@@ -375,3 +397,60 @@ def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration])
         "model": metadata,
         "held_out": {name: asdict(figure) for name, figure in figures.items()},
     }
+
+
+class ObservationFit(PartFit):
+    """Fit the observation model with its miss rates."""
+
+    name: ClassVar[str] = "observation"
+
+    @property
+    def settings(self) -> FitObservationConfig:
+        """The settings of the observation model."""
+        common = {name: each for name, each in self.inputs.common.items() if name not in ("columns", "rows")}
+        return FitObservationConfig(**common, holdout=self.inputs.holdout, fixations=self.config.fixations)
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        return {"fitting": 1 + 0.1 * len(self.run.scenes)}
+
+    def fit(self) -> PartResult:
+        """Fit the model, and compare its posteriors of the true class with those of raw scores."""
+        config, run, samples = self.settings, self.run, self.inputs.samples
+        held_out = split(samples.scene, config.holdout)
+        judged = samples[held_out]
+        model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
+        fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
+        cells = whole_photograph(self.config.columns, self.config.rows)
+        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        model.miss_rate = misses.rates().to(model.edges)
+        raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
+        with torch.inference_mode():
+            posteriors = {
+                name: m.calibrate(judged.scores, judged.distance) for name, m in (("raw", raw), ("fitted", model))
+            }
+        cost = {name: surprisal(p.double().gather(1, judged.labels[:, None])[:, 0]) for name, p in posteriors.items()}
+        photographs = judged.scene.unique().tolist()
+        means = {
+            name: torch.stack([each[judged.scene == scene].mean() for scene in photographs]).numpy()
+            for name, each in cost.items()
+        }
+        gain = Difference.of(means["raw"], means["fitted"])
+        figures = {name: calibration(p, judged.labels) for name, p in posteriors.items()}
+        rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
+        rows += [
+            [name, f"{f.nll:.3f}", f"{f.brier:.3f}", f"{f.ece:.3f}", f"{f.accuracy:.3f}"] for name, f in figures.items()
+        ]
+        why = (
+            f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
+            f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats gained')}"
+        )
+        figure = plot_reliability({name: (p, judged.labels) for name, p in posteriors.items()})
+        save_figure(figure, self.config.out / "reliability.png")
+        report = section(
+            f"Predicted probability of the true class of a detection: fitted on {len(samples) - len(judged)} "
+            f"detections, evaluated on {len(judged)} detections in {len(photographs)} held-out photographs.",
+            rows,
+        )
+        return PartResult(self.write(model, gain.better, why), report, ["reliability.png"])

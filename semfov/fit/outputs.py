@@ -2,11 +2,10 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import yaml
 from torch import Tensor
 
 from semfov.data.scene import Scenes
@@ -17,7 +16,6 @@ from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking, looking_of
 from semfov.runs.scene_run import finish
-from semfov.runs.setup import plain
 
 Model = TypeVar("Model", bound=Pretrained)
 
@@ -36,7 +34,7 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
         The metadata.
     """
     left_out = {*WHERE, "data", "detector", "sensor", *besides}
-    settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
+    settings = {name: value for name, value in config.plain().items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
 
 
@@ -56,7 +54,7 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
     """
     files = {
         "report.md": report,
-        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
+        "config.yaml": config.yaml(),
         figures[0]: figures[1],
     }
     print(report)
@@ -101,8 +99,8 @@ def split(scene: Tensor, holdout: int) -> Tensor:
     held_out = scene % holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(
-            "data: expected examples both to train on and to hold out, got all of one kind "
-            f"({len(scene)} examples); give more photographs"
+            f"data: expected examples both to train on and to hold out, got {len(scene)}, all of one kind; give more "
+            "photographs"
         )
     return held_out
 

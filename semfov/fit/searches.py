@@ -23,13 +23,12 @@ from semfov.episode import Step, rollout
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
+from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.remembered import RememberedLooks
-from semfov.runs.search_protocol import choose_classes
-from semfov.runs.seeds import generator_for
-from semfov.runs.store import DetectionStore
+from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_searches
+from semfov.runs.store import DetectionStore, RememberedLooks
 
 
 class TargetSearch(ABC, Generic[LookType]):
@@ -89,25 +88,14 @@ class TargetSearch(ABC, Generic[LookType]):
 
 
 @dataclass(frozen=True)
-class SearchTarget:
+class SearchTarget(DrawnSearch):
     """A class to search for in a photograph.
 
     Attributes:
-        target: the class, 1..K.
-        goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
-        start: `(1,)`, the first fixated cell.
         spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
     """
 
-    target: int
-    goal: Tensor
-    start: Tensor
     spare: bool = False
-
-    @property
-    def present(self) -> bool:
-        """Whether the photograph holds the class."""
-        return bool(self.goal.any())
 
 
 class SearchedPhotograph:
@@ -199,24 +187,17 @@ def open_photographs(
     Returns:
         The photographs with classes to search for.
     """
-    photographs: list[SearchedPhotograph] = []
+    photographs, protocol = list[SearchedPhotograph](), ProtocolConfig(seed=seed)
     for index in chosen:
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
-        covered = grid.footprint(annotation.boxes)
         targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
         held = set(annotation.labels.tolist())
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
-        wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
+        wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
         search_targets = tuple(
-            SearchTarget(
-                target,
-                covered[annotation.labels == target].any(0),
-                torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
-                spare=number >= len(targets),
-            )
-            for number, target in enumerate(wide)
+            SearchTarget(**vars(search), spare=number >= len(targets)) for number, search in enumerate(wide)
         )
         if targets:
             photographs.append(

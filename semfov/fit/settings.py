@@ -4,49 +4,31 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import DataConfig, OutcomeConfig, SensorConfig, WorkConfig
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Side, SingleName
+from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
+from semfov.runs.settings import Count, Positive, Range, Seed, Share, Side, SingleName
 
 
 @dataclass(frozen=True)
-class NameConfig(Settings):
-    """The name of a fitted model.
-
-    Args:
-        name: name of the model (None: the detector's name).
-    """
-
-    name: SingleName | None = None
-
-
-@dataclass(frozen=True)
-class FitConfig(OutcomeConfig):
+class FitConfig(WorkConfig):
     """Base of the settings of fits to a detector's looks at annotated photographs.
 
     Args:
         data: photographs to learn from (by default all of them, however many objects they have).
+        detector: the detector that processes the foveated views.
+        sensor: the foveal sensor.
         seed: seed of all random choices.
+        name: name of the model (None: the detector's name).
         out: folder for the model and the report.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    seed: Seed = 0
-
-
-@dataclass(frozen=True)
-class FovealFitConfig(FitConfig):
-    """Base of the settings of fits to foveated looks.
-
-    Args:
-        detector: the detector that processes the foveated views.
-        sensor: the foveal sensor.
-    """
-
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    seed: Seed = 0
+    name: SingleName | None = None
 
 
 @dataclass(frozen=True)
-class FitOnLooksConfig(FovealFitConfig, NameConfig, WorkConfig):
+class FitOnLooksConfig(FitConfig):
     """Base of the settings of fits on looks from every cell of photographs.
 
     Args:

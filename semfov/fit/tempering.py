@@ -1,9 +1,11 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -13,10 +15,13 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words, percent_of, section
 from semfov.fit.outputs import write_outputs
-from semfov.fit.settings import FovealFitConfig
+from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartResult
+from semfov.fit.settings import FitConfig
+from semfov.io.manifest import Part
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.config import WorkConfig
 from semfov.runs.progress import track
 from semfov.runs.samples import Sampler, Samples, SampleSettings, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
@@ -25,7 +30,7 @@ from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
-class FitTemperingConfig(FovealFitConfig, WorkConfig):
+class FitTemperingConfig(FitConfig):
     """Find the exponent of the likelihoods.
 
     Args:
@@ -47,12 +52,13 @@ class FitTemperingConfig(FovealFitConfig, WorkConfig):
         cache: folder for the labelled detections (None: `out`).
     """
 
+    unused = ("name",)
     calibrated: bool = False
-    footprint: Footprint = "box_centre"
+    footprint: Footprint = FOOTPRINT
     exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
     photographs: Count | None = None
     fixations: Count = 8
-    iou: Share = 0.5
+    iou: Share = IOU
     shard: Count = 32
     columns: Side = 10
     rows: Side = 10
@@ -64,7 +70,6 @@ class FitTemperingConfig(FovealFitConfig, WorkConfig):
 
 def fit_tempering(config: FitTemperingConfig) -> None:
     """Collect looks, try every exponent, and write the report."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
     settings = SampleSettings.of(config)
     sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
@@ -205,3 +210,65 @@ def tempering_report(hits: dict[float, dict[str, float]]) -> str:
             "",
         ]
     )
+
+
+class TemperingFit(PartFit):
+    """Choose whether scores are calibrated before they are fused, and with which exponent."""
+
+    name: ClassVar[str] = "tempering"
+
+    @property
+    def settings(self) -> FitTemperingConfig:
+        """The settings of the choice."""
+        return FitTemperingConfig(
+            **self.inputs.common,
+            holdout=self.inputs.holdout,
+            fixations=self.config.fixations,
+            min_objects=1,
+            max_target_area=self.config.max_target_area,
+        )
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in self.settings.exponents]
+        return dict.fromkeys(tried, 0.005 * len(self.run.scenes))
+
+    def fit(self) -> PartResult:
+        """Choose, and compare the share of next fixations that hit the target with that of raw scores."""
+        config, run, inputs = self.settings, self.run, self.inputs
+        ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
+        baseline = Semantic(inputs.components)
+        raw = hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
+        rates = {
+            (scores, exponent): hit_rates(
+                config, run.scenes, inputs.samples, inputs.fusing(scores, exponent), f"{scores} {exponent:g}"
+            )
+            for scores in ways
+            for exponent in config.exponents
+        }
+        means = {way: means_of(config, each) for way, each in rates.items()}
+        scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
+        held_out = [index for index in raw if index % config.holdout == 0]
+        chosen = rates[best]
+        gain = Difference.of(
+            torch.tensor([chosen[index] for index in held_out]).numpy(),
+            torch.tensor([raw[index] for index in held_out]).numpy(),
+        )
+        before = means_of(config, raw)["held_out"]
+        why = (
+            f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
+            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
+        )
+        rows = [
+            ["scores", "exponent", "next fixations that hit, %"],
+            ["raw, every cell of a box", "1", percent_of(before)],
+        ]
+        rows += [[way[0], f"{way[1]:g}", percent_of(mean["held_out"])] for way, mean in means.items()]
+        report = section(
+            f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
+            f"photographs; the table shows results on {len(held_out)} held-out photographs.",
+            rows,
+        )
+        settings = {"scores": scores, "exponent": exponent, "footprint": config.footprint}
+        return PartResult(Part(None, None, gain.better, why, settings), report)

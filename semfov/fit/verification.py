@@ -1,11 +1,14 @@
 """Fit the verification of targets by closer looks, from searches of photographs with boxes."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -14,15 +17,21 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
+from semfov.fit.comparison import Difference
+from semfov.fit.detector_report import in_words
+from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
-from semfov.fit.settings import FovealFitConfig, NameConfig
+from semfov.fit.settings import FitConfig
+from semfov.io.manifest import Part
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Positive, Range, Share, Side
-from semfov.runs.setup import make_eye, make_scenes, make_target_evidence
+from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
 from semfov.runs.tables import mean_or_dash, share, table
 
@@ -44,10 +53,12 @@ _THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
 
 SearchEnd = tuple[bool | None, int]
 """End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
+ABSENT = 200
+"""The threshold is chosen on about this many searches for absent classes, at most 20 in a photograph."""
 
 
 @dataclass(frozen=True)
-class FitVerificationConfig(FovealFitConfig, NameConfig):
+class FitVerificationConfig(FitConfig):
     """Fit the verification of targets.
 
     Args:
@@ -70,6 +81,7 @@ class FitVerificationConfig(FovealFitConfig, NameConfig):
         cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
+    unused = ("workers", "scheduler")
     data: DataConfig = field(default_factory=DataConfig)
     target_model: str | None = None
     fitted: Count | None = None
@@ -158,7 +170,7 @@ class VerificationResult:
 def fit_verification(config: FitVerificationConfig) -> None:
     """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
     eye = make_eye(config.detector, config.sensor)
-    evidence = make_target_evidence(config.target_model, eye)
+    evidence = make_learned(TargetEvidence, config.target_model, eye)
     scenes = make_scenes(config.data, eye.detector.classes)
     left_out = set()
     if config.fitted is not None:
@@ -463,3 +475,91 @@ def _row(present: Sequence[bool], ended: Sequence[SearchEnd]) -> list[str]:
         looks.append(mean_or_dash([end for _, end in of_kind]))
         places += found
     return [*shares, share(sum(places), len(places)), *looks]
+
+
+class VerificationFit(PartFit):
+    """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
+
+    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`shipped_mean`).
+    """
+
+    name: ClassVar[str] = "verification"
+
+    @property
+    def settings(self) -> FitVerificationConfig:
+        """The settings of the fit."""
+        area = self.config.max_target_area
+        return FitVerificationConfig(**self.inputs.common, absent=self.inputs.absent, max_target_area=area)
+
+    @property
+    def tasks(self) -> dict[str, float]:
+        """The tasks and their seconds."""
+        judged = len(self.inputs.judged)
+        return {"looking": judged, "verifying": 0.5 * judged}
+
+    def fit(self) -> PartResult:
+        """Fit in folds, and compare decisions with those of the same agent without closer looks."""
+        config, run, judged = self.settings, self.run, self.inputs.judged
+        evidence = self.inputs.model("evidence")
+        if not isinstance(evidence, TargetEvidence):
+            why = "not fitted, since the agent does not use the target evidence"
+            return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
+        photographs = open_photographs(
+            run.eye,
+            run.scenes,
+            judged,
+            (config.columns, config.rows),
+            classes=config.classes,
+            absent=config.absent,
+            max_area=config.max_target_area,
+            seed=config.seed,
+            spare=min(20, ABSENT // len(judged)),
+            everywhere=run.detections,
+        )
+        if len(photographs) < 2:
+            raise DataError(
+                "data: expected at least 2 held-out photographs with a class to search for, got "
+                f"{len(photographs)}; give more photographs"
+            )
+        assert evidence.thresholds is not None
+        # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
+        give_up = min(config.give_up, evidence.thresholds.give_up)
+        config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
+        fitted = fit_in_folds(photographs, evidence, config, shipped_mean(), SUREST_OF_FEW)
+        assert fitted.model.thresholds is not None
+        confirm = fitted.model.thresholds.confirm
+        after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
+        before = scores(fitted.searches, [each.unverified for each in fitted.searches])
+        gain = Difference.of(after, before)
+        why = (
+            f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
+            f"{in_words(gain, 'points gained', 100)}"
+        )
+        fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes, "target_model", "fitted")}
+        text = (
+            "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
+            "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
+            "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
+            "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
+        )
+        return PartResult(
+            self.write(fitted.model, gain.better, why),
+            text + verification_report(fitted, f"{len(photographs)} photographs")[0],
+        )
+
+
+def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> FloatArray:
+    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
+
+    Args:
+        searches: the searches.
+        ends: their ends. A right place scores 1, a wrong place -1, and a search that finds nothing 0.
+
+    Returns:
+        `(P,)`, the mean score of each photograph.
+    """
+    by_picture: dict[int, dict[bool, list[int]]] = {}
+    for each, (right, _) in zip(searches, ends, strict=True):
+        score = 0 if right is None else 1 if right else -1
+        by_picture.setdefault(each.picture, {}).setdefault(each.present, []).append(score)
+    return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in by_picture.values()])

@@ -38,7 +38,7 @@ from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import inside
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import DetectorConfig, WorkConfig
+from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.setup import make_detector, prepare_worker, split_photographs
@@ -54,7 +54,7 @@ RefitPart = Literal["presence", "decision", "survey", "verification", "certainty
 
 
 @dataclass(frozen=True)
-class FitZoomConfig(FitConfig, WorkConfig):
+class FitZoomConfig(FitConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
@@ -97,6 +97,7 @@ class FitZoomConfig(FitConfig, WorkConfig):
         scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
+    unused = ("sensor", "name")
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
     holdout: Annotated[int, Range(2, 10**9)] = 5
     mosaics: Count = 400

@@ -17,9 +17,9 @@ from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, n
 from semfov.gaze.policies.tables import salient_from
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.config import BeliefConfig, PoliciesConfig, PolicyConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
-from semfov.runs.setup import make_map_evidence, make_observation, make_target_evidence, make_templates
+from semfov.runs.setup import make_learned, make_observation, make_templates
 from semfov.strategy import Strategy
 
 T = TypeVar("T")
@@ -65,17 +65,17 @@ class Models:
     templates: ClassTemplates | None = None
 
 
-def load_models(config: PoliciesConfig, task: Task, eye: Eye) -> Models:
+def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
     """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     policies = [resolve(choice, task) for choice in config.policies]
     belief = config.belief
     return Models(
         make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
-        make_target_evidence(belief.target_model, eye)
+        make_learned(TargetEvidence, belief.target_model, eye)
         if any(by_evidence(policy, task) for policy in policies)
         else None,
-        make_map_evidence(belief.map_model, eye)
+        make_learned(MapEvidence, belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
         else None,
         make_templates(config.class_templates, eye)

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, get_origin
 from semfov.errors import SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.runs.arguments import in_one_line, setting_types, usual_form
-from semfov.runs.settings import check_settings
+from semfov.runs.settings import Settings, check_settings
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
 
-_Config = TypeVar("_Config")
+_Config = TypeVar("_Config", bound=Settings)
 
 GOES_ON = "; give the same command again to continue"
 """What is said about an interrupted command that keeps what it has finished."""
@@ -33,7 +33,7 @@ _ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "termi
 
 
 def make_parser(
-    config: type[Any],
+    config: type[Settings],
     description: str | None,
     positional: tuple[str, str] | None = None,
     program: str | None = None,
@@ -41,7 +41,7 @@ def make_parser(
     """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted.
 
     Args:
-        config: dataclass of the settings.
+        config: the settings, without those that are `unused`.
         description: description for `--help`.
         program: name of the program in the usage; None for that of the process.
         positional: name and help of a field that becomes an optional positional argument: a path, or a tuple of words.
@@ -71,7 +71,8 @@ def make_parser(
         several = get_origin(hint) is tuple
         kind = str if several or hint is str else Path
         parser.add_argument(positional[0], help=positional[1], nargs="*" if several else "?", type=kind)
-    parser.add_class_arguments(config, as_group=True, skip=set() if positional is None else {positional[0]})
+    skip = {*config.unused, *([] if positional is None else positional[:1])}
+    parser.add_class_arguments(config, as_group=True, skip=skip)
     return parser
 
 
@@ -104,7 +105,7 @@ def run_command(
 
     Args:
         main: the function to run; it may return an exit code.
-        config: dataclass of its settings.
+        config: class of its settings.
         description: description for `--help`.
         arguments: command-line arguments (None: those of the process).
         positional: name and help of a field that becomes an optional positional argument (`make_parser`).
@@ -154,6 +155,26 @@ def run_command(
         print(f"{_ENDINGS[signal.SIGTERM]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGTERM
     return code or 0
+
+
+def command(
+    main: Callable[[_Config], int | None], config: type[_Config], description: str | None
+) -> Callable[..., int]:
+    """Make the function `main` of a module that is a command: it takes the arguments and returns the exit code.
+
+    Args:
+        main: the function to run.
+        config: class of its settings.
+        description: description for `--help`.
+
+    Returns:
+        `run_command` for these, by default with the arguments of the process.
+    """
+
+    def run(arguments: Sequence[str] | None = None) -> int:
+        return run_command(main, config, description, arguments)
+
+    return run
 
 
 class _Terminated(BaseException):

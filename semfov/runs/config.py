@@ -248,29 +248,20 @@ class ProtocolConfig(Settings):
 
 
 @dataclass(frozen=True)
-class OutcomeConfig(Settings):
+class WorkConfig(Settings):
     """Settings of every run and every fit with a detector.
 
     Args:
-        detector: the detector.
+        detector: the detector, which is applied to each foveated view.
         out: folder of the outcomes.
         cache: folder for what is stored, shared between runs (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
+        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     out: Path = Path("runs")
     cache: Path | None = None
-
-
-@dataclass(frozen=True)
-class WorkConfig(OutcomeConfig):
-    """Settings of runs and fits in several processes.
-
-    Args:
-        workers: number of processes (None: one per CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
-    """
-
     workers: Workers | None = None
     scheduler: str | None = None
 
@@ -286,57 +277,30 @@ WHERE = ("out", "cache", "workers", "scheduler")
 
 @dataclass(frozen=True)
 class LookingConfig(WorkConfig):
-    """Looks from every cell of a grid.
+    """Looks at scenes from every cell of a grid.
 
     Args:
-        detector: the detector, which is applied to each foveated view.
+        data: the scenes.
         sensor: the foveal sensor.
         belief: the belief, a grid of class distributions; its columns and rows are the cells.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
     """
 
+    data: DataConfig = field(default_factory=DataConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     store: bool = True
 
 
 @dataclass(frozen=True)
-class ScenesConfig(LookingConfig):
-    """Looks at scenes from every cell of a grid.
-
-    Args:
-        data: the scenes.
-    """
-
-    data: DataConfig = field(default_factory=DataConfig)
-
-
-@dataclass(frozen=True)
-class PoliciesConfig(LookingConfig):
-    """Policies that choose among the cells, in the episodes of a protocol.
+class RunConfig(LookingConfig):
+    """Policies that choose among the cells of scenes, in the episodes of a protocol.
 
     Args:
         saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
-    """
-
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
-    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
-
-    @property
-    def class_templates(self) -> str | None:
-        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
-        return None
-
-
-@dataclass(frozen=True)
-class RunConfig(PoliciesConfig, ScenesConfig):
-    """Policies that look at the scenes of a data set, in the episodes of a protocol.
-
-    Args:
         models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
 
     Attributes:
@@ -344,7 +308,15 @@ class RunConfig(PoliciesConfig, ScenesConfig):
     """
 
     task: ClassVar[Task] = "search"
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policies: tuple[str | PolicyConfig, ...] = ("recommended",)
     models: Path | None = None
+
+    @property
+    def class_templates(self) -> str | None:
+        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
+        return None
 
     def complete(self, folder: ModelFolder) -> Self:
         """The settings, completed by the values that this kind of run takes from a folder of models."""

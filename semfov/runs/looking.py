@@ -14,12 +14,11 @@ from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import BeliefConfig, LookingConfig, ScenesConfig
-from semfov.runs.remembered import look_everywhere
+from semfov.runs.config import BeliefConfig, LookingConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
-from semfov.runs.store import cell_store
+from semfov.runs.store import cell_store, look_everywhere
 
 
 class Looking(SceneRun):
@@ -50,12 +49,10 @@ class Looking(SceneRun):
 
     def check_sources(self) -> None:
         """Check that the files of the scenes and of the detector exist, before any of them is loaded."""
-        assert isinstance(self.config, ScenesConfig)
         check_sources(self.config.data, self.config.detector)
 
     def open_scenes(self) -> Scenes:
         """Open the scenes of the settings; a subclass may open others."""
-        assert isinstance(self.config, ScenesConfig)
         return make_scenes(self.config.data, self.eye.detector.classes)
 
     def depends_on(self) -> dict[str, Any]:
@@ -123,7 +120,7 @@ def looking_of(config: Any) -> Looking:
         The looks, none of which has been taken yet (`finish` takes them).
     """
     return Looking(
-        ScenesConfig(
+        LookingConfig(
             data=config.data,
             detector=config.detector,
             sensor=config.sensor,

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from semfov.belief.observers import Observer
 from semfov.errors import check, lookup
-from semfov.gaze.policies import Task
+from semfov.gaze.policies import POLICIES, Task
 from semfov.gaze.templates import at_points
+from semfov.io.code import class_digest
 from semfov.runs.candidates import Candidate, belief_settings, load_models, make_strategy
-from semfov.runs.config import PoliciesConfig, PolicyConfig, SaliencyModel
+from semfov.runs.config import PolicyConfig, RunConfig, SaliencyModel
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
-from semfov.runs.scene_run import store_folder
+from semfov.runs.scene_run import digest_of, store_folder
 from semfov.strategy import Strategy
 
 
 class PolicyLooking(Looking):
-    """Looks at scenes, and policies with the tables that they need for each scene.
+    """Looks at scenes, and policies that are compared in them, with the tables that they need for each scene.
+
+    A subclass runs their episodes (`outcomes`).
 
     Args:
         config: the settings.
@@ -34,9 +40,9 @@ class PolicyLooking(Looking):
     """
 
     task: Task
-    config: PoliciesConfig
+    config: RunConfig
 
-    def __init__(self, config: PoliciesConfig) -> None:
+    def __init__(self, config: RunConfig) -> None:
         labels = [label(choice, self.task) for choice in config.policies]
         for name in labels:
             check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
@@ -54,9 +60,29 @@ class PolicyLooking(Looking):
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
         size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency, sensor, size)
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, size)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
+        }
+
+    def _code(self) -> str:
+        """Digest of the code of the run, and of policies that the user registered."""
+        chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
+        foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
+        return digest_of([super()._code(), [class_digest(POLICIES[name]) for name in foreign]])
+
+    def depends_on(self) -> dict[str, Any]:
+        """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""
+        config, models = self.config, self.models
+        policies = {name: asdict(policy) for name, policy in self.policies.items()}
+        return {
+            **super().depends_on(),
+            "task": self.task,
+            "models": [models.observation, models.evidence, models.map, models.templates],
+            "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
+            "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
+            "policies": policies,
+            "saliency": asdict(config.saliency) if self.saliency_stores else None,
         }
 
     def stored(self, index: int) -> bytes | None:
@@ -96,9 +122,9 @@ class PolicyLooking(Looking):
         digest, store = self.digest(index), self.saliency_stores[name]
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
-            image = self.scenes[index].image
-            reference = self.config.sensor.reference
-            saliency = saliency_table(name, self.config.saliency, self.eye.sensor, reference, image, self.grid(index))
+            image, how = self.scenes[index].image, self.config.saliency
+            seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
+            saliency = saliency_table(name, how.view, how.reduction, *seen)
             if self.config.store:
                 store.save(digest, saliency)
         return saliency

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -26,21 +26,8 @@ _SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
 SALIENCY_CLASSES: dict[str, Callable[[], SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
 
-class SaliencySettings(Protocol):
-    """The settings of saliency that its values depend on (`semfov.runs.config.SaliencyConfig`).
-
-    The class is not imported: stored saliency would then depend on the code of all settings, and on what they import.
-    """
-
-    @property
-    def view(self) -> Literal["foveated", "picture"]:
-        """What saliency is computed of: the foveated view from each fixation, or the whole photograph once."""
-        ...
-
-    @property
-    def reduction(self) -> Reduction:
-        """How the saliency of a cell follows from that of its pixels."""
-        ...
+SaliencyView = Literal["foveated", "picture"]
+"""What saliency is computed of: the foveated view from each fixation, or the whole photograph once."""
 
 
 class SaliencyStore(SceneStore):
@@ -49,25 +36,32 @@ class SaliencyStore(SceneStore):
     Args:
         folder: folder of the store.
         name: name of the saliency model.
-        saliency: settings of the saliency baselines.
+        view: what saliency is computed of.
+        reduction: how the saliency of a cell follows from that of its pixels.
         sensor: settings of the sensor; the saliency of the whole photograph does not depend on them.
         grid: `(columns, rows)`.
     """
 
     def __init__(
-        self, folder: Path, name: str, saliency: SaliencySettings, sensor: Mapping[str, Any], grid: tuple[int, int]
+        self,
+        folder: Path,
+        name: str,
+        view: SaliencyView,
+        reduction: Reduction,
+        sensor: Mapping[str, Any],
+        grid: tuple[int, int],
     ) -> None:
         what = {
             "model": name,
-            "view": saliency.view,
-            "reduction": saliency.reduction,
-            "sensor": sensor if saliency.view == "foveated" else None,
+            "view": view,
+            "reduction": reduction,
+            "sensor": sensor if view == "foveated" else None,
             "grid": list(grid),
         }
         cells = grid[0] * grid[1]
         schema = Schema({"saliency": Field(("F", cells), low=0)})
         super().__init__(folder, what, looks_digest(*_SOURCES), schema)
-        self.fixations = cells if saliency.view == "foveated" else 1
+        self.fixations = cells if view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:
         """The saliency of a scene; None if it is missing or incomplete."""
@@ -80,7 +74,7 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_table(
-    name: str, saliency: SaliencySettings, sensor: Sensor, reference: float, image: Tensor, grid: Grid
+    name: str, view: SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
     """Saliency of every cell of a photograph.
 
@@ -89,7 +83,8 @@ def saliency_table(
 
     Args:
         name: name of the saliency model.
-        saliency: settings of the saliency baselines.
+        view: what saliency is computed of.
+        reduction: how the saliency of a cell follows from that of its pixels.
         sensor: the sensor.
         reference: longer side in pixels of the images that the sensor's settings are for.
         image: `(3, H, W)`.
@@ -100,13 +95,12 @@ def saliency_table(
     """
     model = SALIENCY_CLASSES[name]()
     with one_thread(), torch.inference_mode():
-        if saliency.view == "picture":
-            return saliency_of_cells(model, image[None], grid, saliency)
+        if view == "picture":
+            return cell_saliency(model(image[None]), grid.columns, grid.rows, reduction)
         state, fixations = open_at_reference(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
-        return torch.cat(
-            [saliency_of_cells(model, sensor.picture(state, point[None]), grid, saliency) for point in fixations]
-        )
+        seen = (sensor.picture(state, point[None]) for point in fixations)
+        return torch.cat([cell_saliency(model(each), grid.columns, grid.rows, reduction) for each in seen])
 
 
 def open_at_reference(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
@@ -115,8 +109,3 @@ def open_at_reference(sensor: Sensor, reference: float, image: Tensor, points: T
     size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
     ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
     return sensor.open(resize(image[None], size), ratio.new_ones(2)), (points + 0.5) * ratio - 0.5
-
-
-def saliency_of_cells(model: SaliencyMap, pictures: Tensor, grid: Grid, saliency: SaliencySettings) -> Tensor:
-    """Saliency of the cells of pictures `(B, 3, h, w)`, `(B, X·Y)`."""
-    return cell_saliency(model(pictures), grid.columns, grid.rows, saliency.reduction)

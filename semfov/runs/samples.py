@@ -137,6 +137,8 @@ class SampleSettings:
         iou: smallest intersection over union at which a detection matches an object.
         seed: random seed of the fixations.
         shard: number of photographs in a shard, the unit of work.
+        mosaics: number of mosaics, for windows; `fixations` is then the number of windows at each magnification.
+        holdout: n; every n-th mosaic is composed of every n-th photograph, and the other mosaics of the others.
     """
 
     data: DataConfig
@@ -146,15 +148,13 @@ class SampleSettings:
     iou: float
     seed: int
     shard: int = 32
+    mosaics: int = 0
+    holdout: int = 10
 
     @classmethod
     def of(cls, config: Any) -> SampleSettings:
-        """Take these settings from those of a command, by their names."""
-        return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
-
-    def sampler(self, folder: Path) -> Sampler:
-        """The sampler with these settings, whose shards are in a folder."""
-        return Sampler(self, folder)
+        """Take those of these settings that a command has, by their names."""
+        return cls(**{each.name: getattr(config, each.name) for each in fields(cls) if hasattr(config, each.name)})
 
 
 CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
@@ -307,16 +307,18 @@ class Sampler:
 _process: dict[str, Sampler] = {}
 
 
-def _prepare(settings: SampleSettings, folder: Path) -> None:
+def _prepare(kind: type[Sampler], settings: SampleSettings, folder: Path) -> None:
     prepare_worker()
-    _process["sampler"] = settings.sampler(folder)
+    _process["sampler"] = kind(settings, folder)
 
 
 def _run_shard(shard: int) -> bytes:
     return pack_tensors(_process["sampler"].sample(shard).tensors())
 
 
-def collect_samples(settings: SampleSettings, folder: Path, where: Where, title: str) -> Sampler:
+def collect_samples(
+    settings: SampleSettings, folder: Path, where: Where, title: str, kind: type[Sampler] = Sampler
+) -> Sampler:
     """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
 
     The result is the same to the last bit wherever the work is done, on processors of one kind.
@@ -326,18 +328,19 @@ def collect_samples(settings: SampleSettings, folder: Path, where: Where, title:
         folder: folder of the shards.
         where: where the work is done (`semfov.runs.workers.Where`).
         title: label of the progress bar.
+        kind: the class of the sampler.
 
     Returns:
         The sampler, which reads the samples.
     """
-    sampler = settings.sampler(folder)
+    sampler = kind(settings, folder)
     todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
     done = run_tasks(
         _run_shard,
         todo,
         where=where,
         setup=_prepare,
-        settings=(settings, folder),
+        settings=(kind, settings, folder),
         title=title,
         unit="shard",
     )

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -68,7 +67,7 @@ class SceneRun(ABC):
 
     def own_settings(self, *others: str) -> dict[str, Any]:
         """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
-        return {name: value for name, value in asdict(self.config).items() if name not in (*_BESIDES, *others)}
+        return {name: value for name, value in self.config.plain().items() if name not in (*_BESIDES, *others)}
 
     def _code(self) -> str:
         """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""

@@ -135,6 +135,64 @@ def choose_classes(
     return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
 
 
+@dataclass(frozen=True)
+class DrawnSearch:
+    """A search for a drawn class, which the photograph may hold or not.
+
+    Attributes:
+        target: the class, 1..K.
+        goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
+        start: `(1,)`, the first fixated cell.
+        noise: `(1, shifts+1, X·Y)`, random numbers that choose among cells of equal value.
+    """
+
+    target: int
+    goal: Tensor
+    start: Tensor
+    noise: Tensor
+
+    @property
+    def present(self) -> bool:
+        """Whether the photograph holds the class."""
+        return bool(self.goal.any())
+
+
+def choose_searches(
+    scenes: Scenes,
+    index: int,
+    grid: Grid,
+    protocol: ProtocolConfig,
+    classes: int,
+    max_area: float,
+    absent: int | None = None,
+) -> list[DrawnSearch]:
+    """Draw searches of a photograph: their classes (`choose_classes`), first fixations and ties.
+
+    Args:
+        scenes: the data set.
+        index: index of the scene.
+        grid: the cells.
+        protocol: gaze shifts, ties and seed.
+        classes: largest number of present classes.
+        max_area: classes that cover a larger share of the image are left out.
+        absent: largest number of absent classes (None: the number of present classes that were drawn).
+
+    Returns:
+        The searches, those for present classes first.
+    """
+    annotation, scene, seed = scenes.annotation(index), scenes.ids[index], protocol.seed
+    covered = grid.footprint(annotation.boxes)
+    return [
+        DrawnSearch(
+            target,
+            covered[annotation.labels == target].any(0),
+            torch.randint(len(grid), (1,), generator=generator_for("start", seed, scene, target)),
+            noise_for(protocol, len(grid), scene, target, 0)[None],
+        )
+        for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+    ]
+
+
 def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
     """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
     return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
+
+import yaml
 
 from semfov.errors import check
 from semfov.io.schema import excerpt, interval, is_number
@@ -76,11 +79,31 @@ class Settings:
 
     A class documents its own settings, and inherited ones only where they mean something else: `--help` takes the
     other descriptions from its bases.
+
+    Attributes:
+        unused: inherited settings that mean nothing here. They keep their defaults, and are neither options of the
+            command nor written with its outcomes.
     """
+
+    unused: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         """Check all values (`check_settings`)."""
         check_settings(type(self), vars(self), nested=False)
+
+    def plain(self) -> dict[str, Any]:
+        """The settings as JSON values, in which paths are text and tuples are lists."""
+        return plain({name: value for name, value in asdict(self).items() if name not in self.unused})
+
+    def yaml(self) -> str:
+        """The settings as a file that `--config` reads."""
+        return yaml.safe_dump(self.plain(), sort_keys=False)
+
+
+def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert settings to JSON values: paths become text, tuples become lists."""
+    values: dict[str, Any] = json.loads(json.dumps(settings, default=str))
+    return values
 
 
 _WORDS = {int: "a whole number", float: "a number", str: "a name"}

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import logging
 import multiprocessing
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from semfov.belief import MapEvidence, TargetEvidence, Verification
+from semfov.data.coco import CocoScenes
 from semfov.data.scene import Scenes
+from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
@@ -27,6 +29,9 @@ from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
+
+Learned = TypeVar("Learned", TargetEvidence, MapEvidence, Verification)
+Made = TypeVar("Made")
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -52,21 +57,19 @@ def check_data(data: DataConfig) -> None:
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
     check_data(data)
-    if data.root is None or data.annotations is None:
-        from semfov.data.scenes import EmbeddedScenes
-
+    if data.root is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
-    from semfov.data.coco import CocoScenes
+    return _photographs(data, classes, None if data.ids is None else read_ids(data.ids), data.limit)
 
-    return CocoScenes(
-        data.root,
-        data.annotations,
-        classes,
-        min_instances=data.min_instances,
-        ids=None if data.ids is None else read_ids(data.ids),
-        max_target_area=data.max_target_area,
-        limit=data.limit,
-    )
+
+def _photographs(
+    data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] | None, limit: int | None = None
+) -> Scenes:
+    """The photographs with these ids (None: all) that the settings select."""
+    assert data.root is not None
+    assert data.annotations is not None
+    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
+    return CocoScenes(data.root, data.annotations, classes, ids=ids, limit=limit, **selection)
 
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
@@ -84,24 +87,14 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
         InputError: there are too few photographs to split.
     """
     check_data(data)
-    if data.root is None or data.annotations is None:
-        from semfov.data.scenes import EmbeddedScenes
-
-        count = data.limit or 16
-        return (
-            EmbeddedScenes(classes, count=count, seed=data.scene_seed),
-            EmbeddedScenes(classes, count=count, seed=data.scene_seed + 1),
-        )
-    from semfov.data.coco import CocoScenes
-
-    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
-    ids: list[Any] = [*make_scenes(data, classes).ids]
+    if data.root is None:
+        count, seeds = data.limit or 16, (data.scene_seed, data.scene_seed + 1)
+        larger, smaller = (EmbeddedScenes(classes, count=count, seed=seed) for seed in seeds)
+        return larger, smaller
+    ids = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
     others = [name for number, name in enumerate(ids) if number % every]
-    return (
-        CocoScenes(data.root, data.annotations, classes, ids=others, **selection),
-        CocoScenes(data.root, data.annotations, classes, ids=ids[::every], **selection),
-    )
+    return _photographs(data, classes, others), _photographs(data, classes, ids[::every])
 
 
 def read_ids(path: Path) -> list[str]:
@@ -128,21 +121,9 @@ def detector_options(detector: DetectorConfig) -> dict[str, Any]:
             f"detector.head: expected null, since detector.name {detector.name!r} is not an ONNX file, got "
             f"{detector.head!r}"
         )
-    options: dict[str, Any] = {
-        "threshold": detector.threshold,
-        "iou": detector.iou,
-        "limit": detector.limit,
-    }
-    for name in ("background", "weights", "classes", "head"):
-        if getattr(detector, name) is not None:
-            options[name] = getattr(detector, name)
-    if detector.stride != "auto":
-        options["stride"] = detector.stride
-    if detector.input_size is not None:
-        options["input_size"] = detector.input_size
-    if detector.runtime != "auto":
-        options["runtime"] = detector.runtime
-    return options
+    default, options = DetectorConfig(), ("background", "weights", "classes", "head", "stride", "input_size", "runtime")
+    changed = [name for name in options if getattr(detector, name) != getattr(default, name)]
+    return {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
@@ -193,34 +174,23 @@ def observation_name(eye: Eye) -> str:
     return shipped_model(FovealObservationModel, recommended_model(detector.name, growth_of(eye)), "MODEL")
 
 
-def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
-    """Load learned target evidence by name, or the one shipped for the eye; check that it fits the eye."""
+def make_learned(kind: type[Learned], name: str | None, eye: Eye) -> Learned:
+    """Load a learned model by name, or the one shipped for the eye; check that it fits the eye."""
     if name is None:
-        name = shipped_model(TargetEvidence, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
-    model = TargetEvidence.from_pretrained(name)
+        name = shipped_model(kind, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
+    model = kind.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 
 
-def make_verification(name: str | None, eye: Eye) -> Verification | None:
-    """Load a model of verification by name, or the one shipped for the eye, if there is one; check that it fits."""
-    if name is not None:
-        model: Verification | None = Verification.from_pretrained(name)
-    else:
-        model = Verification.if_shipped(learned_for(eye.detector.name, growth_of(eye)))
-    if model is None:
+def if_shipped(make: Callable[[str | None, Eye], Made], name: str | None, eye: Eye) -> Made | None:
+    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped."""
+    try:
+        return make(name, eye)
+    except InputError:
+        if name is not None:
+            raise
         return None
-    model.check_compatible(eye.settings())
-    return model.requires_grad_(False)
-
-
-def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
-    """Load a learned map by name, or the one shipped for the eye; check that it fits the eye."""
-    if name is None:
-        name = shipped_model(MapEvidence, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
-    model = MapEvidence.from_pretrained(name)
-    model.check_compatible(eye.settings())
-    return model.requires_grad_(False)
 
 
 def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
@@ -228,11 +198,6 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     model = ClassTemplates.from_pretrained(name or eye.detector.name)
     model.check_eye(eye.settings(), eye.detector.classes)
     return model
-
-
-def plain(settings: dict[str, Any]) -> Any:
-    """Convert settings to JSON values: paths become text, tuples become lists."""
-    return json.loads(json.dumps(settings, default=str))
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

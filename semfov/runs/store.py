@@ -1,4 +1,4 @@
-"""Stores looks at scenes, so that each is computed only once.
+"""Looks at scenes, each computed only once: in memory and, with a store, on disk.
 
 Scenes are static, so what a look shows is a function of scene and action: the cell, the pose and cell, the box or the
 window that the eye looks at. A store keeps looks under a key of everything that they depend on. It changes the duration
@@ -9,7 +9,7 @@ import hashlib
 import json
 import platform
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -18,10 +18,11 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
+from semfov.eye import Eye
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import read_tensors, write_tensors
-from semfov.runs.looks import LOOK_SOURCES, BoxKey
+from semfov.runs.looks import LOOK_SOURCES, BoxKey, one_thread, photograph_looks
 from semfov.version import __version__
 
 Action = TypeVar("Action", bound=Hashable)
@@ -200,6 +201,81 @@ def cell_store(
     centres = Grid(columns, rows, (641, 479)).centres.tolist()
     what = {"settings": settings, "grid": [columns, rows], "centres": centres}
     return DetectionStore(folder, what, LOOK_SOURCES, components)
+
+
+class RememberedLooks(Generic[Action, StoredLook]):
+    """Looks at one scene by action, each made once: read from a store, or computed when it is first asked for.
+
+    Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
+    batch nor on the number of CPU cores.
+
+    Args:
+        open_scene: opens the scene; returns the function that looks. It is called only when a look is missing.
+        store: store of the looks; None keeps them in memory.
+        digest: gives the sha256 of what the pixels of the scene depend on; called only with a store.
+    """
+
+    def __init__(
+        self,
+        open_scene: Callable[[], Callable[[Action], StoredLook]],
+        store: LookStore[Action, StoredLook] | None = None,
+        digest: Callable[[], str] = lambda: "",
+    ) -> None:
+        self._open, self._store, self._digest = open_scene, store, digest
+        self._look: Callable[[Action], StoredLook] | None = None
+        self._looks: dict[Action, StoredLook] | None = None
+        self._stored = 0
+
+    @property
+    def looks(self) -> dict[Action, StoredLook]:
+        """All looks so far, by action."""
+        if self._looks is None:
+            self._looks = {} if self._store is None else self._store.load(self._digest())
+            self._stored = len(self._looks)
+        return self._looks
+
+    def __call__(self, action: Action) -> StoredLook:
+        """Look, or remember."""
+        looks = self.looks
+        if action not in looks:
+            with one_thread(), torch.inference_mode():
+                self._look = self._open() if self._look is None else self._look
+                looks[action] = self._look(action)
+        return looks[action]
+
+    def save(self) -> None:
+        """Store the looks at the scene if there are new ones."""
+        if self._store is not None and self._looks is not None and len(self._looks) > self._stored:
+            self._store.save(self._digest(), self._looks)
+            self._stored = len(self._looks)
+
+    def close(self) -> None:
+        """Store new looks, and free the opened scene and the stored looks; a later look reads them again."""
+        self._look = None
+        self.save()
+        if self._store is not None:
+            self._looks = None
+
+
+def look_everywhere(
+    eye: Eye, image: Callable[[], Tensor], grid: Grid, store: DetectionStore | None, digest: Callable[[], str]
+) -> Detections:
+    """Detections from the centre of every cell of a photograph, read from a store, or computed and stored.
+
+    Args:
+        eye: sensor and detector.
+        image: gives the image, `(1, 3, H, W)`.
+        grid: the cells.
+        store: store of the looks; None stores none.
+        digest: gives the sha256 of what the pixels depend on.
+
+    Returns:
+        The detections, a batch of X·Y.
+    """
+    looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)
+    detections = Detections.stack([looks(cell) for cell in range(len(grid))])
+    looks.save()
+    return detections
 
 
 def versions() -> dict[str, object]:

@@ -22,9 +22,14 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     return text.getvalue()
 
 
+def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:
+    """A value and its standard error, such as `12.3 ± 0.4`; with `sign="+"` the value always has its sign."""
+    return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
+
+
 def percent(value: float, error: float) -> str:
-    """A share and its standard error in percent, such as `12.3 ± 0.4`."""
-    return f"{100 * value:.1f} ± {100 * error:.1f}" if math.isfinite(error) else f"{100 * value:.1f}"
+    """A share in percent with its standard error, if there is one."""
+    return plus_minus(100 * value, 100 * error) if math.isfinite(error) else f"{100 * value:.1f}"
 
 
 def share(count: int, total: int) -> str:

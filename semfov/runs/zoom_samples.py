@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 import torch
@@ -15,7 +13,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.observation.matching import match
 from semfov.runs.looks import one_thread
-from semfov.runs.samples import Sampler, Samples, SampleSettings
+from semfov.runs.samples import Sampler, Samples
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.zoom_store import WINDOW_SOURCES as GLANCES
@@ -27,23 +25,6 @@ COLUMNS, ROWS, TILE = 8, 6, (480, 360)
 
 Such a mosaic is so large that the overview reduces it by more than three octaves.
 """
-
-
-@dataclass(frozen=True)
-class MosaicSettings(SampleSettings):
-    """Settings that labelled detections in windows depend on.
-
-    Attributes:
-        mosaics: number of mosaics; `fixations` is the number of windows at each magnification.
-        holdout: n; every n-th mosaic is composed of every n-th photograph, and the other mosaics of the others.
-    """
-
-    mosaics: int = 0
-    holdout: int = 10
-
-    def sampler(self, folder: Path) -> Sampler:
-        """The sampler with these settings, whose shards are in a folder."""
-        return MosaicSampler(self, folder)
 
 
 class HeldOutMosaics:
@@ -90,7 +71,6 @@ class MosaicSampler(Sampler):
     Fixations are `(x, y, magnification)`.
     """
 
-    settings: MosaicSettings
     sources = (*GLANCES, "semfov.data.mosaics", __name__)
     coordinates = 3
 

@@ -10,8 +10,7 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.io.schema import Field
-from semfov.runs.remembered import RememberedLooks
-from semfov.runs.store import LookStore, pack, unpack
+from semfov.runs.store import LookStore, RememberedLooks, pack, unpack
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window

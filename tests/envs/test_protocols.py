@@ -3,10 +3,8 @@
 import gymnasium
 import pytest
 
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.explore.run import ExploreConfig, ExploreRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 

@@ -1,57 +1,35 @@
-"""`python -m eval.calibration` as a user runs it: small, on the embedded scenes, with the real detector."""
+"""The files of a small run of `python -m eval.calibration`."""
 
 import csv
 import json
 
 import pytest
-import torch
 
-from eval.calibration import main
-from semfov.belief import MapEvidence, TargetEvidence
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.config import DetectorConfig, SensorConfig
-from semfov.runs.setup import make_eye
+from tests.lab.commands.table import small_run
 
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
 
 
 @pytest.fixture(scope="module")
-def arguments(tmp_path_factory):
-    """Arguments of a run of two scenes on 5 × 4 cells with untrained models."""
-    folder = tmp_path_factory.mktemp("calibration")
-    settings = make_eye(DetectorConfig(), SensorConfig()).settings()
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        TargetEvidence(8, 6, metadata=settings).save(folder / "target.safetensors")
-        MapEvidence(8, 6, metadata=settings).save(folder / "map.safetensors")
-    return [
-        "--data.limit", "2", "--fixations", "1", "--grid", "[5,4]", "--target_area", "0.5",
-        "--target_model", str(folder / "target.safetensors"), "--map_model", str(folder / "map.safetensors"),
-        "--cache", str(folder / "cache"),
-    ]  # fmt: skip
+def finished(tmp_path_factory):
+    """A run of four photographs on 3 × 2 cells with untrained models."""
+    return small_run("eval.calibration", tmp_path_factory.mktemp("calibration"))
 
 
-@pytest.fixture(scope="module")
-def finished(arguments, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out")
-    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
-    return out
-
-
-@pytest.mark.weights
 def test_run_writes_tables_sums_and_figures(finished):
     for name in ("calibration.md", "config.yaml", "reliability.png", "beliefs.png", *FILES):
         assert (finished / name).stat().st_size > 200
     rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
     whole = [row for row in rows if row["cells"] == "all"]
-    assert [(row["belief"], row["looks"]) for row in whole] == [(b, n) for b in BELIEFS for n in ("1", "5", "15")]
-    # Two scenes, each with a present and an absent class: 4 searches of 20 cells.
-    assert {row["count"] for row in whole} == {"80"}
-    assert {row["count"] for row in rows if (row["looks"], row["cells"]) == ("15", "fixated")} == {"60"}
+    assert [(row["belief"], row["looks"]) for row in whole] == [(b, n) for b in BELIEFS for n in ("1", "5")]
+    # Four present and two absent classes, as two photographs hold all three: 6 searches of 6 cells.
+    assert {row["count"] for row in whole} == {"36"}
+    assert {row["count"] for row in rows if (row["looks"], row["cells"]) == ("5", "fixated")} == {"30"}
     text = (finished / "beliefs.md").read_text()
-    assert "4 searches" in text
-    assert "2 of them for a class that is present" in text
+    assert "6 searches" in text
+    assert "4 of them for a class that is present" in text
     assert "half of the target classes are present" in text
     by_looks = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
     for row in whole:
@@ -60,7 +38,6 @@ def test_run_writes_tables_sums_and_figures(finished):
         assert [float(value) for value in shown[3:]] == pytest.approx([float(f) for f in figures], abs=1.01e-4)
 
 
-@pytest.mark.weights
 def test_sums_in_the_file_add_up_to_the_figures(finished):
     written = json.loads((finished / "beliefs.json").read_text())
     assert written["edges"] == BinarySums.EDGES.tolist()
@@ -73,12 +50,3 @@ def test_sums_in_the_file_add_up_to_the_figures(finished):
         parts = [s for s in written["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
         if each["cells"] == "all":
             assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2
-
-
-@pytest.mark.slow
-@pytest.mark.weights
-def test_scores_can_be_evaluated_without_beliefs(arguments, tmp_path, capsys):
-    assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0
-    assert "classwise ECE" in capsys.readouterr().out
-    assert not list(tmp_path.glob("beliefs*"))
-    assert not (tmp_path / "parts").exists()

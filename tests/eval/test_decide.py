@@ -1,25 +1,21 @@
-"""`python -m eval.decide` as a user runs it: small, on the embedded scenes, with the real detector."""
+"""The table and the records of decisions: those of a small run, and by hand."""
 
 import json
 
 import pytest
 import torch
 
-from eval.decide import main
 from eval.decide.report import decision_summary
-from semfov.belief import TargetEvidence
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
 from semfov.metrics.presence import area_under_roc, hits_at
-from semfov.runs.config import DetectorConfig, SensorConfig
-from semfov.runs.setup import make_eye
 from semfov.runs.tables import mean_or_dash, share
+from tests.lab.commands.table import small_run
 
 POLICIES = [
     "target-evidence",
     "random gaze",
-    "calibrated belief",
-    "calibrated belief, a detection at the gaze",
+    "published belief",
+    "published belief, a detection at the gaze",
 ]
 REFERENCES = ["one sharp look, highest score", "sharp look and its quarters, highest score", "class frequency"]
 
@@ -32,50 +28,35 @@ def rows_of(text):
 
 
 @pytest.fixture(scope="module")
-def arguments(tmp_path_factory):
-    """Arguments of a run of two scenes on 4 × 3 cells with an untrained model."""
-    folder = tmp_path_factory.mktemp("decide")
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = TargetEvidence(8, 6, thresholds=Thresholds(0.6, 0.3))
-    model.metadata = make_eye(DetectorConfig(), SensorConfig()).settings()
-    model.save(folder / "model.safetensors")
-    return [
-        "--data.limit", "2", "--data.max_target_area", "0.5", "--belief.columns", "4", "--belief.rows", "3",
-        "--belief.target_model", str(folder / "model.safetensors"), "--protocol.shifts", "5",
-        "--cache", str(folder / "cache"),
-    ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def finished(arguments, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out")
-    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
-    return out
+def finished(tmp_path_factory):
+    """A run of four photographs on 3 × 2 cells with untrained models."""
+    model = ("--belief.model", "HERE/observation.safetensors")
+    return small_run("eval.decide", tmp_path_factory.mktemp("decide"), *model)
 
 
 def records_in(out):
     return [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.weights
 def test_run_writes_table_and_records(finished):
     records = records_in(finished)
-    assert len(records) == 16
+    assert len(records) == 24
     for record in records:
         assert record["policy"] in POLICIES
         assert record["outcome"] in OUTCOMES
-        assert 1 <= record["looks"] <= 6
+        assert 1 <= record["looks"] <= 4
         assert 0 < record["probability"] < 1
-    assert [record["present"] for record in records] == 2 * [*[True] * 4, *[False] * 4]
+    # Two photographs hold all three classes, so that none is absent.
+    there = {(record["scene"], record["target"]): record["present"] for record in records}
+    assert sorted(there.values()) == [False] * 2 + [True] * 4
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
     places, lands = [*POLICIES, "one sharp look"], POLICIES
     compared = ["difference to target-evidence", *POLICIES[1:], *REFERENCES]
     assert [row[0] for row in rows] == [*POLICIES, *REFERENCES, *places, *compared, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
-    assert "4 searches" in text
-    assert "2 of them for a present class" in text
+    assert "6 searches" in text
+    assert "4 of them for a present class" in text
     for row in rows[:4]:
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])

@@ -8,15 +8,14 @@ import pytest
 import torch
 
 from eval.explore import explore
-from eval.explore.config import ExploreConfig
-from eval.explore.references import FUSED, PAINTED
-from eval.explore.run import ExploreRun
+from eval.explore.run import FUSED, PAINTED, ExploreConfig, ExploreRun
 from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import closure
 from semfov.runs import saliency_store
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SaliencyConfig
+from semfov.runs.config import DetectorConfig
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -24,16 +23,8 @@ pytestmark = pytest.mark.weights
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):
     """A run of two scenes on 4 × 3 cells."""
-    folder = tmp_path_factory.mktemp("explore")
-    return ExploreConfig(
-        data=DataConfig(limit=2),
-        belief=BeliefConfig(columns=4, rows=3),
-        protocol=ProtocolConfig(starts=2, shifts=4),
-        policies=("random-raw", "kl-calibrated", "vocus2-raw"),
-        cache=folder / "cache",
-        out=folder / "out",
-        workers=1,
-    )
+    settings = run_settings(tmp_path_factory.mktemp("explore"), 2, starts=2, shifts=4)
+    return ExploreConfig(**settings, policies=("random-raw", "kl-calibrated", "vocus2-raw"))
 
 
 @pytest.fixture(scope="session")
@@ -124,7 +115,7 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     peak = divmod(int(seen.argmax()), seen.shape[-1])
     peak_cell = int(peak[0] * 3 / seen.shape[0]) * 4 + int(peak[1] * 4 / seen.shape[1])
     assert stored[5].argmax() == peak_cell
-    picture = saliency_table("vocus2", SaliencyConfig(view="picture", reduction="mean"), sensor, 640.0, image, grid)
+    picture = saliency_table("vocus2", "picture", "mean", sensor, 640.0, image, grid)
     assert picture.shape == (1, 12)
     expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
     torch.testing.assert_close(picture, expected)
@@ -151,7 +142,7 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     settings = run.eye.settings()["sensor"]
 
     def key(name="vocus2", view="foveated", reduction="max", sensor=settings, grid=(4, 3)):
-        return SaliencyStore(folder, name, SaliencyConfig(view, reduction), sensor, grid).key
+        return SaliencyStore(folder, name, view, reduction, sensor, grid).key
 
     other = {**settings, "sigma": 50.0}
     keys = [

@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from eval.explore.config import ExploreConfig
+from eval.explore.run import ExploreConfig
 from eval.page import paper
 from eval.page.curves import behind, corrected_signs
 from eval.page.experiments import AT_THRESHOLDS, SCORE_THRESHOLDS, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
-from eval.page.findings import BASELINES, COUNTED, FINDINGS, TESTED, Advantage, Finding, Overtaken
+from eval.page.findings import BASELINES, COUNTED, FINDINGS, TESTED, VERDICTS, Advantage, Finding, Overtaken
 from eval.page.origin import missing, origin
 from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
-from eval.page.verdicts import VERDICTS
 from eval.results import PLACE, WHOLE, fill_page, page_table, results
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.config import SensorConfig
 from semfov.runs.presets import label

@@ -4,17 +4,13 @@ import csv
 import json
 
 import pytest
-import torch
 import yaml
 
 from eval.search import search
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
-from semfov.detection import Detections
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
-from semfov.runs.looks import look_from
+from eval.search.run import SearchConfig
+from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
-from semfov.runs.store import cell_store
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -22,17 +18,9 @@ pytestmark = pytest.mark.weights
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):
     """A run of two scenes on 4 × 3 cells."""
-    folder = tmp_path_factory.mktemp("search")
-    return SearchConfig(
-        data=DataConfig(limit=2),
-        belief=BeliefConfig(columns=4, rows=3),
-        protocol=ProtocolConfig(starts=3, shifts=6),
-        policies=("random", "itti-koch", PolicyConfig("non-predictive", tempering=0.25), "non-predictive-raw"),
-        cache=folder / "cache",
-        out=folder / "out",
-        workers=1,
-        scanpaths=1,
-    )
+    policies = ("random", "itti-koch", PolicyConfig("non-predictive", tempering=0.25), "non-predictive-raw")
+    settings = run_settings(tmp_path_factory.mktemp("search"), 2, starts=3, shifts=6)
+    return SearchConfig(**settings, policies=policies, scanpaths=1)
 
 
 @pytest.fixture(scope="session")
@@ -74,22 +62,3 @@ def test_run_writes_records_tables_and_figures(finished):
     summary = (finished.out / "summary.md").read_text()
     assert "CP@5" in summary
     assert "| non-predictive-raw, tempering 0.25 |" in summary
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_stored_looks_equal_new_looks_and_damaged_files_are_refused(finished):
-    run = SearchRun(finished)
-    digest = run.scenes.digest(0)
-    stored = Detections.stack([*run.store.load(digest).values()])
-    seen = look_from(run.eye, run.scenes[0].image, run.grid(0).centres)
-    for name in ("boxes", "scores", "mask"):
-        assert torch.equal(getattr(stored, name), getattr(seen, name))
-    path = run.store.path(digest)
-    whole = path.read_bytes()
-    for damage in (whole[: len(whole) // 2], b"", whole[:-40] + bytes([whole[-40] ^ 1]) + whole[-39:]):
-        path.write_bytes(damage)
-        assert run.store.load(digest) == {}
-    path.write_bytes(whole)
-    other = cell_store(path.parent.parent, {"another": "eye"}, 4, 3)
-    other.folder = run.store.folder
-    assert other.load(digest) == {}

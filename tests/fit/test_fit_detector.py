@@ -12,14 +12,15 @@ import pytest
 import torch
 from PIL import Image
 from scipy import stats
+from semfov.detection.coco_classes import COCO_CLASSES
 
 import semfov
 from eval.comparison.model_folder import with_models
 from eval.decide import main as decide
-from eval.decide.config import DecisionConfig
-from eval.explore.config import ExploreConfig
+from eval.decide.run import DecideConfig
+from eval.explore.run import ExploreConfig
 from eval.search import main as search
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov import ActivePerception, DataError, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
@@ -30,8 +31,7 @@ from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
-from semfov.fit.parts.verification import VerificationFit, scores
-from semfov.fit.verification import VerifiedSearch
+from semfov.fit.verification import VerificationFit, VerifiedSearch, scores
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
@@ -163,14 +163,14 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
-    "windows": "fit_mosaics",
+    "parts.windows": "fit_mosaics",
 }
 
 
 def forbid(monkeypatch, *parts):
     """Make the fit of parts fail."""
     for part in parts:
-        monkeypatch.setattr(f"semfov.fit.parts.{part}.{FITS[part]}", None)
+        monkeypatch.setattr(f"semfov.fit.{part}.{FITS[part]}", None)
 
 
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
@@ -327,7 +327,7 @@ def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
     agent = ActivePerception.from_pretrained(folder)
     assert agent.verification is None
     assert isinstance(agent.searching.observer, Target)
-    assert with_models(DecisionConfig(models=folder)).verification is None
+    assert with_models(DecideConfig(models=folder)).verification is None
     assert command(["search", str(home / "photographs/0.png"), "--target", "red", "--models", str(folder)]) == 0
 
 
@@ -335,8 +335,8 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, used=True)
     file = str(folder / "verification.safetensors")
-    assert with_models(DecisionConfig(models=folder)).verification == file
-    assert with_models(DecisionConfig(models=folder, verification="other")).verification == "other"
+    assert with_models(DecideConfig(models=folder)).verification == file
+    assert with_models(DecideConfig(models=folder, verification="other")).verification == "other"
     given = ["--models", str(folder), "--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
     out = tmp_path / "decide"
     assert decide([*data(home), *given, "--out", str(out), "--cache", str(home / "cache")]) == 0
@@ -364,7 +364,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.parts.verification.fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.verification.fit_in_folds", fail)
     assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
@@ -536,5 +536,6 @@ def test_fitting_uses_targets_of_all_sizes():
     config = FitDetectorConfig(model=Path("a.onnx"), data=DataConfig(max_target_area=0.1)).named()
     assert config.data.max_target_area is None
     assert config.detector.background is None
-    assert config.evidence(3).absent == 2
-    assert config.evidence(80).absent is None
+    for classes, absent in ((("cat", "cup", "dog"), 2), (COCO_CLASSES, None)):
+        run = SimpleNamespace(scenes=EmbeddedScenes(classes, count=2))
+        assert PartInputs(config, run).absent == absent

@@ -71,7 +71,7 @@ def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted,
 
 def test_detections_are_drawn_evenly(fitted):
     config = FitObservationConfig(data=DataConfig(limit=6, min_instances=0, max_target_area=None), fixations=2, shard=2)
-    sampler = SampleSettings.of(config).sampler(fitted / "samples")
+    sampler = Sampler(SampleSettings.of(config), fitted / "samples")
     every = sampler.all()
     assert torch.equal(sampler.drawn(len(every)).scores, every.scores)
     some = sampler.drawn(len(every) // 2)
@@ -93,6 +93,8 @@ def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
     counts = [int(row[3]) for row in rows if row[2].strip() == "raw"]
     assert len(counts) == 9
     assert sum(counts[:-1]) == counts[-1]
+    assert not list(tmp_path.glob("beliefs*"))
+    assert not (tmp_path / "parts").exists()
 
 
 def test_samples_match_looks_at_random_fixations(tmp_path):

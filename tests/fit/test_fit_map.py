@@ -1,42 +1,40 @@
-"""`python -m train.fit_map`: small on the embedded scenes, and its examples against loops."""
+"""The fit of the map of all classes: examples and objective against loops, training, evaluation and report."""
 
-import json
 import math
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from eval.explore import main as explore
 from semfov import Grid
 from semfov.belief import MapEvidence
 from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
-from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
 from semfov.fit.examples import ExampleLooks
-from semfov.fit.map import FitMapConfig, frequencies, map_objective, train_gain, train_map
-from semfov.fit.map_examples import make_map_examples
+from semfov.fit.map import (
+    FitMapConfig,
+    frequencies,
+    judge_map,
+    make_map_examples,
+    map_objective,
+    map_report,
+    train_gain,
+    train_map,
+)
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
-from tests.small import scattered
-from train.fit_map import main
+from tests.small import looking
 
 GRID = Grid(4, 4, (640, 480))
 CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def random_detections(index):
-    return scattered(index, GRID, len(CLASSES))
-
-
 @pytest.fixture(scope="module")
 def run():
     """A stand-in for a run with stored looks at four embedded scenes."""
-    return SimpleNamespace(
-        scenes=EmbeddedScenes(CLASSES, count=4), grid=lambda index: GRID, detections=random_detections
-    )
+    return looking(CLASSES, GRID, 4)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +59,7 @@ def test_examples_match_looks_from_every_cell(run, examples):
     assert examples.answers.shape == (4, CELLS, 7)
     for row in range(4):
         index, targets = int(examples.scene[row]), examples.targets[row]
-        annotation, seen = run.scenes.annotation(index), random_detections(index)
+        annotation, seen = run.scenes.annotation(index), run.detections(index)
         features = class_features(seen, GRID.centres, GRID, targets)
         torch.testing.assert_close(examples.features[row].float(), features, atol=2e-3, rtol=2e-3)
         for cell in range(CELLS):
@@ -106,7 +104,7 @@ def test_looks_of_examples_match_stored_looks(run):
     for row, scene in enumerate(chosen.scene.tolist()):
         path, order = cells[row : row + 1], chosen.targets[row]
         alone = rollout(
-            StoredLooks(random_detections(scene), GRID), observer, acquisition, path[:, 0], Given(path), most=4
+            StoredLooks(run.detections(scene), GRID), observer, acquisition, path[:, 0], Given(path), most=4
         )
         for number, step in enumerate(alone):
             stored = step.belief.probabilities[0]
@@ -157,52 +155,16 @@ def test_training_is_repeatable(examples):
     assert all(torch.equal(value, models[1][name]) for name, value in models[0].items())
 
 
-SMALL = [
-    "--data.limit", "3", "--columns", "4", "--rows", "3", "--looks", "3", "--holdout", "2", "--steps", "4",
-    "--gain_steps", "2", "--batch", "2", "--workers", "1",
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A model trained on 3 embedded scenes."""
-    out = tmp_path_factory.mktemp("fit_map")
-    torch.set_num_threads(1)
-    assert main([*SMALL, "--out", str(out / "out"), "--cache", str(out / "cache")]) == 0
-    return out
-
-
-@pytest.mark.weights
-@pytest.mark.slow
-def test_training_writes_model_and_report(trained):
-    model = MapEvidence.from_pretrained(trained / "out/yolov3-tiny.safetensors")
-    assert model.metadata["detector"]["name"] == "yolov3-tiny"
-    assert model.metadata["training"]["steps"] == 4
-    assert model.prior.shape == (81,)
-    judged = json.loads((trained / "out/judged.json").read_text())
-    assert [row["looks"] for row in judged] == [1, 2, 3, 5, 10]  # there are 12 cells
+def test_a_map_is_evaluated_after_each_number_of_looks_and_reported(examples):
+    config = FitMapConfig(columns=4, rows=4)
+    model = MapEvidence(4, 4, components=len(CLASSES) + 1).requires_grad_(False)
+    judged = judge_map(config, model, examples, GRID)
+    assert [row["looks"] for row in judged] == [1, 2, 3, 5, 10, 15]
     assert all(math.isfinite(value) for row in judged for value in row.values())
-    report = (trained / "out/report.md").read_text()
+    report = map_report(judged, 3, 2)
+    assert "Trained on 3 photographs and evaluated on 2 held-out" in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
     for row, cells in zip(judged, rows, strict=True):
-        assert cells[:2] == [str(row["looks"]), f"{100 * row['all']:.1f}"]
-        assert cells[-2:] == [f"{row['expected']:.2f}", f"{row['brought']:.2f}"]
-
-
-@pytest.mark.weights
-@pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
-def test_the_model_works_in_an_exploration(trained, tmp_path):
-    arguments = [
-        "--policies", "[closer-look-learned, expected-gain-learned]", "--belief.map_model",
-        str(trained / "out/yolov3-tiny.safetensors"), "--belief.columns", "4", "--belief.rows", "3", "--data.limit",
-        "2", "--protocol.starts", "2", "--protocol.shifts", "3", "--workers", "1",
-    ]  # fmt: skip
-    assert explore([*arguments, "--out", str(tmp_path / "out"), "--cache", str(trained / "cache")]) == 0
-    records = [json.loads(line) for line in (tmp_path / "out/episodes.jsonl").read_text().splitlines()]
-    learned = [r for r in records if r["policy"] in ("closer-look-learned", "expected-gain-learned")]
-    assert len(learned) == 2 * 2 * 2
-    for record in learned:
-        assert len(record["cells"]) == len(set(record["cells"])) == 4
-        assert len(record["right"]) == len(record["right_everywhere"]) == 4
-        assert max(record["right_everywhere"]) <= 12
+        shares = [f"{100 * row[name]:.1f}" for name in ("all", "objects", "objects_without_background")]
+        errors = [f"{row[name]:.4f}" for name in ("nll", "ece", "ece_background")]
+        assert cells == [str(row["looks"]), *shares, *errors, f"{row['expected']:.2f}", f"{row['brought']:.2f}"]

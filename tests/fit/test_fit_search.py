@@ -1,6 +1,5 @@
-"""`python -m train.fit_search`: small on the embedded scenes, and its parts against loops."""
+"""The fit of the target evidence: examples, objective and thresholds against loops, training, evaluation, report."""
 
-import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -21,32 +20,27 @@ from semfov.fit.evidence import (
     FitSearchConfig,
     choose_thresholds,
     evidence_objective,
+    evidence_report,
     judge_evidence,
+    make_examples,
     searches,
     train_evidence,
 )
-from semfov.fit.evidence_examples import make_examples
 from semfov.fit.examples import ExampleLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.search_protocol import choose_classes
-from tests.small import scattered
-from train.fit_search import main
+from tests.small import looking
 
 GRID = Grid(4, 4, (640, 480))
 CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def random_detections(index):
-    return scattered(index, GRID, len(CLASSES))
-
-
 @pytest.fixture(scope="module")
 def run():
     """A stand-in for a run with stored looks at five embedded scenes."""
-    scenes = EmbeddedScenes(CLASSES, count=5)
-    return SimpleNamespace(scenes=scenes, grid=lambda index: GRID, detections=random_detections)
+    return looking(CLASSES, GRID, 5)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +53,7 @@ def test_examples_match_looks_from_every_cell(run, examples):
     kinds = set()
     for row in range(len(examples)):
         index, target = int(examples.scene[row]), int(examples.target[row])
-        annotation, seen = run.scenes.annotation(index), random_detections(index)
+        annotation, seen = run.scenes.annotation(index), run.detections(index)
         features = look_features(seen, GRID.centres, GRID, target)
         assert examples.features.dtype == torch.float16
         assert torch.equal(examples.features[row], features.half())
@@ -110,7 +104,7 @@ def test_looks_of_examples_match_stored_looks(run, examples):
     beliefs = [step.belief for step in steps]
     for row, example in enumerate(chosen.tolist()):
         target = examples.target[example : example + 1]
-        stored = StoredLooks(random_detections(int(examples.scene[example])), GRID, target)
+        stored = StoredLooks(run.detections(int(examples.scene[example])), GRID, target)
         path = cells[row : row + 1]
         alone = rollout(stored, Target(model), TargetPosterior(target), path[:, 0], Given(path), most=4)
         for number, step in enumerate(alone):
@@ -293,37 +287,13 @@ def test_more_training_lowers_the_evaluated_loss(examples):
     assert nll[1] < nll[0] - 0.1
 
 
-SMALL = [
-    "--data.limit", "6", "--columns", "4", "--rows", "4", "--looks", "4", "--holdout", "3", "--max_target_area", "0.5",
-    "--steps", "30", "--batch", "8",
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A model trained on 6 embedded scenes."""
-    out = tmp_path_factory.mktemp("fit_search")
-    torch.set_num_threads(1)
-    assert main([*SMALL, "--workers", "1", "--out", str(out / "out"), "--cache", str(out / "cache")]) == 0
-    return out
-
-
-@pytest.mark.weights
-@pytest.mark.slow
-def test_training_writes_model_report_and_figures(trained):
-    model = TargetEvidence.from_pretrained(trained / "out/yolov3-tiny.safetensors")
-    assert model.metadata["detector"]["name"] == "yolov3-tiny"
-    assert model.metadata["training"]["steps"] == 30
-    assert len(model.prior) == 81
-    judged = json.loads((trained / "out/judged.json").read_text())
-    assert [row["looks"] for row in judged] == list(JUDGED)
-    report = (trained / "out/report.md").read_text()
-    assert "area under ROC" in report
-    assert f"presence is at least {model.thresholds.confirm:.3f} and" in report
-    assert f"no other cell has a probability of at least {model.thresholds.give_up:.2f}" in report
+def test_the_report_has_the_measures_and_the_thresholds():
+    names = ("found", "cells_nll", "cells_ece", "visited_ece", "presence_area", "presence_ece")
+    judged = [{"looks": looks, **{name: looks / 20 + n / 100 for n, name in enumerate(names)}} for looks in JUDGED]
+    report = evidence_report(judged, Thresholds(0.7, 0.05, 0.4), 8, 3)
+    assert "presence is at least 0.700 and that of a fixated cell at least 0.40" in report
+    assert "no other cell has a probability of at least 0.05" in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
-    for row, cells in zip(judged, rows, strict=True):
-        assert cells[:3] == [str(row["looks"]), f"{100 * row['found']:.1f}", f"{row['cells_nll']:.4f}"]
-        assert cells[3:] == [
-            f"{row[name]:.4f}" for name in ("cells_ece", "visited_ece", "presence_area", "presence_ece")
-        ]
+    assert rows == [
+        [str(row["looks"]), f"{100 * row['found']:.1f}", *(f"{row[name]:.4f}" for name in names[1:])] for row in judged
+    ]

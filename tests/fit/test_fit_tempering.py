@@ -1,14 +1,11 @@
-"""`python -m train.fit_tempering`: small on the embedded scenes, and its hit rate against a loop."""
-
-import json
+"""The fit of the tempering of likelihoods: its hit rate against a loop, and its report."""
 
 import pytest
 import torch
 
 from semfov import Detections, Grid
 from semfov.belief.observers import Semantic
-from semfov.fit.tempering import hit_rate
-from train.fit_tempering import main
+from semfov.fit.tempering import hit_rate, tempering_report
 
 
 def looks(count, boxes=3, classes=4):
@@ -52,13 +49,9 @@ def test_there_is_no_hit_rate_when_every_fixation_is_on_the_target():
     assert hit_rate(Semantic(5), seen, fixations, grid, torch.tensor([1]), goal) is None
 
 
-@pytest.mark.weights
-@pytest.mark.slow
-def test_report_has_a_row_for_every_exponent(tmp_path):
-    small = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--min_objects", "1", "--shard", "2"]
-    assert main([*small, "--exponents", "[0.25,1.0]", "--workers", "1", "--out", str(tmp_path)]) == 0
-    hits = json.loads((tmp_path / "hits.json").read_text())
-    assert set(hits) == {"0.25", "1.0"}
-    assert all(0 <= value <= 1 for rates in hits.values() for value in rates.values())
-    best = max(hits, key=lambda name: hits[name]["fitted"])
-    assert f"choose by: {float(best):g}." in (tmp_path / "report.md").read_text()
+def test_the_report_has_a_row_for_every_exponent_and_names_the_best():
+    """The best one is that of the photographs to choose by."""
+    report = tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
+    assert "choose by: 0.25." in report
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
+    assert rows == [["0.25", "50.00", "10.00"], ["1", "40.00", "30.00"]]

@@ -1,6 +1,4 @@
-"""`python -m train.fit_verification`: small on the embedded scenes, and its parts against loops and SciPy."""
-
-import json
+"""The fit of the verification, against loops and SciPy."""
 
 import numpy as np
 import pytest
@@ -35,7 +33,6 @@ from semfov.io.storage import read
 from semfov.runs.looks import look_from
 from semfov.runs.store import cell_store
 from tests.small import CLASSES, Blobs
-from train.fit_verification import main
 
 
 def examined(count=200, seed=0):
@@ -366,18 +363,3 @@ def test_stored_looks_are_read_as_they_were_written_or_not_at_all(tmp_path):
     eye = anew.eye
     assert cell_store(tmp_path, eye.settings(), 4, 3, 4).folder == path.parent
     assert cell_store(tmp_path, eye.settings(), 3, 4, 4).folder != path.parent
-
-
-@pytest.mark.weights
-@pytest.mark.slow
-def test_the_command_fits_a_model_that_the_agent_can_load(tmp_path, capsys):
-    small = ["--data.limit", "3", "--looks", "2", "--folds", "2", "--data.min_instances", "0"]
-    assert main([*small, "--out", str(tmp_path), "--cache", str(tmp_path / "cache")]) == 0
-    model = Verification.from_pretrained(tmp_path / "yolov3-tiny.safetensors")
-    assert model.thresholds is not None
-    assert model.metadata["training"]["looks"] == 2
-    figures = json.loads((tmp_path / "judged.json").read_text())
-    assert figures["area"] >= 0
-    report = (tmp_path / "report.md").read_text()
-    assert "(chosen)" in report
-    assert report in capsys.readouterr().out

@@ -11,7 +11,7 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.detector import manifest_of
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.folder import FolderFit
-from semfov.fit.parts.windows import RECALL_PASSES, in_raw_order, photograph_recalls
+from semfov.fit.parts.windows import RECALL_PASSES, WindowsFit, in_raw_order, photograph_recalls
 from semfov.fit.windows import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
@@ -45,12 +45,12 @@ def folder_of(home, **settings):
 
 @pytest.mark.slow
 def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continues(home, tmp_path, monkeypatch):
-    usual = FitDetectorConfig.mosaics
+    usual = WindowsFit.mosaics
 
     def fewer(*given):
         return replace(usual(*given), mosaics=2, crowded=1, judged=2, searched=2)
 
-    monkeypatch.setattr(FitDetectorConfig, "mosaics", fewer)
+    monkeypatch.setattr(WindowsFit, "mosaics", fewer)
     folder = folder_of(home)
     fitted = folder.fit("windows")
     config = folder.fits["windows"].settings

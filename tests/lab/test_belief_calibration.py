@@ -8,7 +8,7 @@ import torch
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import add_up, curves, landing_table, pooled, write_belief_report
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target

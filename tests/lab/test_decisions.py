@@ -7,8 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eval.decide.config import DecisionConfig
-from eval.decide.run import DecisionRun, landing, overlap, quarters, sharp_place
+from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarters, sharp_place
 from semfov import DataError, Detections, DirichletBelief, Grid, InputError
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, Target
@@ -50,7 +49,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config(folder):
-    return DecisionConfig(
+    return DecideConfig(
         data=DataConfig(limit=3, max_target_area=0.5),
         belief=BeliefConfig(columns=4, rows=3, target_model=str(write_evidence(folder / "model.safetensors", AT))),
         protocol=ProtocolConfig(shifts=6),

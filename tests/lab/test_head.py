@@ -49,8 +49,7 @@ def config(request, tmp_path, monkeypatch):
     monkeypatch.setattr("eval.head.run.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
-    monkeypatch.setattr("eval.head.run.make_target_evidence", lambda name, eye: models[0])
-    monkeypatch.setattr("eval.head.run.make_map_evidence", lambda name, eye: models[1])
+    monkeypatch.setattr("eval.head.run.make_learned", lambda kind, name, eye: {type(m): m for m in models}[kind])
     return HeadConfig(
         scene=request.param,
         scenes=2,

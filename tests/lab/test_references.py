@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval.explore.references import FUSED, PAINTED, sharp_maps
+from eval.explore.run import FUSED, PAINTED, sharp_maps
 from semfov import Detections, Grid
 from semfov.runs.exploration_protocol import counts_of
 

@@ -6,16 +6,15 @@ import pytest
 import torch
 
 from eval.comparison.replay import replay
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.explore.run import ExploreConfig, ExploreRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov import ActivePerception
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap
 from semfov.episode import rollout
 from semfov.runs import exploration_protocol, search_protocol
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -30,15 +29,7 @@ SEMANTIC = (
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("replay")
-    return {
-        "data": DataConfig(limit=1),
-        "belief": BeliefConfig(columns=4, rows=3),
-        "protocol": ProtocolConfig(starts=2, shifts=5),
-        "cache": folder / "cache",
-        "out": folder / "out",
-        "workers": 1,
-    }
+    return run_settings(tmp_path_factory.mktemp("replay"), starts=2, shifts=5)
 
 
 @pytest.fixture(scope="module")

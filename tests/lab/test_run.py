@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.explore.run import ExploreConfig, ExploreRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SaliencyConfig
+from semfov.runs.config import DataConfig, PolicyConfig, ProtocolConfig, SaliencyConfig
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
@@ -19,13 +18,7 @@ GUIDED = PolicyConfig("predictive", saliency="vocus2")
 
 @pytest.fixture
 def config(tmp_path):
-    return SearchConfig(
-        data=DataConfig(limit=1),
-        belief=BeliefConfig(columns=4, rows=3),
-        policies=("random",),
-        cache=tmp_path / "cache",
-        out=tmp_path / "out",
-    )
+    return SearchConfig(**run_settings(tmp_path), policies=("random",))
 
 
 def test_policies_of_a_run_are_named_by_their_labels(config):

@@ -9,27 +9,17 @@ import pytest
 import eval.comparison.report_page as module
 from eval.comparison.report_page import choose_episodes, write_run_report
 from eval.explore import report as explore_report
-from eval.explore.config import ExploreConfig
-from eval.explore.run import ExploreRun
+from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import report as search_report
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
-from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
+from eval.search.run import SearchConfig, SearchRun
+from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    return {
-        "data": DataConfig(limit=2),
-        "belief": BeliefConfig(columns=4, rows=3),
-        "protocol": ProtocolConfig(starts=2, shifts=5),
-        "cache": folder / "cache",
-        "out": folder / "out",
-        "workers": 1,
-    }
+    return run_settings(tmp_path_factory.mktemp("report"), 2, starts=2, shifts=5)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 
 from eval.comparison import report_page as run_report
 from eval.comparison.summary import Curve
-from eval.search.config import SearchConfig
+from eval.search.run import SearchConfig
 from semfov import Detections, Grid, Scanpath
 from semfov.decision import Decision
 from semfov.detection import Objects

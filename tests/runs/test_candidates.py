@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from eval.explore.config import ExploreConfig
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig
+from eval.search.run import SearchConfig
 from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
 from semfov.belief import MapEvidence
 from semfov.errors import InputError
@@ -106,13 +106,13 @@ def test_saliency_does_not_change_which_models_a_policy_needs():
 def loaded(monkeypatch):
     """The models that a run loads, as pairs of kind and name."""
     loaded = []
-    for kind in ("observation", "target_evidence", "map_evidence"):
 
-        def make(name, eye, kind=kind):
-            loaded.append((kind, name))
-            return kind
+    def make(kind, name):
+        loaded.append((kind, name))
+        return kind
 
-        monkeypatch.setattr(candidates, f"make_{kind}", make)
+    monkeypatch.setattr(candidates, "make_observation", lambda name, eye: make("observation", name))
+    monkeypatch.setattr(candidates, "make_learned", lambda kind, name, eye: make(kind, name))
     return loaded
 
 
@@ -122,8 +122,8 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
     assert loaded == []
     learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
-    assert load_models(learned, "exploration", eye) == Models(map="map_evidence")
-    assert loaded == [("map_evidence", "everything")]
+    assert load_models(learned, "exploration", eye) == Models(map=MapEvidence)
+    assert loaded == [(MapEvidence, "everything")]
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2")
     every = SearchConfig(
@@ -131,8 +131,8 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
         belief=BeliefConfig(model="mine", target_model="sought"),
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", "target_evidence")
-    assert sorted(loaded) == [("observation", "mine"), ("target_evidence", "sought")]
+    assert models == Models("observation", TargetEvidence)
+    assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
 
 
 @pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])

@@ -19,7 +19,7 @@ import torch
 from semfov.detection.weights import fetch
 from semfov.errors import InputError, SemfovError
 from semfov.runs import cluster, workers
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ScenesConfig
+from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 from semfov.runs.workers import run_tasks, shared_processes
@@ -240,7 +240,7 @@ def test_looks_of_a_cluster_come_back_and_are_the_same_to_the_bit(tmp_path, monk
     with scheduler(port, tmp_path), worker(port, tmp_path, cache=tmp_path / "far"):
         for name, where in (("alone", {"workers": 1}), ("near", {"scheduler": f"tcp://127.0.0.1:{port}"})):
             monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / name))
-            config = ScenesConfig(
+            config = LookingConfig(
                 data=DataConfig(limit=2),
                 detector=DetectorConfig(weights=weights),
                 belief=BeliefConfig(columns=2, rows=1),

@@ -4,12 +4,15 @@ import dataclasses
 
 import pytest
 import torch
+import yaml
 
 from semfov import load_detector
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection import Selection
 from semfov.errors import InputError
+from semfov.fit.tempering import FitTemperingConfig
 from semfov.runs import config as settings
+from semfov.runs.command import run_command
 from semfov.runs.settings import Range, check_settings
 from tests import small
 
@@ -57,6 +60,17 @@ def test_invalid_seeds_and_counts_of_embedded_scenes_are_refused():
     for wrong in ({"seed": -1}, {"count": 0}):
         with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
             EmbeddedScenes(("cup",), **wrong)
+
+
+def test_unused_settings_are_no_options_and_are_not_written(capsys):
+    config = FitTemperingConfig(holdout=3)
+    assert "name" in config.unused
+    written = yaml.safe_load(config.yaml())
+    assert written.keys() == {field.name for field in dataclasses.fields(config)} - {"name"}
+    assert (written["holdout"], written["out"], written["data"]["min_instances"]) == (3, "runs/fit_tempering", 0)
+    with pytest.raises(SystemExit):
+        run_command(print, FitTemperingConfig, "", ["--name", "mine"])
+    assert "unknown option --name" in capsys.readouterr().err
 
 
 CONFIGS = [value for value in vars(settings).values() if dataclasses.is_dataclass(value) and isinstance(value, type)]

@@ -18,11 +18,12 @@ import os, sys, time
 from dataclasses import dataclass
 from pathlib import Path
 from semfov.runs.command import run_command
+from semfov.runs.settings import Settings
 from semfov.runs.workers import run_tasks
 from semfov.io.files import replacing
 
 @dataclass(frozen=True)
-class Config:
+class Config(Settings):
     """Sleep.
 
     Args:

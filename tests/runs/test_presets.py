@@ -1,20 +1,18 @@
 """Policies in settings: names, mappings, labels in tables, and which are refused."""
 
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from itertools import combinations
 from typing import get_args
 
 import pytest
-import yaml
 
-from eval.explore.config import ExploreConfig
-from eval.search.config import SearchConfig
+from eval.explore.run import ExploreConfig
+from eval.search.run import SearchConfig
 from semfov.errors import InputError
 from semfov.gaze.policies import Task, policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import WORDS, label, presets, resolve, valid_policies
-from semfov.runs.setup import plain
 
 TASKS = get_args(Task)
 ALIASES = {
@@ -183,7 +181,7 @@ def test_a_policy_can_be_a_mapping_in_yaml(tmp_path):
 def test_settings_that_a_run_wrote_can_be_read_back(config, tmp_path):
     policies = (PolicyConfig("random", saliency="vocus2"), *config().policies)
     path = tmp_path / "config.yaml"
-    path.write_text(yaml.safe_dump(plain(asdict(replace(config(), policies=policies))), sort_keys=False))
+    path.write_text(replace(config(), policies=policies).yaml())
     assert parsed(config, "--config", str(path)) == policies
 
 

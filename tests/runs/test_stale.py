@@ -12,17 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval.comparison import run as run_module
 from eval.search import main
-from eval.search.config import SearchConfig
-from eval.search.run import SearchRun
+from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
-from semfov.runs import scene_run
-from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from semfov.runs import policy_looking, scene_run
+from semfov.runs.config import PolicyConfig
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import finish, gather
+from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,15 +30,7 @@ pytestmark = pytest.mark.weights
 
 @pytest.fixture
 def config(tmp_path):
-    return SearchConfig(
-        data=DataConfig(limit=1),
-        belief=BeliefConfig(columns=3, rows=2),
-        protocol=ProtocolConfig(starts=2, shifts=3),
-        policies=("random",),
-        cache=tmp_path / "cache",
-        out=tmp_path / "out",
-        workers=1,
-    )
+    return SearchConfig(**run_settings(tmp_path, 1, 3, 2, starts=2, shifts=3), policies=("random",))
 
 
 @pytest.mark.slow
@@ -75,7 +66,7 @@ def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, 
         chosen = replace(config, policies=(PolicyConfig("own-of-a-test"),))
         key = SearchRun(chosen).key
         assert SearchRun(chosen).key == key
-        monkeypatch.setattr(run_module, "class_digest", lambda kind: "changed")
+        monkeypatch.setattr(policy_looking, "class_digest", lambda kind: "changed")
         assert SearchRun(chosen).key != key
         assert SearchRun(config).settings_key != SearchRun(chosen).settings_key
     finally:

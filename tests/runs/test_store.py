@@ -8,8 +8,7 @@ import torch
 from semfov.detection import Detections
 from semfov.runs import store as store_module
 from semfov.runs.looks import LOOK_SOURCES
-from semfov.runs.remembered import RememberedLooks
-from semfov.runs.store import DetectionStore, cell_store
+from semfov.runs.store import DetectionStore, RememberedLooks, cell_store
 from semfov.runs.zoom_store import GlanceStore
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, around, on_lattice

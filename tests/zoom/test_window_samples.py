@@ -7,10 +7,11 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.misses import count_misses
+from semfov.fit.observation import count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows
+from semfov.runs.samples import SampleSettings
+from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSampler, choose_windows
 from semfov.zoom.lattice import Lattice
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
@@ -50,8 +51,8 @@ def sampler(detector, monkeypatch, tmp_path):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: detector)
     monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
-    settings = MosaicSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
-    return settings.sampler(tmp_path)
+    settings = SampleSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
+    return MosaicSampler(settings, tmp_path)
 
 
 @pytest.mark.slow

@@ -20,10 +20,10 @@ from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, lookup
 from semfov.eye import Eye
 from semfov.fit.outputs import model_path, write_outputs
-from semfov.fit.settings import NameConfig
+from semfov.fit.settings import FitConfig
 from semfov.gaze.habits import GazeHabits
 from semfov.gaze.policies import Task
-from semfov.runs.config import BeliefConfig, OutcomeConfig, PoliciesConfig, PolicyConfig, SaliencyConfig, SensorConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig, SaliencyConfig
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.settings import Count, Positive
@@ -34,7 +34,7 @@ from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_
 
 
 @dataclass(frozen=True)
-class FitHumanlikeConfig(NameConfig, OutcomeConfig):
+class FitHumanlikeConfig(FitConfig):
     """Fit a model of how people choose their next fixation.
 
     Args:
@@ -42,7 +42,6 @@ class FitHumanlikeConfig(NameConfig, OutcomeConfig):
         fixations: JSON file of people's fixations in the pictures, in OSIE's format
             (`semfov.data.fixations.write_osie`).
         detector: the detector that processes the foveated views.
-        sensor: the foveal sensor.
         belief: the grid of the beliefs.
         saliency: settings of the saliency policies.
         policies: exploration policies to compare, as in `eval.explore`.
@@ -54,9 +53,9 @@ class FitHumanlikeConfig(NameConfig, OutcomeConfig):
         cache: folder for the detections from every cell, shared with other runs (None: the user's cache).
     """
 
+    unused = ("data", "seed", "workers", "scheduler")
     root: Path = field(kw_only=True)
     fixations: Path = field(kw_only=True)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture", reduction="mean"))
     policies: tuple[str | PolicyConfig, ...] = ("kl-raw", "closer-look-raw", "vocus2-raw", "itti-koch-raw")
@@ -123,8 +122,8 @@ class Viewing(PolicyLooking):
 
     def __init__(self, config: FitHumanlikeConfig, names: list[str]) -> None:
         self._fit, self._names = config, names
-        shared = (each.name for each in fields(PoliciesConfig) if hasattr(config, each.name))
-        super().__init__(PoliciesConfig(**{name: getattr(config, name) for name in shared}))
+        shared = (each.name for each in fields(RunConfig) if hasattr(config, each.name))
+        super().__init__(RunConfig(**{name: getattr(config, name) for name in shared}))
 
     def check_sources(self) -> None:
         """Check that the detector exists; the pictures are looked for when they are opened."""

@@ -6,12 +6,10 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from numpy.typing import NDArray
 
 from eval.comparison.summary import announce, write_texts
@@ -24,7 +22,6 @@ from semfov.errors import DataError, check
 from semfov.io.code import commit
 from semfov.io.files import clean, sha256
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.setup import plain
 from semfov.runs.tables import csv_text, table
 from semfov.version import __version__
 from semfov.viz.style import save_figure
@@ -119,7 +116,7 @@ def people_report(
         "summary.md": summary,
         "summary.csv": _csv(tables),
         "curves.csv": _curves(tables),
-        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
+        "config.yaml": config.yaml(),
         "manifest.json": json.dumps(_manifest(config), indent=2) + "\n",
     }
     written = write_texts(out, files)

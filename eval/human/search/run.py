@@ -8,7 +8,6 @@ from typing import Annotated
 
 import torch
 
-from eval.comparison.run import Run
 from eval.human.search.screens import Screens
 from eval.human.search.trials import goal_rectangle, read_searches
 from semfov.belief.grid import Grid
@@ -17,7 +16,8 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
-from semfov.runs.config import BeliefConfig, PoliciesConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Episode, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
@@ -41,7 +41,7 @@ class ScreenConfig(Settings):
 
 
 @dataclass(frozen=True)
-class PeopleSearchConfig(PoliciesConfig):
+class PeopleSearchConfig(RunConfig):
     """Comparison of people, models and policies that search for the same targets in the same pictures.
 
     Args:
@@ -62,6 +62,7 @@ class PeopleSearchConfig(PoliciesConfig):
         store: keep detections on disk.
     """
 
+    unused = ("data", "models")
     people: Path = Path("human_scanpaths")
     files: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
@@ -74,7 +75,7 @@ class PeopleSearchConfig(PoliciesConfig):
     out: Path = Path("runs/human_search")
 
 
-class PeopleSearchRun(Run):
+class PeopleSearchRun(PolicyLooking):
     """Searches for the targets of people, one screen after the other."""
 
     task: Task = "search"

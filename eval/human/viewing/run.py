@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from eval.comparison.run import Run
 from eval.human.viewing.density import Events, enlarged, events_of
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Landing, Look, Observer
@@ -32,8 +31,9 @@ from semfov.gaze.choice import Given
 from semfov.gaze.policies import ObjectSeeking, Task
 from semfov.io.schema import Field, Schema
 from semfov.runs.candidates import Candidate
-from semfov.runs.config import PoliciesConfig, PolicyConfig, SaliencyConfig, SaliencyModel
+from semfov.runs.config import PolicyConfig, RunConfig, SaliencyConfig, SaliencyModel
 from semfov.runs.looks import one_thread
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.scene_run import digest_of, store_folder
@@ -75,7 +75,7 @@ class DensityConfig(Settings):
 
 
 @dataclass(frozen=True)
-class ViewingConfig(PoliciesConfig):
+class ViewingConfig(RunConfig):
     """Comparison of people and policies that view the same pictures without a task.
 
     Args:
@@ -101,7 +101,7 @@ class ViewingConfig(PoliciesConfig):
     """
 
     people: Path = Path("fixations.json")
-    data: PicturesConfig = field(default_factory=PicturesConfig)
+    data: PicturesConfig = field(default_factory=PicturesConfig)  # type: ignore[assignment]
     saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture"))
     density: DensityConfig = field(default_factory=DensityConfig)
     policies: tuple[str | PolicyConfig, ...] = (
@@ -113,7 +113,7 @@ class ViewingConfig(PoliciesConfig):
         "expected-gain-learned",
         "objects-calibrated",
     )
-    models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")
+    models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")  # type: ignore[assignment]
     swap: bool = False
     sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "kl-calibrated", "landing")
     files: tuple[Path, ...] = ()
@@ -195,7 +195,7 @@ def read_people(path: Path) -> list[Fixations]:
     return read_table(path) if path.suffix == ".csv" else read_osie(path)
 
 
-class ViewingRun(Run):
+class ViewingRun(PolicyLooking):
     """Free viewing, one picture after the other: computes the maps of policies along people's scanpaths."""
 
     task: Task = "exploration"

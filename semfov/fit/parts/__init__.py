@@ -1,4 +1,4 @@
-"""The models that are fitted to a detector, one file for each part of a model folder.
+"""What the parts of a model folder share, and the fit of all of them in order.
 
-`semfov.fit.parts.folder.FolderFit` fits them in order.
+A part stands with its fit, such as `semfov.fit.map.MapFit`; that of large pictures is here.
 """

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from semfov.belief.grid import Footprint
 from semfov.belief.observers import Observer, Semantic
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.gaze.policies import Policy
@@ -23,6 +24,12 @@ from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
 
+FEW = 8
+"""Detectors with fewer classes also learn from photographs that contain none of them."""
+FOOTPRINT: Footprint = "box_centre"
+"""Which cells a detection updates where scores are fused with an exponent of their own."""
+IOU = 0.5
+"""Least overlap at which a detection counts as showing an object."""
 MAP_SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
 _LONGEST = 15
@@ -55,9 +62,20 @@ class PartInputs:
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.config, self.run = config.sized(len(run.scenes)), run
         self.components = len(run.scenes.classes) + 1
-        self.holdout = self.config.observation.holdout
+        self.holdout = self.config.holdout or 5
         self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
         self.results: dict[str, PartResult] = {}
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """Settings that all parts but the one for large pictures have in common."""
+        names = ("data", "detector", "sensor", "columns", "rows", "seed", "out")
+        return {name: getattr(self.config, name) for name in names}
+
+    @property
+    def absent(self) -> int | None:
+        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
+        return 2 if self.components <= FEW else None
 
     @property
     def judged(self) -> Sequence[int]:
@@ -87,8 +105,7 @@ class PartInputs:
         """Return the belief that fuses `raw` or `calibrated` scores with an exponent."""
         model = self.model("observation") if scores == "calibrated" else None
         assert model is None or isinstance(model, FovealObservationModel)
-        footprint = self.config.tempering.footprint
-        return Semantic(self.components, model, footprint=footprint, tempering=exponent)
+        return Semantic(self.components, model, footprint=FOOTPRINT, tempering=exponent)
 
     @cached_property
     def samples(self) -> Samples:
@@ -99,7 +116,7 @@ class PartInputs:
             generator = generator_for("cells", self.config.seed, run.scenes.ids[index])
             cells = torch.randperm(len(grid), generator=generator)[: self.config.fixations]
             detections, annotation = run.detections(index)[cells], run.scenes.annotation(index)
-            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, self.config.observation.iou))
+            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, IOU))
         return Samples.join(samples)
 
 

@@ -9,18 +9,19 @@ from typing import Any
 
 from semfov.errors import DataError, InputError
 from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.evidence import EvidenceFit
+from semfov.fit.map import MapFit
+from semfov.fit.observation import ObservationFit
 from semfov.fit.parts.base import PartFit, PartInputs, PartResult
-from semfov.fit.parts.evidence import EvidenceFit
-from semfov.fit.parts.map import MapFit
-from semfov.fit.parts.observation import ObservationFit
-from semfov.fit.parts.tempering import TemperingFit
-from semfov.fit.parts.verification import VerificationFit
 from semfov.fit.parts.windows import WindowsFit
+from semfov.fit.tempering import TemperingFit
+from semfov.fit.verification import VerificationFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
 from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import digest_of
+from semfov.runs.settings import plain
 
 FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit, WindowsFit)
 """The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
@@ -70,9 +71,10 @@ class FolderFit:
 
     def _settings(self, name: str) -> list[Any]:
         """List everything except the looks that a part and its evaluation depend on."""
-        before = [fitted.part.sha256 for fitted in self.results.values()]
-        before += [_plain(asdict(each.part)) for each in self.results.values() if each.part.settings]
-        return [name, _plain(asdict(self.fits[name].settings)), self.config.judged, before]
+        before: list[Any] = [fitted.part.sha256 for fitted in self.results.values()]
+        before += [plain(asdict(each.part)) for each in self.results.values() if each.part.settings]
+        settings = plain(asdict(self.fits[name].settings))
+        return [name, {each: settings[each] for each in settings.keys() - {*WHERE}}, self.config.judged, before]
 
     def _record(self, name: str) -> Path:
         return self.config.out / "progress" / f"{name}.json"
@@ -87,8 +89,3 @@ class FolderFit:
         except Exception:  # a damaged record is no problem, as the part can be fitted again
             return None
         return PartResult(part, record["report"], record["figures"]) if whole else None
-
-
-def _plain(settings: dict[str, Any]) -> Any:
-    """Return the settings that a part depends on, as JSON values."""
-    return json.loads(json.dumps({name: each for name, each in settings.items() if name not in WHERE}, default=str))

@@ -46,6 +46,8 @@ RECALL_PASSES = (4, 8, 16)
 """Passes of the detector after which recall is reported."""
 _OF_INPUT = 1.15
 """Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
+_FOR_MOSAICS = 360
+"""The number of mosaics grows up to this number of photographs to learn from."""
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
@@ -80,7 +82,34 @@ class WindowsFit(PartFit):
                 f"not fitted, since mosaics need at least {ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
-        return self.config.mosaics(photographs, self._tile())
+        return self.mosaics(photographs)
+
+    def mosaics(self, photographs: int) -> FitZoomConfig:
+        """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
+        own, held_out = self.config, -(-photographs // self.inputs.holdout)
+        training = min(photographs - held_out, _FOR_MOSAICS)
+        return FitZoomConfig(
+            data=own.data,
+            detector=own.detector,
+            holdout=self.inputs.holdout,
+            mosaics=max(1, training // 5),
+            far=max(1, training // 60),
+            crowded=max(1, training // 10),
+            judged=max(8, min(held_out // 3, 30)),
+            judged_far=1,
+            kinds=(),
+            searched=max(8, training // 12),
+            sought=3,
+            passes=16,
+            tile=self._tile(),
+            steps=own.window_steps,
+            survey_steps=own.window_steps,
+            seed=own.seed,
+            out=own.out,
+            cache=own.cache,
+            workers=own.workers,
+            scheduler=own.scheduler,
+        )
 
     def _tile(self) -> int:
         """Width of the photographs' slots in pixels: the photographs are not enlarged."""

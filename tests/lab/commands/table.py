@@ -4,6 +4,7 @@ The small runs look at photographs of coloured squares with a network that detec
 settings, `HERE` stands for the folder that `write_material` fills.
 """
 
+import importlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +79,16 @@ def write_material(folder: Path) -> None:
         ]
     write_table(folder / "people.csv", viewed)
     (folder / "people.json").write_text(json.dumps(record))
+
+
+def small_run(name: str, folder: Path, *more: str) -> Path:
+    """Run the small run of a command in a folder, with more settings; returns the folder of its outcomes."""
+    write_material(folder)
+    module, *job = name.split()
+    words = [*job, *(word.replace("HERE", str(folder)) for word in (*COMMANDS[name].settings, *more))]
+    paths = ["--out", str(folder / "out"), "--cache", str(folder / "cache"), "--workers", "1"]
+    assert importlib.import_module(module).main([*words, *paths]) == 0
+    return folder / "out"
 
 
 COMMANDS = {

@@ -1,6 +1,7 @@
 """Every command runs, writes its files, goes on after a kill, and gives the same bits however its work is divided."""
 
 import importlib
+import json
 import os
 import re
 import subprocess
@@ -11,12 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from safetensors import safe_open
 
 from semfov.gaze.policies import POLICIES
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label, presets
 
-from .table import COMMANDS, RUN, write_material
+from .table import COMMANDS, MODEL, RUN, write_material
 
 ROOT = Path(__file__).parents[3]
 
@@ -59,6 +61,17 @@ def test_a_run_writes_its_files(finished):
     for file in (*COMMANDS[name].files, *COMMANDS[name].others):
         assert (folder / "out" / file).stat().st_size > 20, file
     assert not list(folder.rglob("*.part"))
+
+
+@pytest.mark.parametrize("finished", [f"train.fit_{name}" for name in ("search", "map", "verification")], indirect=True)
+def test_a_fitted_model_says_what_it_was_fitted_to_and_with_which_settings(finished):
+    _, settings, folder = finished
+    with safe_open(folder / "out" / MODEL, "pt") as file:
+        (record,) = map(json.loads, file.metadata().values())
+    metadata = record["metadata"]
+    assert metadata["detector"]["name"] == "colours"
+    assert str(metadata["training"]["looks"]) == settings[settings.index("--looks") + 1]
+    assert metadata["data"]
 
 
 def long(name):
