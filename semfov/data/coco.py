@@ -267,15 +267,39 @@ class CocoScenes:
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, of the detector's classes, without decoding its image."""
+        """Return the objects of a scene, of the detector's classes, without decoding its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects.
+        """
         return self._packed.annotation(self._rows[index])
 
     def targets(self, index: int) -> list[int]:
-        """List the classes of a scene that may be searched for, 1..K, ascending."""
+        """List the classes of a scene that may be searched for, 1..K, ascending.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Class indices.
+        """
         return list(self._targets[index])
 
     def digest(self, index: int) -> str:
-        """Compute the sha256 of an image file and of the size in its annotations."""
+        """Compute the sha256 of an image file and of the size in its annotations.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            64 hexadecimal digits.
+
+        Raises:
+            DataError: the file is missing or cannot be read.
+        """
         path = self._files[index]
         check_regular(path, f"image {path}")
         try:

@@ -198,10 +198,24 @@ class ComposedScenes(ABC):
 
     @abstractmethod
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, without composing its image."""
+        """Return the objects of a scene, without composing its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects.
+        """
 
     def targets(self, index: int) -> list[int]:
-        """List the classes that may be searched for, ascending: those that cover at most a fifth of the scene."""
+        """List the classes that may be searched for, ascending: those that cover at most a fifth of the scene.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Class indices 1..K.
+        """
         return legal_targets(self.annotation(index))
 
     def _generator(self, index: int, *part: int) -> np.random.Generator:

@@ -141,18 +141,39 @@ class EmbeddedScenes(ComposedScenes):
         return self._scene(index, "search array", image.float() / 255)
 
     def items(self, index: int) -> list[Item]:
-        """List the photographs in a scene with their places, objects first."""
+        """List the photographs in a scene with their places, objects first.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Photographs and places.
+        """
         return _layout(self._generator(index))
 
     def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, of the detector's classes, without composing its image."""
+        """Return the objects of a scene, of the detector's classes, without composing its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects.
+        """
         objects = [item for item in self.items(index) if item.photograph.label in self._labels]
         boxes = torch.tensor([item.box() for item in objects], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([self._labels[item.photograph.label] for item in objects], dtype=torch.int64)
         return Annotation(boxes, labels, torch.zeros(len(objects), dtype=torch.bool), _SIZE)
 
     def digest(self, index: int) -> str:
-        """Compute the sha256 of a scene's pixels."""
+        """Compute the sha256 of a scene's pixels.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            64 hexadecimal digits.
+        """
         return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
 
     def _pixels(self, index: int) -> NDArray[np.uint8]:

@@ -99,7 +99,14 @@ class Record(Conversion):
     _format: ClassVar[Format]
 
     def is_whole(self, region: Sequence[float]) -> bool:
-        """Whether a region `(x1, y1, x2, y2)` is the whole picture, up to a pixel."""
+        """Whether a region is the whole picture, up to a pixel.
+
+        Args:
+            region: `(x1, y1, x2, y2)` in picture pixels.
+
+        Returns:
+            Whether it is.
+        """
         (x1, y1, x2, y2), (width, height) = region, self.size
         return x2 - x1 > width - 1 and y2 - y1 > height - 1
 
