@@ -27,6 +27,9 @@ class DecideConfig(ScenesConfig):
         closer: largest number of closer looks in a search; 0 decides without them.
         verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
             one that is shipped for detector and sensor, if there is one).
+        references: also search without closer looks, with random gaze and with the published belief, for which
+            photographs are looked at from every cell, and look sharply at their quarters; without them the agent's
+            looks and one sharp look suffice.
         out: folder for tables, records and the figure.
         models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
             verification.
@@ -38,6 +41,7 @@ class DecideConfig(ScenesConfig):
     place: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     verification: str | None = None
+    references: bool = True
     out: Path = Path("runs/decide")
     models: Path | None = None
 

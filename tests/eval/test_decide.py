@@ -83,6 +83,17 @@ def test_run_writes_table_and_records(finished):
         assert row[1].startswith(f"{area_under_roc(score, there):.3f} ± ")
 
 
+@pytest.mark.weights
+def test_without_references_the_agent_searches_as_with_them(finished, arguments, tmp_path):
+    """Its looks are then made one by one, when a search needs them."""
+    alone = [*arguments, "--references", "false", "--store", "false", "--workers", "1", "--out", str(tmp_path)]
+    assert main(alone) == 0
+    agent = [record for record in records_in(finished) if record["policy"] == "target-evidence"]
+    assert records_in(tmp_path) == [{**record, "tiled": None} for record in agent]
+    rows = rows_of((tmp_path / "decisions.md").read_text())
+    assert [row[0] for row in rows[:3]] == ["target-evidence", REFERENCES[0], REFERENCES[2]]
+
+
 def record(policy, present, outcome, probability, looks, **more):
     base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
     base |= {"place": None, "closer": 0, "scene": 1, "frequency": 1 - probability}
