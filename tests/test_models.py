@@ -187,7 +187,7 @@ def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
     assert model.metadata["method"] == "discriminative"
 
 
-@pytest.mark.parametrize(("detector", "sensor"), product(DETECTORS, PUBLISHED_SENSORS))
+@pytest.mark.parametrize(("detector", "sensor"), list(product(DETECTORS, PUBLISHED_SENSORS)))
 def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(detector, sensor):
     model = semfov.FovealObservationModel.from_pretrained(f"{detector}-{sensor}")
     fitted = model.metadata["sensor"]
