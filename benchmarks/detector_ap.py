@@ -110,6 +110,7 @@ def main() -> None:
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--root", type=Path, required=True, help="folder of the photographs")
     parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")
+    parser.add_argument("--input-size", type=int, help="longer side of the network's input, if it takes any size")
     parser.add_argument("--stride", type=int, help="pad the canvas to a multiple of this; 0: to the whole canvas")
     parser.add_argument("--multilabel", action="store_true", help="count a box for every class")
     parser.add_argument("--runtime", help="what runs a Darknet network: auto, torch or onnxruntime")
@@ -117,6 +118,8 @@ def main() -> None:
     options: dict[str, Any] = {}
     if arguments.weights:
         options["weights"] = arguments.weights
+    if arguments.input_size:
+        options["input_size"] = arguments.input_size
     if arguments.stride is not None:
         options["stride"] = arguments.stride or None
     if arguments.runtime:

@@ -62,12 +62,12 @@ class SensorChoice(NamedTuple):
 
 CANDIDATES = {
     "published, 320": SensorChoice("published", 320),
-    "multi-scale, 4 × 160": SensorChoice("multi-scale", 320),
+    "multi-scale, 4 × 160": SensorChoice("multi-scale", 160),
     "gradual, 320": SensorChoice("gradual", 320),
     "gradual, 416": SensorChoice("gradual", 416),
     "log-polar, 320": SensorChoice("log-polar", 320),
     "sharp, 320": SensorChoice("gradual", 320, {"sigma": 1e4}),
-    "multi-scale, 4 × 160 of 1920 px": SensorChoice("multi-scale", 320, {"reference": 1920.0}),
+    "multi-scale, 4 × 160 of 1920 px": SensorChoice("multi-scale", 160, {"reference": 1920.0}),
 }
 """What is compared; the last one is for pictures of at least 1920 px, and left out unless it is asked for.
 

@@ -6,7 +6,8 @@ Without photographs it uses the embedded scenes. In every photograph the agent s
 for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
 rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
 belief by Kaplan's rule with the same thresholds and with the rule of the published agent, and one sharp look at the
-whole photograph. Detections from every cell are stored and shared with `python -m eval.search`.
+whole photograph. Detections from every cell are stored and shared with `python -m eval.search`. `--references false`
+leaves out everything but the agent's own searches and the sharp look, which takes a tenth of the looks.
 """
 
 from eval.comparison.model_folder import with_models

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
-from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, UNVERIFIED, landing_cells
+from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 
@@ -21,7 +21,8 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
     first = groups[names[0]]
     scores = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
     scores[SHARP] = torch.tensor([record["sharp"] for record in first])
-    scores["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+    if first[0]["tiled"] is not None:
+        scores["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
     scores[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
     return scores, torch.tensor([record["present"] for record in first])
 
@@ -60,7 +61,7 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
         )
     decided.append(sharp_decisions(first, telling.place(SHARP)))
     closely = ""
-    if UNVERIFIED in groups:
+    if any(record["closer"] for record in groups.get(AGENT, [])):
         each = mean_or_dash([record["closer"] for record in groups[AGENT]], 2)
         closely = f" Closer looks count as looks; {AGENT} makes {each} of them in a search."
     return "\n".join(

@@ -20,11 +20,12 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, conclude, confirms, decide
 from semfov.detection.detections import Detections
-from semfov.episode import Step, Stopwatch, StoredLooks
+from semfov.episode import Looks, Step, Stopwatch, StoredLooks
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
@@ -64,6 +65,9 @@ class DecideConfig(RunConfig):
         closer: largest number of closer looks in a search; 0 decides without them.
         verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
             one that is shipped for detector and sensor, if there is one).
+        references: also search without closer looks, with random gaze and with the published belief, for which
+            photographs are looked at from every cell, and look sharply at their quarters; without them the agent's
+            looks and one sharp look suffice.
         out: folder for tables, records and the figure.
         models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
             verification.
@@ -76,6 +80,7 @@ class DecideConfig(RunConfig):
     place: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     verification: str | None = None
+    references: bool = True
     out: Path = Path("runs/decide")
 
     def complete(self, folder: ModelFolder) -> Self:
@@ -114,11 +119,12 @@ class DecisionRun(PolicyLooking):
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
-        self.compared: dict[str, tuple[Strategy, _Rule]] = {
-            AGENT: (learned, self._by_thresholds),
-            **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
-            RANDOM: (random, self._by_thresholds),
-        }
+        self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
+        if not config.references:
+            return
+        if self.verified:
+            self.compared[UNVERIFIED] = learned, self._by_thresholds
+        self.compared[RANDOM] = random, self._by_thresholds
         model = if_shipped(make_observation, config.belief.model, self.eye)
         if model is not None:
             self.models = replace(self.models, observation=model)
@@ -151,8 +157,8 @@ class DecisionRun(PolicyLooking):
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
-        thresholds = [config.confirm, config.give_up, config.place, config.closer]
-        return {**super().depends_on(), "decisions": thresholds, "verification": self.verification}
+        settings = [config.confirm, config.give_up, config.place, config.closer, config.references]
+        return {**super().depends_on(), "decisions": settings, "verification": self.verification}
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
@@ -163,14 +169,16 @@ class DecisionRun(PolicyLooking):
         records: list[ResultRecord] = []
         if not searches:
             return records, watch.seconds
-        detections = self.detections(index)
+        # All searches together look from most of the cells; the agent's alone look from few.
+        everywhere = self.detections(index) if self.config.references else None
         with torch.inference_mode():
             image = self.scenes[index].image[None]
             sharp = self.eye.detector(image)
-            tiles = [self.eye.detector(tile) for tile in quarters(image)]
+            tiles = [] if everywhere is None else [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
-        closer: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
-            lambda: photograph_looks(self.eye, lambda: image, grid)
+        store = self.store if self.config.store and everywhere is None else None
+        remembered: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
+            lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
         for search in searches:
             target, goal = search.target, search.goal
@@ -180,16 +188,18 @@ class DecisionRun(PolicyLooking):
                 "present": search.present,
                 "sharp": float(highest_score(sharp, target)),
                 "frequency": float(self.frequencies[index][target]),
-                "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)),
+                "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)) if tiles else None,
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
-            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            looks: Looks = CellLooks(remembered, grid, grid.centres, target)
+            if everywhere is not None:
+                looks = StoredLooks(everywhere, grid, torch.tensor([target]))
             for name, (strategy, judge) in self.compared.items():
 
                 def rule(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
-                verifier = self._verifier(closer, grid, target) if name in self.verified else None
+                verifier = self._verifier(remembered, grid, target) if name in self.verified else None
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
@@ -198,7 +208,7 @@ class DecisionRun(PolicyLooking):
                     else:
                         # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                         place = int(last.cell) if judge is at_the_gaze else None
-                        visited = [detections[cell] for cell in path.split(1)]
+                        visited = [step.detections for step in steps]
                         decision = conclude(int(rule(last)), last.belief, visited, grid, target, place)
                 closely = 0 if verifier is None else len(verifier.looks)
                 records.append(
@@ -216,6 +226,7 @@ class DecisionRun(PolicyLooking):
                         "landing_seen": detected_on_landing(steps, path, goal, target, grid),
                     }
                 )
+        remembered.save()
         watch.lap("search")
         return records, watch.seconds
 

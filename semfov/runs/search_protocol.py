@@ -10,7 +10,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
-from semfov.episode import Step, StoredLooks, rollout
+from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.candidates import Candidate
@@ -277,7 +277,7 @@ def _run_batch(
 
 
 def search_steps(
-    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+    looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> list[Step]:
     """Run one search until it decides or all looks are spent.
 

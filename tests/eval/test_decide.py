@@ -64,6 +64,16 @@ def test_run_writes_table_and_records(finished):
         assert row[1].startswith(f"{area_under_roc(score, there):.3f} ± ")
 
 
+def test_without_references_the_agent_searches_as_with_them(finished, tmp_path):
+    """Its looks are then made one by one, when a search needs them."""
+    model = ("--belief.model", "HERE/observation.safetensors")
+    out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--store", "false")
+    agent = [record for record in records_in(finished) if record["policy"] == "target-evidence"]
+    assert records_in(out) == [{**record, "tiled": None} for record in agent]
+    rows = rows_of((out / "decisions.md").read_text())
+    assert [row[0] for row in rows[:3]] == ["target-evidence", REFERENCES[0], REFERENCES[2]]
+
+
 def record(policy, present, outcome, probability, looks, **more):
     base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
     base |= {"place": None, "closer": 0, "scene": 1, "frequency": 1 - probability}

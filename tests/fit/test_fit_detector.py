@@ -12,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 from scipy import stats
-from semfov.detection.coco_classes import COCO_CLASSES
 
 import semfov
 from eval.comparison.model_folder import with_models
@@ -26,6 +25,7 @@ from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
+from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig

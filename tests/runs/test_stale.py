@@ -152,10 +152,10 @@ def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
     # The first run is in this process, with the same code as the copied tree.
     assert main(small) == 0
     first = (tmp_path / "out" / "episodes.jsonl").read_text()
-    choice = tree / "semfov" / "gaze" / "selection.py"
+    choice = tree / "semfov" / "gaze" / "choice.py"
     text = choice.read_text()
-    assert "masked_fill(visited, -torch.inf)" in text
-    choice.write_text(text.replace("masked_fill(visited, -torch.inf)", "neg().masked_fill(visited, -torch.inf)"))
+    assert "values.masked_fill(visited, -torch.inf)" in text
+    choice.write_text(text.replace("values.masked_fill(", "values.neg().masked_fill("))
     call = [sys.executable, "-m", "eval.search", *small]
     environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(call, cwd=tree, env=environment, capture_output=True, text=True, check=True)
