@@ -173,7 +173,7 @@ def object_facts(
         each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
     )
     chosen, scale = index.numpy(), scale.astype(np.float32)
-    first, second, shared, area = _pairs(corners)
+    first, second, shared, area = overlapping(corners)
     union = area[first] + area[second] - shared
     overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
     part = shared / np.maximum(area[second], 1e-6)
@@ -236,7 +236,7 @@ def _logit(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     return odds
 
 
-def _pairs(
+def overlapping(
     boxes: NDArray[np.float32],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
     """Pairs of boxes that overlap, in both orders, the areas that they share `(P,)`, and the areas of all `(L,)`."""
