@@ -13,8 +13,8 @@ from semfov.io.schema import Field
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.store import LookStore, pack, unpack
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
 WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)

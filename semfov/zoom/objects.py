@@ -143,7 +143,8 @@ def fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Ten
         `(M, 4)`.
 
     >>> boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 14], [50, 50, 60, 60]])
-    >>> fused(torch.tensor([0]), boxes, torch.tensor([0.6, 0.2, 0.9]), torch.ones(3), torch.zeros(3).bool(), torch.ones(3))
+    >>> scores, labels, whole = torch.tensor([0.6, 0.2, 0.9]), torch.ones(3), torch.zeros(3).bool()
+    >>> fused(torch.tensor([0]), boxes, scores, labels, whole, torch.ones(3))
     tensor([[ 0.,  0., 10., 11.]])
     """
     first, second, shared, area = overlapping(boxes.float().numpy())
@@ -168,7 +169,7 @@ def probable_objects(
     target: int | Sequence[int] | None,
     certainty: Certainty,
     *,
-    remaining: float = 0.0,
+    remaining: tuple[float, float] = (0.0, 0.0),
     promised: float = 0.0,
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float]]:
@@ -179,7 +180,7 @@ def probable_objects(
         lattice: lattice of the picture.
         target: as for `merge`.
         certainty: predicts the probabilities.
-        remaining: number of objects that looks are still expected to find (`ZoomBelief.remaining`).
+        remaining: numbers of objects that looks are still expected to find (`ZoomBelief.remaining`).
         promised: number of objects that the looks after the first were expected to find.
         latest: as for `merge_with_facts`.
 

@@ -11,8 +11,8 @@ from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.remembered import RememberedLooks
 from semfov.runs.store import DetectionStore, cell_store
 from semfov.runs.zoom_store import GlanceStore
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, around, on_lattice
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
 DIGEST = "a" * 64

@@ -7,11 +7,11 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
-from semfov.zoom.search import look_for
 from semfov.zoom.sums import WindowSums
 from tests.zoom import plain
 

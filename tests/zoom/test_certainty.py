@@ -132,7 +132,12 @@ def test_objects_have_the_facts_of_their_looks():
     near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
     faint = look(2, [21.0, 20, 90, 92], 0.04)
     objects, facts = merge_with_facts([far, near, faint], lattice)
-    assert objects.boxes.tolist() == merge([far, near, faint]).boxes.tolist()
+    sharp = merge([far, near, faint])
+    assert objects.scores.tolist() == sharp.scores.tolist()
+    weights = torch.tensor([0.9, 0.6 / 4**2])  # two octaves, of which each has a quarter of the pixels
+    mean = weights / weights.sum() @ torch.tensor([[20.0, 20, 90, 90], [22.0, 20, 92, 91]])
+    torch.testing.assert_close(objects.boxes, mean[None])
+    assert merge_with_facts([far, near], lattice, latest=True)[0].boxes.tolist() == sharp.boxes.tolist()
     told = dict(zip(FACTS, facts[0].tolist(), strict=True))
     assert told["score"] == told["best"] == told["sharpest"] == pytest.approx(logit(0.9))
     assert told["shown"] == pytest.approx(math.log(3))
@@ -157,15 +162,18 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
 
 
 def test_what_no_look_has_shown_is_negative_binomial():
-    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0)
-    mean, variance = certainty.unseen(6.0, promised=10.0, discoveries=3.0)
+    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0, faint=0.25, promise=0.4)
+    mean, variance = certainty.unseen((5.0, 4.0), promised=25.0, discoveries=3.0)
     shape, rate = 4 * 0.5 + 3, 4 + 10
     law = nbinom(shape, rate / (rate + 6))
     assert mean == pytest.approx(law.mean())
     assert variance == pytest.approx(law.var())
-    assert certainty.unseen(0.0, promised=10.0, discoveries=3.0) == (0.0, 0.0)
+    assert certainty.unseen((0.0, 0.0), promised=10.0, discoveries=3.0) == (0.0, 0.0)
     assert Certainty.of(certainty.numbers) == certainty
-    with pytest.raises(InputError, match="certainty: expected 2 or 17 numbers, got 3"):
+    earlier = Certainty.of(certainty.numbers[:-2])  # all cells and promises count in full
+    assert earlier == replace(certainty, faint=1.0, promise=1.0)
+    assert earlier.unseen((2.0, 4.0), promised=10.0, discoveries=3.0) == pytest.approx((law.mean(), law.var()))
+    with pytest.raises(InputError, match="certainty: expected 2, 17 or 19 numbers, got 3"):
         Certainty.of([1.0, 2.0, 3.0])
 
 
