@@ -116,6 +116,9 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
             odds = plain.odds(lattice, evidence, target, seen, level)
             np.testing.assert_allclose(belief.odds(level), odds, rtol=1e-3, atol=1e-4)
             np.testing.assert_allclose(belief.chances(level), unseen / (1 + np.exp(-odds)), atol=1e-4)
+        most = np.max([expected[level] for level in range(1, lattice.levels)], 0)
+        remaining = most[most >= 0.1].sum(), most[most < 0.1].sum()
+        np.testing.assert_allclose(belief.remaining(), remaining, rtol=1e-3, atol=1e-4)
 
 
 def test_changes_in_cells_without_hints_change_no_odds(belief):
