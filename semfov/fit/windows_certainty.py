@@ -161,8 +161,8 @@ def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> C
         numbers = [n for n in _EXPECTING if n < len(each.glances)] if each.target is None else []
         last = each.outcome(certainty, len(each.glances))[1] if numbers else 0.0
         for number in numbers:
-            first, now = each.outcome(certainty, number)
-            shown = max(now - first, 0.0), now, max(last, now)
+            first, sums = each.outcome(certainty, number)
+            shown = max(sums - first, 0.0), sums, max(last, sums)
             cases.append((*each.remaining[number - 1], each.promised[number - 1], *shown))
     if not cases:
         return certainty
