@@ -34,12 +34,11 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import run_command
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom.episode import Order, WindowStep, look_by_look
-from semfov.zoom.gist import DETECTION_SCORE
+from semfov.zoom.episode import Order, WindowStep, find_everything, look_by_look
 from semfov.zoom.glances import LiveGlances, Window
+from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.search import find_everything
 from semfov.zoom.slices import adaptive_slices, slices
 
 try:

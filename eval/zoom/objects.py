@@ -35,7 +35,7 @@ def object_record(
     annotation: Annotation,
     passes: int,
     certainty: Certainty | None,
-    ahead: Sequence[tuple[float, float]] = (),
+    ahead: Sequence[tuple[tuple[float, float], float]] = (),
 ) -> ResultRecord:
     """Compare the objects after some numbers of passes with the annotated ones.
 
@@ -47,8 +47,8 @@ def object_record(
         annotation: the annotated objects.
         passes: largest number of passes.
         certainty: gives objects probabilities; None leaves them the detector's scores.
-        ahead: after each look, the number of objects that further looks are expected to find, and the number that the
-            looks after the first were expected to find.
+        ahead: after each look, the numbers of objects that further looks are expected to find (`ZoomBelief.remaining`),
+            and the number that the looks after the first were expected to find.
 
     Returns:
         The record: for each number of passes the scores of the objects, which of them are right, and the number of
@@ -62,7 +62,7 @@ def object_record(
         if certainty is None:
             objects = merge(looks[:number], target)
         else:
-            remaining, promised = ahead[min(number, len(looks)) - 1] if ahead else (0.0, 0.0)
+            remaining, promised = ahead[min(number, len(looks)) - 1] if ahead else ((0.0, 0.0), 0.0)
             objects, (unseen, _) = probable_objects(
                 looks[:number], lattice, target, certainty, remaining=remaining, promised=promised
             )

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.gist import Gist
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 

@@ -35,12 +35,11 @@ from semfov.runs.window_looking import (
     right_boxes,
 )
 from semfov.zoom.decision import CLOSER
-from semfov.zoom.episode import WindowStep, look_by_look
-from semfov.zoom.gist import DETECTION_SCORE
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import adaptive_slices, ranked, slices
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
@@ -200,7 +199,7 @@ class ZoomRun(WindowLooking, SceneRun):
         )
 
     def _objects(
-        self, name: str, index: int, looks: list[Glance], ahead: list[tuple[float, float]]
+        self, name: str, index: int, looks: list[Glance], ahead: list[tuple[tuple[float, float], float]]
     ) -> Iterator[ResultRecord]:
         """Compare the objects of ours, with probabilities and with scores, and of slices with the annotated ones."""
         if name not in _COMPARED:
@@ -267,17 +266,18 @@ class ZoomRun(WindowLooking, SceneRun):
         return records
 
 
-def looked(turns: Iterator[WindowStep[Any]]) -> tuple[list[Glance], list[tuple[float, float]]]:
+def looked(turns: Iterator[WindowStep[Any]]) -> tuple[list[Glance], list[tuple[tuple[float, float], float]]]:
     """The looks of turns; and after each, with a belief, the objects that looks are expected to find, and were so far.
 
     Args:
         turns: the turns.
 
     Returns:
-        The looks; and pairs of numbers as for `semfov.zoom.objects.probable_objects`, none without a belief.
+        The looks; and for `semfov.zoom.objects.probable_objects` what remains and what was promised, none without a
+        belief.
     """
     looks: list[Glance] = []
-    ahead: list[tuple[float, float]] = []
+    ahead: list[tuple[tuple[float, float], float]] = []
     promised = 0.0
     for turn in turns:
         promised += turn.worth if looks else 0.0

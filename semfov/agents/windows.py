@@ -25,13 +25,12 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
-from semfov.zoom.episode import WindowStep, look_by_look
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects
-from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, usual_slices
 
 USUAL_PASSES = 24
@@ -388,7 +387,7 @@ def window_objects(
         return merge(glances, target), None
     # A belief about objects of any class says nothing about those of several.
     several = target is not None and not isinstance(target, int)
-    remaining = 0.0 if belief is None or several else belief.remaining()
+    remaining = (0.0, 0.0) if belief is None or several else belief.remaining()
     return probable_objects(glances, lattice, target, certainty, remaining=remaining, promised=promised, latest=latest)
 
 

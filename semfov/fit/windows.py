@@ -48,7 +48,7 @@ from semfov.runs.workers import run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.survey import Survey
+from semfov.zoom.networks import Survey
 
 RefitPart = Literal["presence", "decision", "survey", "verification", "certainty"]
 

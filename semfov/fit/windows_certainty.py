@@ -15,15 +15,21 @@ from semfov.runs.progress import track
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import FACTS, Certainty
+from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge_with_facts, probable_objects
-from semfov.zoom.search import find_everything
 
 _AFTER = (3, 6, 12, 24)
 """Numbers of looks after which objects are taken."""
-_SCALES = tuple(0.05 * 1.25**n for n in range(16))
+_EXPECTING = (1, 2, 4, 8, 16, 24)
+"""Numbers of looks after which the number of further objects is taken."""
+_FURTHER = 2
+"""Explorations are this many times as long as they may be for users, to see what further looks show."""
+_SCALES = tuple(0.05 * 1.25**n for n in range(21))
 _STRENGTHS = tuple(2.0**n for n in range(-2, 9))
+_FAINT = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
+_PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class MosaicExploration:
         looks: the stored looks at the mosaic.
         target: class 1..K whose objects were looked for; None for all classes.
         glances: the looks.
-        remaining: after each look, the number of objects that further looks are expected to find.
+        remaining: after each look, the numbers of objects that further looks are expected to find.
         promised: after each look, the number of objects that the looks after the first were expected to find.
         facts: facts about the objects after some of the looks, `(n, 14)`.
         right: which of them are right, `(n,)` boolean.
@@ -43,7 +49,7 @@ class MosaicExploration:
     looks: StoredGlances
     target: int | None
     glances: list[Glance]
-    remaining: list[float]
+    remaining: list[tuple[float, float]]
     promised: list[float]
     facts: Tensor
     right: Tensor
@@ -67,7 +73,8 @@ def mosaic_explorations(
         model: the evidence that guides the explorations.
         pictures: the pictures.
         opened: the stored looks at each.
-        passes: number of passes of the detector in each.
+        passes: number of passes of the detector after which objects are taken. As many follow, which only tell how
+            many more objects they show.
         title: label of the progress bar.
 
     Yields:
@@ -78,12 +85,12 @@ def mosaic_explorations(
         for target in (None, int(annotation.labels.bincount().argmax())):
             glances: list[Glance] = []
             remaining, promised = [], [0.0]
-            for turn in islice(find_everything(looks, model, target), passes):
+            for turn in islice(find_everything(looks, model, target), _FURTHER * passes):
                 glances.append(turn.glance)
                 remaining.append(turn.belief.remaining())
                 promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
             facts, right = [], []
-            for number in sorted({min(n, len(glances)) for n in (*_AFTER, passes)}):
+            for number in sorted({min(n, len(glances), passes) for n in (*_AFTER, passes)}):
                 objects, object_facts = merge_with_facts(glances[:number], looks.lattice, target)
                 hits = right_boxes(objects, annotation)
                 facts.append(object_facts[hits >= 0])
@@ -136,38 +143,38 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
 
 
 def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> Certainty:
-    """Fit the number of objects that further looks show, by maximum likelihood over a grid of scale and strength.
+    """Fit the number of objects that further looks show, by least squares over a grid.
+
+    The error is that of the logarithm of one more than the number of objects in all, so that pictures with few objects
+    count as much as those with many. Only explorations for objects of all classes are taken: of a single class some
+    pictures hold hundreds of a few pixels.
 
     Args:
         certainty: the probability of objects.
         explored: explorations.
 
     Returns:
-        The certainty with scale and strength.
+        The certainty with scale, strength, and the shares of faint cells and of promises that count.
     """
     cases = []
     for each in explored:
-        numbers = [n for n in _AFTER if n < len(each.glances)]
-        if not numbers:
-            continue
-        last = each.outcome(certainty, len(each.glances))[1]
+        numbers = [n for n in _EXPECTING if n < len(each.glances)] if each.target is None else []
+        end = each.outcome(certainty, len(each.glances))[1] if numbers else 0.0
         for number in numbers:
-            first, now = each.outcome(certainty, number)
-            case = each.remaining[number - 1], each.promised[number - 1], max(now - first, 0.0), max(last - now, 0.0)
-            cases.append(case)
+            first, sums = each.outcome(certainty, number)
+            shown = max(sums - first, 0.0), sums, max(end, sums)
+            cases.append((*each.remaining[number - 1], each.promised[number - 1], *shown))
     if not cases:
         return certainty
-    remaining, promised, discoveries, more = torch.tensor(cases, dtype=torch.float64).unbind(-1)
+    clear, faint, promised, discoveries, now, last = torch.tensor(cases, dtype=torch.float64).unbind(-1)
 
-    def likelihood(scale: float, strength: float) -> float:
-        """Log likelihood of the negative binomial distribution, for numbers that need not be whole."""
-        shape, rate = strength * scale + discoveries, strength + promised
-        odds = remaining / (remaining + rate)
-        terms = torch.lgamma(shape + more) - torch.lgamma(shape) - torch.lgamma(more + 1)
-        return float((terms + shape * (1 - odds).log() + more * odds.clamp(min=1e-12).log()).sum())
+    def error(scale: float, strength: float, share: float, promise: float) -> float:
+        factor = (strength * scale + discoveries) / (strength + promise * promised)
+        expected = now + factor * (clear + share * faint)
+        return float((expected.log1p() - last.log1p()).square().mean())
 
-    scale, strength = max(product(_SCALES, _STRENGTHS), key=lambda pair: likelihood(*pair))
-    return Certainty(certainty.offset, certainty.weights, scale, strength)
+    chosen = min(product(_SCALES, _STRENGTHS, _FAINT, _PROMISES), key=lambda four: error(*four))
+    return Certainty(certainty.offset, certainty.weights, *chosen)
 
 
 def certainty_again(
@@ -209,7 +216,8 @@ def certainty_again(
     return [
         f"Probability of an object, fitted on {sum(len(each.right) for each in training)} objects: offset "
         f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
-        f"strength {model.certainty.strength:g}.",
+        f"strength {model.certainty.strength:g}, faint cells {model.certainty.faint:g}, promises "
+        f"{model.certainty.promise:g}.",
         "",
         f"Of {len(right)} objects in pictures of held-out photographs {int(right.sum())} are right and "
         f"{float(chances.sum()):.0f} are expected; the expected calibration error is {error:.3f}. Of the "

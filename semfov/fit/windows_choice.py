@@ -10,10 +10,10 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, Window, around
-from semfov.zoom.search import find_everything, look_for
 
 FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
 PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)

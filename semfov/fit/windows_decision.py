@@ -20,10 +20,9 @@ from semfov.runs.search_protocol import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.episode import WindowStep
+from semfov.zoom.decision import SearchFacts
+from semfov.zoom.episode import WindowStep, look_for
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.facts import SearchFacts
-from semfov.zoom.search import look_for
 
 _JUDGED = (1, 4, 8, 16)
 """Numbers of looks after which the probability of presence is evaluated."""

@@ -17,8 +17,8 @@ from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
-from semfov.zoom.gist import DETECTION_SCORE, Gist
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 

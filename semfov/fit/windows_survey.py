@@ -1,4 +1,4 @@
-"""Fit the survey: how many objects of any class closer looks find (`semfov.zoom.survey`)."""
+"""Fit the survey: how many objects of any class closer looks find (`semfov.zoom.networks`)."""
 
 import random
 from collections import defaultdict
@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.windows_evidence import WindowResult, ZoomExample, closer_windows, descend_examples, rates_before
-from semfov.zoom.gist import Gist
-from semfov.zoom.survey import Survey
+from semfov.zoom.hints import Gist
+from semfov.zoom.networks import Survey
 
 LATER = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""

@@ -18,10 +18,9 @@ from semfov.live.base import FramePerception
 from semfov.paths import WindowMoment, reduced_copy
 from semfov.zoom.closer import closer_window, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
-from semfov.zoom.episode import WindowStep, look_by_look
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.glances import Glance, LiveGlances, Window
 from semfov.zoom.objects import without_replaced
-from semfov.zoom.search import find_everything, look_for
 from semfov.zoom.slices import ranked, usual_slices
 
 WINDOW_RATE = 0.03

@@ -18,7 +18,7 @@ from semfov.paths.stimulus import LONGEST
 from semfov.report.episode import Data, jpeg_uri, rounded, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.viz.head import head_views
-from semfov.zoom.gist import DETECTION_SCORE
+from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
 _Frame = tuple[int, int, int, int]

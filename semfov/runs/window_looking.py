@@ -21,8 +21,8 @@ from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
-from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance
+from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.objects import merge
 
 LEAST_CONFIDENCE = 0.3

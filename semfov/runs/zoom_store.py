@@ -12,8 +12,8 @@ from semfov.detection.load import load_detector
 from semfov.io.schema import Field
 from semfov.runs.store import LookStore, RememberedLooks, pack, unpack
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
 WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)

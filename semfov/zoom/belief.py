@@ -10,12 +10,15 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.zoom.evidence import GlimpseEvidence, pool
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
 from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
+
+_CLEAR = 0.1
+"""Number of objects from which on a cell clearly promises one."""
 
 
 class Rates(Protocol):
@@ -168,10 +171,18 @@ class ZoomBelief:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
         return torch.from_numpy(self._expected(level))
 
-    def remaining(self) -> float:
-        """Number of objects that looks are still expected to find: in each cell those of the level that finds most."""
+    def remaining(self) -> tuple[float, float]:
+        """Number of objects that looks are still expected to find: in each cell those of the level that finds most.
+
+        Returns:
+            The number in cells in which a tenth of an object or more is expected, and the number in all others.
+        """
         levels = range(1, self.lattice.levels)
-        return float(np.maximum.reduce([self._expected(level) for level in levels]).sum()) if levels else 0.0
+        if not levels:
+            return 0.0, 0.0
+        expected = np.maximum.reduce([self._expected(level) for level in levels])
+        clear = float(expected[expected >= _CLEAR].sum())
+        return clear, float(expected.sum()) - clear
 
     def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""

@@ -44,24 +44,28 @@ class Certainty:
 
     .. math:: \operatorname{logit} p = a + \sum_i b_i f_i
 
-    The number of objects that looks would still show is about :math:`c R`, where R is the number that the evidence
-    expects. The scale c is learned from the looks that were made: if they showed F new objects where the evidence
-    promised W, its distribution is a Gamma distribution, and the number is negative binomial:
+    The number n of objects that looks would still show is about :math:`c R`. The evidence expects :math:`R_1` objects
+    in cells that clearly promise one and :math:`R_2` in others, most of which count less, because many cells promise a
+    little where nothing is. The scale c is learned from the looks that were made: if they showed F new objects where
+    the evidence promised W, its distribution is a Gamma distribution, and n is negative binomial:
 
     .. math::
-        E[c] = \frac{k c_0 + F}{k + W}, \qquad
-        \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + W}
+        R = R_1 + w R_2, \qquad
+        E[c] = \frac{k c_0 + F}{k + u W}, \qquad
+        \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
 
     Attributes:
         offset: a.
         weights: b, one for each of `FACTS`.
         scale: :math:`c_0`, the mean scale in the pictures of the fit.
         strength: k, the promised objects after which the looks of a picture count as much as the pictures of the fit.
+        faint: w, the share of what cells promise little that counts.
+        promise: u, the share of what looks promise that counts. Looks are made where it is highest by chance, too.
 
     >>> certainty = Certainty.of([0.0, 1.0])
     >>> certainty.probability(torch.eye(len(FACTS))[:2])
     tensor([0.7311, 0.5000])
-    >>> Certainty.of([0.0, 1.0]).unseen(10.0, promised=5.0, discoveries=3.0)
+    >>> Certainty.of([0.0, 1.0]).unseen((10.0, 4.0), promised=5.0, discoveries=3.0)
     (0.0, 0.0)
     """
 
@@ -69,13 +73,16 @@ class Certainty:
     weights: tuple[float, ...]
     scale: float = 0.0
     strength: float = math.inf
+    faint: float = 1.0
+    promise: float = 1.0
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
         """Read a certainty from the numbers of a file.
 
         Args:
-            numbers: a, b, :math:`c_0` and k. Files of earlier versions have a and the weight of the score alone.
+            numbers: a, b, :math:`c_0`, k, w and u. Files of earlier versions have neither w nor u, or a and the weight
+                of the score alone.
 
         Returns:
             The certainty.
@@ -85,16 +92,18 @@ class Certainty:
         """
         if len(numbers) == 2:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
-        check(len(numbers) == len(FACTS) + 3, "certainty", f"2 or {len(FACTS) + 3} numbers", len(numbers))
-        offset, *weights, scale, strength = numbers
-        return cls(offset, tuple(weights), scale, strength)
+        first = len(FACTS) + 1
+        check(
+            len(numbers) in (first + 2, first + 4), "certainty", f"2, {first + 2} or {first + 4} numbers", len(numbers)
+        )
+        return cls(numbers[0], tuple(numbers[1:first]), *numbers[first:])
 
     @property
     def numbers(self) -> list[float]:
         """The numbers of a file, as `of` reads them."""
         if math.isinf(self.strength):
             return [self.offset, self.weights[0]]
-        return [self.offset, *self.weights, self.scale, self.strength]
+        return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise]
 
     def probability(self, facts: Tensor) -> Tensor:
         """The probabilities of objects.
@@ -107,21 +116,25 @@ class Certainty:
         """
         return (self.offset + facts @ facts.new_tensor(self.weights)).sigmoid()
 
-    def unseen(self, expected: float, *, promised: float, discoveries: float) -> tuple[float, float]:
+    def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[float, float]:
         """How many objects further looks would show.
 
         Args:
-            expected: R, the number of objects that the evidence expects further looks to show.
+            expected: :math:`R_1` and :math:`R_2`, the numbers of objects that the evidence expects further looks to
+                show (`ZoomBelief.remaining`).
             promised: W, the number that it expected of the looks after the first.
             discoveries: F, the number that they have shown.
 
         Returns:
             The expected number, and its variance.
         """
+        clear, faint = expected
+        number = clear + self.faint * faint
         if math.isinf(self.strength):
-            return self.scale * expected, self.scale * expected
-        scale = (self.strength * self.scale + discoveries) / (self.strength + promised)
-        return scale * expected, scale * expected * (1 + expected / (self.strength + promised))
+            return self.scale * number, self.scale * number
+        rate = self.strength + self.promise * promised
+        scale = (self.strength * self.scale + discoveries) / rate
+        return scale * number, scale * number * (1 + number / rate)
 
 
 def object_facts(
@@ -173,7 +186,7 @@ def object_facts(
         each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
     )
     chosen, scale = index.numpy(), scale.astype(np.float32)
-    first, second, shared, area = _pairs(corners)
+    first, second, shared, area = overlapping(corners)
     union = area[first] + area[second] - shared
     overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
     part = shared / np.maximum(area[second], 1e-6)
@@ -236,7 +249,7 @@ def _logit(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     return odds
 
 
-def _pairs(
+def overlapping(
     boxes: NDArray[np.float32],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
     """Pairs of boxes that overlap, in both orders, the areas that they share `(P,)`, and the areas of all `(L,)`."""

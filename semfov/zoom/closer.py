@@ -10,8 +10,8 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
-from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import Glance, Glances, Window, around
+from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
 CONTEXT = 3.0

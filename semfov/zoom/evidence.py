@@ -17,25 +17,27 @@ from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.gist import Gist
+from semfov.zoom.hints import Gist
 from semfov.zoom.networks import (
     CROWD,
     STEPS,
+    SURVEY,
+    Survey,
     features,
     hint_maps,
     memory_maps,
     neighbourhood_mean,
     small_network,
+    survey_fields,
     tapered,
     through,
 )
-from semfov.zoom.survey import SURVEY, Survey, survey_fields
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
 CASE, _JUDGE_WIDTH = 10, 16
-"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.facts`)."""
+"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.decision`)."""
 _LARGEST = 1e6
 
 
@@ -57,7 +59,7 @@ class GlimpseEvidence(Pretrained):
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
     - Does the picture hold t at all, after the looks of a search? The highest score of t in any look, :math:`s^*`, is
-      corrected by further facts about the search, its case c (`semfov.zoom.facts`):
+      corrected by further facts about the search, its case c (`semfov.zoom.decision`):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
@@ -251,7 +253,7 @@ class GlimpseEvidence(Pretrained):
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            case: `(..., 10)`, further facts about the search (`semfov.zoom.facts.SearchFacts.case`).
+            case: `(..., 10)`, further facts about the search (`semfov.zoom.decision.SearchFacts.case`).
 
         Returns:
             Log odds, `(...)`.

@@ -23,7 +23,7 @@ from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence, pool_all
 from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.gist import FINEST, Gist
+from semfov.zoom.hints import FINEST, Gist
 from semfov.zoom.networks import STEPS
 
 LOOK_METADATA_KEY = "semfov.look"

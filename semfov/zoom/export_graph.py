@@ -8,7 +8,7 @@ from semfov.detection.darknet_onnx import Graph
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
-from semfov.zoom.gist import DETECTION_SCORE
+from semfov.zoom.hints import DETECTION_SCORE
 
 OPSET = 18
 """The first opset whose `Resize` has antialiasing."""
@@ -170,7 +170,7 @@ class LookGraph(Graph):
     def gist(
         self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
-        """Compute the gist of a look, as `semfov.zoom.gist.gist` does.
+        """Compute the gist of a look, as `semfov.zoom.hints.gist` does.
 
         Args:
             hints: names of boxes in picture pixels and of score vectors.

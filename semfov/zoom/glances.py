@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.zoom.eye import WindowEye, WindowLooks, WindowView
-from semfov.zoom.gist import Gist, gist
+from semfov.zoom.hints import Gist, gist
 from semfov.zoom.lattice import Lattice
 
 

@@ -1,12 +1,24 @@
-"""Hints: a detector's candidates in a look, also those below the detection threshold; they show where to zoom in."""
+"""What a look shows of where to zoom in: hints, which are faint candidates too, and the strongest in each cell."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
+import torch
 from torch import Tensor
 
+from semfov.detection.detections import Detections
 from semfov.detection.detector import FAINT
 from semfov.detection.scores import BackgroundPolicy, Candidates, shares
 from semfov.detection.selection import check_candidates, check_scores
+from semfov.zoom.lattice import Lattice
+
+FINEST = 32
+"""Largest number of cells along a side of a gist."""
+
+DETECTION_SCORE = 0.1
+"""Score from which on a detection counts as a found object."""
 
 
 @dataclass(frozen=True)
@@ -50,3 +62,84 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint
     check_candidates(image, confidence, boxes)
     check_scores(image, selected)
     return Hints(boxes, shares(selected, policy)[1].detach())
+
+
+@dataclass(frozen=True)
+class Gist:
+    """The summary of a look at a window: the strongest hint of every class in each cell.
+
+    The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
+    form one cell of the gist.
+
+    Attributes:
+        level: level of the window.
+        first: `(column, row)` of the window's first cell on the lattice.
+        scale: number of lattice cells along a side of a cell of the gist.
+        scores: `(rows, columns, K)`, highest score of each class among hints whose centre lies in the cell; 0 without
+            hints.
+        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint; 0 without
+            hints.
+        found: `(rows, columns, K)`, boolean, classes of detections whose centre lies in the cell.
+    """
+
+    level: int
+    first: tuple[int, int]
+    scale: int
+    scores: Tensor
+    size: Tensor
+    found: Tensor
+
+    @cached_property
+    def best(self) -> Tensor:
+        """Highest score of any class among the hints of each cell, `(rows, columns)`."""
+        return self.scores.amax(-1)
+
+
+def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
+    """Compute the gist of a look at a window of the lattice.
+
+    Args:
+        hints: hints of the look, in picture pixels.
+        detections: detections of the look, a batch of one without padding, likewise.
+        lattice: lattice of the picture.
+        action: `(level, column, row)` of the window.
+
+    Returns:
+        The gist.
+    """
+    level, column, row = action
+    span = lattice.span(level)
+    scale = max(1, span // FINEST)
+    columns = -(-min(span, lattice.columns - column) // scale)
+    rows = -(-min(span, lattice.rows - row) // scale)
+    width, height = lattice.pitch
+    numbers = (column * width, row * height), (width * scale, height * scale), (columns - 1, rows - 1)
+    low, pitch, last = np.array(numbers, np.float32)
+    kinds, cells = hints.scores.shape[-1], rows * columns
+    boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
+    confident = scores.amax(-1)
+    class_scores = detections.scores[0, :, 1:].detach().float().numpy()
+    sure = (class_scores.max(1, initial=0) >= DETECTION_SCORE).nonzero()[0]
+    corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
+    cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
+    across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
+    number = down * columns + across
+    at, there = number[: len(boxes)], number[len(boxes) :]
+    place = torch.from_numpy(at)
+    strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
+    top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")
+    leads = (confident.numpy() == top.numpy()[at]).nonzero()[0]
+    wide, high = np.log2(np.maximum(boxes[leads, 2:] - boxes[leads, :2], 1e-3)).T
+    size = np.zeros(cells, np.float32)
+    size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
+    found = np.zeros((cells, kinds), np.bool_)
+    found[there, class_scores[sure].argmax(1)] = True
+    shape = rows, columns
+    return Gist(
+        level,
+        (column, row),
+        scale,
+        strongest.view(*shape, -1),
+        torch.from_numpy(size).view(shape),
+        torch.from_numpy(found).view(*shape, -1),
+    )

@@ -3,14 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
-from semfov.zoom.certainty import FACTS, Certainty, object_facts
+from semfov.zoom.certainty import FACTS, Certainty, object_facts, overlapping
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
+
+INSIDE = 0.5
+"""Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
+
+_SAME = 0.5
 
 
 def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
@@ -87,6 +93,9 @@ def merge_with_facts(
 ) -> tuple[Objects, Tensor]:
     """Merge the detections of several looks as `merge` does, and list the facts about each object.
 
+    A cut box is the same object as one of another look from half of its area on, and the box of an object is the mean
+    over the looks that show it (`fused`), except in a stream.
+
     Args:
         glances: looks at one picture.
         lattice: lattice of the picture.
@@ -102,12 +111,56 @@ def merge_with_facts(
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
-    index = unlike(boxes, scores, labels, looks, cut, sharpness)
+    index = unlike(boxes, scores, labels, looks, cut, sharpness, inside=INSIDE)
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]
     facts = object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
-    return Objects(boxes[index], scores[index], labels[index], looks[index]), facts
+    own = boxes[index] if latest else fused(index, boxes, scores, labels, cut, sharpness)
+    return Objects(own, scores[index], labels[index], looks[index]), facts
+
+
+def fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Tensor, magnifications: Tensor) -> Tensor:
+    r"""Mean box of each object over the looks that show it whole, as in weighted boxes fusion.
+
+    The box j of its class counts if it overlaps that of the object by half, with its score s and the number of canvas
+    pixels that show a pixel of the picture, the square of the magnification m:
+
+    .. math:: b = \frac{\sum_j s_j m_j^2 b_j}{\sum_j s_j m_j^2}
+
+    Solovyev, R., Wang, W. and Gabruseva, T. (2021), Weighted boxes fusion: ensembling boxes from different object
+    detection models, Image and Vision Computing 107:104117.
+
+    Args:
+        index: `(M,)`, indices of the boxes that stand for objects.
+        boxes: `(L, 4)`, all boxes of all looks, in picture pixels.
+        scores: `(L,)`, their scores.
+        labels: `(L,)`, their classes.
+        cut: `(L,)`, boolean, boxes that the border of their window cuts. They count for nothing, and stay as they are.
+        magnifications: `(L,)`, of their looks.
+
+    Returns:
+        `(M, 4)`.
+
+    >>> boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 14], [50, 50, 60, 60]])
+    >>> scores, labels, whole = torch.tensor([0.6, 0.2, 0.9]), torch.ones(3), torch.zeros(3).bool()
+    >>> fused(torch.tensor([0]), boxes, scores, labels, whole, torch.ones(3))
+    tensor([[ 0.,  0., 10., 11.]])
+    """
+    first, second, shared, area = overlapping(boxes.float().numpy())
+    chosen, kinds, whole = index.numpy(), labels.numpy(), ~cut.numpy()
+    weight = (scores * magnifications.square()).double().numpy()
+    place = np.full(len(boxes), -1)
+    place[chosen] = np.arange(len(chosen))
+    union = area[first] + area[second] - shared
+    counts = (place[first] >= 0) & whole[first] & whole[second] & (kinds[first] == kinds[second])
+    counts &= shared >= _SAME * union
+    objects, others = place[first[counts]], second[counts]
+    corners = boxes.double().numpy()
+    total, sums = weight[chosen], corners[chosen] * weight[chosen, None]
+    np.add.at(total, objects, weight[others])
+    np.add.at(sums, objects, corners[others] * weight[others, None])
+    return torch.from_numpy(sums / total[:, None]).to(boxes)
 
 
 def probable_objects(
@@ -116,7 +169,7 @@ def probable_objects(
     target: int | Sequence[int] | None,
     certainty: Certainty,
     *,
-    remaining: float = 0.0,
+    remaining: tuple[float, float] = (0.0, 0.0),
     promised: float = 0.0,
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float]]:
@@ -127,7 +180,7 @@ def probable_objects(
         lattice: lattice of the picture.
         target: as for `merge`.
         certainty: predicts the probabilities.
-        remaining: number of objects that looks are still expected to find (`ZoomBelief.remaining`).
+        remaining: numbers of objects that looks are still expected to find (`ZoomBelief.remaining`).
         promised: number of objects that the looks after the first were expected to find.
         latest: as for `merge_with_facts`.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.zoom.evidence import GlimpseEvidence, pool_spans
-from semfov.zoom.gist import Gist
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.sums import Box, Cells, Place, extent, union

@@ -21,9 +21,9 @@ from semfov.envs import (
 )
 from semfov.envs.registration import IDS
 from semfov.envs.windows import window_of
+from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.search import find_everything, look_for
 
 KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}

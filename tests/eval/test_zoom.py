@@ -9,8 +9,8 @@ from eval.zoom.orders import sparse
 from semfov import FovealObservationModel
 from semfov.errors import InputError
 from semfov.zoom import WindowEye
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import LiveGlances, overview
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
 from tests.small import Coloured

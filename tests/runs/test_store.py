@@ -10,8 +10,8 @@ from semfov.runs import store as store_module
 from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.store import DetectionStore, RememberedLooks, cell_store
 from semfov.runs.zoom_store import GlanceStore
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, around, on_lattice
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
 DIGEST = "a" * 64

@@ -7,8 +7,8 @@ import torch
 
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.evidence import pool
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance
+from semfov.zoom.hints import Gist
 from semfov.zoom.networks import STEPS
 
 

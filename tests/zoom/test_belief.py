@@ -7,11 +7,11 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
-from semfov.zoom.search import look_for
 from semfov.zoom.sums import WindowSums
 from tests.zoom import plain
 
@@ -116,6 +116,9 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
             odds = plain.odds(lattice, evidence, target, seen, level)
             np.testing.assert_allclose(belief.odds(level), odds, rtol=1e-3, atol=1e-4)
             np.testing.assert_allclose(belief.chances(level), unseen / (1 + np.exp(-odds)), atol=1e-4)
+        most = np.max([expected[level] for level in range(1, lattice.levels)], 0)
+        remaining = most[most >= 0.1].sum(), most[most < 0.1].sum()
+        np.testing.assert_allclose(belief.remaining(), remaining, rtol=1e-3, atol=1e-4)
 
 
 def test_changes_in_cells_without_hints_change_no_odds(belief):

@@ -14,7 +14,7 @@ from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects, unlike
 from semfov.errors import InputError
-from semfov.fit.windows_certainty import fit_certainty
+from semfov.fit.windows_certainty import fit_certainty, fit_unseen
 from semfov.io.storage import read, write_file
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
@@ -132,12 +132,55 @@ def test_objects_have_the_facts_of_their_looks():
     near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
     faint = look(2, [21.0, 20, 90, 92], 0.04)
     objects, facts = merge_with_facts([far, near, faint], lattice)
-    assert objects.boxes.tolist() == merge([far, near, faint]).boxes.tolist()
+    sharp = merge([far, near, faint])
+    assert objects.scores.tolist() == sharp.scores.tolist()
+    weights = torch.tensor([0.9, 0.6 / 4**2])  # two octaves, of which each has a quarter of the pixels
+    mean = weights / weights.sum() @ torch.tensor([[20.0, 20, 90, 90], [22.0, 20, 92, 91]])
+    torch.testing.assert_close(objects.boxes, mean[None])
+    assert merge_with_facts([far, near], lattice, latest=True)[0].boxes.tolist() == sharp.boxes.tolist()
     told = dict(zip(FACTS, facts[0].tolist(), strict=True))
     assert told["score"] == told["best"] == told["sharpest"] == pytest.approx(logit(0.9))
     assert told["shown"] == pytest.approx(math.log(3))
     assert told["missed"] == pytest.approx(math.log(2))  # a box of so low a score is none
     assert merge_with_facts([], lattice)[1].shape == (0, len(FACTS))
+
+
+@pytest.mark.parametrize(("x", "count"), [(60.0, 1), (30.0, 2)])
+def test_a_cut_box_is_the_same_object_from_half_of_its_area_on(x, count):
+    """The finest window of 160 pixels cuts a box from x on, of which 60 pixels lie in one that another look shows."""
+    lattice = Lattice.over((1280, 960), (160, 160))
+
+    def look(level, box, cut):
+        seen = Detections(torch.tensor([[box]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool))
+        return Glance(on_lattice(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
+
+    whole = look(1, [100.0, 20, 300, 90], False)
+    objects, _ = merge_with_facts([whole, look(3, [x, 20.0, 160, 90], True)], lattice)
+    assert len(objects) == count
+    assert objects.boxes[objects.passes == 0].tolist() == [[100.0, 20, 300, 90]]  # the cut box does not count for it
+
+
+def test_what_further_looks_show_is_fitted_by_the_number_in_all():
+    """Pictures whose looks show half of what clear cells promise, and nothing else, teach this."""
+
+    class Exploration:
+        target, glances = None, [None] * 9
+
+        def __init__(self, clear, faint):
+            self.remaining = [(clear * (1 - n / 8), faint) for n in range(9)]
+            self.promised = [clear * n / 8 for n in range(9)]
+            self.sums = [1 + clear / 2 * n / 8 for n in range(9)]
+
+        def outcome(self, certainty, number):
+            return self.sums[0], self.sums[number - 1]
+
+    fitted = fit_unseen(
+        Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]
+    )
+    for clear, faint in ((10.0, 30.0), (4.0, 5.0)):
+        assert fitted.unseen((clear, faint), promised=0.0, discoveries=0.0)[0] == pytest.approx(clear / 2, rel=0.15)
+        after = fitted.unseen((clear / 2, faint), promised=clear / 2, discoveries=clear / 4)[0]
+        assert after == pytest.approx(clear / 4, rel=0.15)
 
 
 def test_probabilities_of_the_fit_maximise_the_likelihood():
@@ -157,15 +200,18 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
 
 
 def test_what_no_look_has_shown_is_negative_binomial():
-    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0)
-    mean, variance = certainty.unseen(6.0, promised=10.0, discoveries=3.0)
+    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0, faint=0.25, promise=0.4)
+    mean, variance = certainty.unseen((5.0, 4.0), promised=25.0, discoveries=3.0)
     shape, rate = 4 * 0.5 + 3, 4 + 10
     law = nbinom(shape, rate / (rate + 6))
     assert mean == pytest.approx(law.mean())
     assert variance == pytest.approx(law.var())
-    assert certainty.unseen(0.0, promised=10.0, discoveries=3.0) == (0.0, 0.0)
+    assert certainty.unseen((0.0, 0.0), promised=10.0, discoveries=3.0) == (0.0, 0.0)
     assert Certainty.of(certainty.numbers) == certainty
-    with pytest.raises(InputError, match="certainty: expected 2 or 17 numbers, got 3"):
+    earlier = Certainty.of(certainty.numbers[:-2])  # all cells and promises count in full
+    assert earlier == replace(certainty, faint=1.0, promise=1.0)
+    assert earlier.unseen((2.0, 4.0), promised=10.0, discoveries=3.0) == pytest.approx((law.mean(), law.var()))
+    with pytest.raises(InputError, match="certainty: expected 2, 17 or 19 numbers, got 3"):
         Certainty.of([1.0, 2.0, 3.0])
 
 

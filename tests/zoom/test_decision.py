@@ -15,11 +15,11 @@ from semfov.decision import OUTCOMES, settle
 from semfov.fit.windows_decision import Searches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
 from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom.decision import SearchFacts
+from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import CASE, features
-from semfov.zoom.facts import SearchFacts
 from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import CELLS
-from semfov.zoom.search import look_for
 
 SHARE = st.floats(0, 1, width=32)
 

@@ -10,9 +10,8 @@ from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.detector import FAINT
 from semfov.errors import InputError
 from semfov.zoom import WindowEye
-from semfov.zoom.gist import DETECTION_SCORE
 from semfov.zoom.glances import LiveGlances, on_lattice
-from semfov.zoom.hints import hints_of
+from semfov.zoom.hints import DETECTION_SCORE, hints_of
 
 KINDS = 3
 

@@ -9,10 +9,10 @@ from semfov.fit.windows_evidence import WindowResult, ZoomExample
 from semfov.fit.windows_survey import LookCounts, SurveyExample, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.gist import Gist
 from semfov.zoom.glances import half_steps, on_lattice
+from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.survey import Survey
+from semfov.zoom.networks import Survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
 CLASSES = 3

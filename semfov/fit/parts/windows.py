@@ -33,11 +33,10 @@ from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
-from semfov.zoom.episode import WindowStep, look_by_look
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances
-from semfov.zoom.search import find_everything
 from semfov.zoom.slices import ranked, usual_slices
 
 ENOUGH = 16
