@@ -227,7 +227,12 @@ SHARES = {
         "a fifth of the NSS difference": ("0.365", "1.739"),
         "a quarter together with VOCUS2": ("0.446", "1.739"),
     },
-    "docs/measurements/zoom.md": {"One of four boxes": ("0.250", 1)},
+    "docs/measurements/zoom.md": {
+        "One of four boxes": ("0.250", 1),
+        "less than half of themselves": "visibility in the annotations of the street",
+        "less than a tenth of an object": "the border of faint cells in the code",
+        "count for a tenth of their promise": "in the file of the model and its card",
+    },
 }
 """What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""
 
