@@ -58,6 +58,7 @@ def test_own_observer_raises_the_score_of_the_target(run):
     assert output.splitlines()[-1] == "found"
 
 
+@pytest.mark.lab
 def test_own_policy_needs_fewer_gaze_shifts(run):
     output = run("own_policy")
     found = re.findall(r"^([\w-]+): ([\d.]+) gaze shifts on average, (\d+) searches$", output, re.MULTILINE)
@@ -77,6 +78,7 @@ def test_learned_gaze_finds_more_than_random_gaze(run):
     assert int(learned[3]) > int(random[3]) + 10
 
 
+@pytest.mark.lab
 def test_own_sensor_recognises_objects_too_small_for_the_published_fovea(run):
     output = run("own_sensor")
     found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are recognised when they are fixated$", output, re.MULTILINE)

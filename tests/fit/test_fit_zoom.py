@@ -34,6 +34,7 @@ pytestmark = pytest.mark.usefixtures("kept_scenes")
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     config = FitZoomConfig(

@@ -203,6 +203,7 @@ def tasks(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_loses_a_worker_and_its_scheduler_gives_what_one_process_gives(tasks, tmp_path):
     port = free_port()
@@ -230,6 +231,7 @@ def test_a_cluster_that_loses_a_worker_and_its_scheduler_gives_what_one_process_
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 @pytest.mark.weights
 @pytest.mark.filterwarnings("ignore")
 def test_looks_of_a_cluster_come_back_and_are_the_same_to_the_bit(tmp_path, monkeypatch):
