@@ -6,6 +6,7 @@ All beliefs are updated with the looks of the same searches.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -17,7 +18,6 @@ from eval.search.run import SearchConfig
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.episode import Step, Stopwatch, rollout
-from semfov.errors import InputError
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Task
@@ -28,7 +28,7 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches
-from semfov.runs.setup import Learned, make_learned
+from semfov.runs.setup import if_shipped, make_learned
 
 COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""
@@ -74,9 +74,13 @@ class BeliefCalibrationRun(PolicyLooking):
     def __init__(self, config: SearchConfig) -> None:
         super().__init__(replace(config, policies=tuple(ALL_CLASSES.values())))
         self.left_out: dict[str, str] = {}
-        belief = self.config.belief
-        evidence = self._if_shipped(LEARNED, TargetEvidence, belief.target_model)
-        evidence_map = self._if_shipped(MAP, MapEvidence, belief.map_model)
+        belief, leave_out = self.config.belief, self.left_out.__setitem__
+        evidence = if_shipped(
+            partial(make_learned, TargetEvidence), belief.target_model, self.eye, partial(leave_out, LEARNED)
+        )
+        evidence_map = if_shipped(
+            partial(make_learned, MapEvidence), belief.map_model, self.eye, partial(leave_out, MAP)
+        )
         self.models = replace(self.models, evidence=evidence, map=evidence_map)
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
@@ -85,16 +89,6 @@ class BeliefCalibrationRun(PolicyLooking):
             self.observers[LEARNED] = Target(evidence)
         if evidence_map is not None:
             self.observers[MAP] = LearnedMap(evidence_map)
-
-    def _if_shipped(self, name: str, kind: type[Learned], model: str | None) -> Learned | None:
-        """Load the model that the settings name, or else the shipped model; None where none is shipped."""
-        try:
-            return make_learned(kind, model, self.eye)
-        except InputError as error:
-            if model is not None:
-                raise
-            self.left_out[name] = str(error)
-            return None
 
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, and how calibration is measured."""

@@ -183,13 +183,32 @@ def make_learned(kind: type[Learned], name: str | None, eye: Eye) -> Learned:
     return model.requires_grad_(False)
 
 
-def if_shipped(make: Callable[[str | None, Eye], Made], name: str | None, eye: Eye) -> Made | None:
-    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped."""
+def if_shipped(
+    make: Callable[[str | None, Eye], Made],
+    name: str | None,
+    eye: Eye,
+    missing: Callable[[str], object] = lambda reason: None,
+) -> Made | None:
+    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped.
+
+    Args:
+        make: loads the model (`make_learned`, `make_observation`).
+        name: name or file of the model; None for the shipped one.
+        eye: sensor and detector.
+        missing: called with the reason where none is shipped.
+
+    Returns:
+        The model.
+
+    Raises:
+        InputError: the model that the settings name cannot be used.
+    """
     try:
         return make(name, eye)
-    except InputError:
+    except InputError as error:
         if name is not None:
             raise
+        missing(str(error))
         return None
 
 
