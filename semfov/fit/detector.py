@@ -125,7 +125,8 @@ def fit_folder(config: FitDetectorConfig) -> None:
 
 def seconds_of_looks(run: Looking) -> float:
     """Estimate the seconds that the remaining looks will take, from the time of one look."""
-    left = [index for index in range(len(run.scenes)) if run.store.load(run.digest(index)) is None]
+    cells = len(run.grid(0))
+    left = [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
     if not left:
         return 1.0
     image = run.scenes[left[0]].image[None]

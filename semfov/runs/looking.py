@@ -86,8 +86,8 @@ class Looking(SceneRun):
         return None if tensors is None else pack_tensors(tensors)
 
     def keep(self, index: int, stored: bytes) -> None:
-        """Store the looks at a scene, if this process does not see them."""
-        if self.store.read(self.digest(index)) is None:
+        """Store the looks at a scene, if this process does not see all of them."""
+        if len(self.store.load(self.digest(index))) < len(self.grid(index)):
             self.store.write(self.digest(index), unpack_tensors(stored))
 
 

@@ -186,7 +186,8 @@ class ZoomBelief:
 
     def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""
-        self._predict()
+        if self._predicted < len(self.gists):
+            self._predict()
         expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
         return expected
 

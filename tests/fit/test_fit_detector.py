@@ -1,5 +1,6 @@
 """`semfov fit` for a detector of coloured squares, from photographs to a search."""
 
+import itertools
 import json
 import re
 import shutil
@@ -27,6 +28,7 @@ from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
+from semfov.fit.detector import seconds_of_looks
 from semfov.fit.detector_report import thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
@@ -38,6 +40,7 @@ from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
+from semfov.runs.looking import looking_of
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network
@@ -514,6 +517,27 @@ def test_one_progress_bar_covers_all_stages(capsys):
     # Outside the stages a task has its own bar again.
     assert list(track(range(2), "alone", "unit")) == [0, 1]
     assert "alone" in capsys.readouterr().err
+
+
+def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path, monkeypatch):
+    """At two seconds a look; scenes that are stored in part count as a whole, and with nothing left a second."""
+    root = home / "photographs"
+    data = DataConfig(root, root / "instances.json", 3, min_instances=0, max_target_area=None)
+    detector = DetectorConfig(str(home / "colours.onnx"))
+    run = looking_of(
+        FitDetectorConfig(data=data, detector=detector, columns=3, rows=2, out=tmp_path, cache=tmp_path, workers=1)
+    )
+    clock = itertools.count(step=2.0)
+    monkeypatch.setattr("semfov.fit.detector.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    assert seconds_of_looks(run) == 2 * 6 * 3
+    run.detections(1)
+    assert seconds_of_looks(run) == 2 * 6 * 2
+    looks = run.store.load(run.digest(1))
+    run.store.save(run.digest(1), {cell: looks[cell] for cell in (0, 4)})
+    assert seconds_of_looks(run) == 2 * 6 * 3
+    for index in range(3):
+        run.detections(index)
+    assert seconds_of_looks(run) == 1
 
 
 @pytest.mark.slow
