@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook, known_options, only_for, without_none
+from semfov.agents.limits import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.windows import ZoomAgent, pays
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -23,9 +23,9 @@ from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
-from semfov.detection.load import DetectorLike, load_yolo
+from semfov.detection.load import DetectorLike, detector_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, SemfovError, check, check_number, check_whole, lookup
+from semfov.errors import InputError, SemfovError, check, check_number, check_options, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
@@ -207,10 +207,9 @@ class ActivePerception(nn.Module):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *given: Any, **options: Any) -> Self:
         """The agent with the parts that a function makes from the options of a constructor, ready for use."""
-        known = [*signature(make).parameters, *signature(load_yolo).parameters]
-        with known_options(options, known, "the agent or of semfov.load_detector"):
-            fields = make(*given, **options)
-        return cls(**fields).eval().requires_grad_(False)
+        known = [*signature(make).parameters, *detector_options()]
+        check_options(options, known, "the agent or of semfov.load_detector")
+        return cls(**make(*given, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""

@@ -214,3 +214,27 @@ def lookup(name: str, known: Iterable[Name], what: str) -> Name:
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names)}"
     raise InputError(f"unknown {what} {name!r}; {hint}")
+
+
+def check_options(options: Iterable[str], known: Iterable[str], what: str) -> None:
+    """Raise `InputError` for the first unknown option of a call that passes its options on, with the nearest names.
+
+    Args:
+        options: names of the options that were given.
+        known: names of the options that exist.
+        what: whose options they are, for the message.
+
+    Raises:
+        InputError: an option is unknown.
+
+    >>> check_options(["gird"], ["grid", "sigma"], "this agent")
+    Traceback (most recent call last):
+    semfov.errors.InputError: gird: expected an option of this agent, got an unknown one; did you mean grid=?
+    """
+    names = list(dict.fromkeys(known))
+    for name in options:
+        if name not in names:
+            cells = name in ("columns", "rows", "cells") and "grid" in names
+            near = ["grid"] if cells else get_close_matches(name, names, n=3)
+            hint = f"; did you mean {' or '.join(f'{each}=' for each in near)}?" if near else ""
+            raise InputError(f"{name}: expected an option of {what}, got an unknown one{hint}")

@@ -2,20 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from inspect import signature
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options, on_cpu
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
-from semfov.detection.load import load_detector, load_yolo
+from semfov.detection.load import load_detector
 from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneBelief, SceneObserver
@@ -80,8 +79,7 @@ class HeadAgent(nn.Module):
             InputError: no models are shipped for a detector of this name.
             DataError: the weights cannot be obtained, or are damaged.
         """
-        with known_options(options, signature(load_yolo).parameters, "semfov.load_detector"):
-            eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
+        eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
         shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
         models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
         for model in models:

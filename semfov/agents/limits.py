@@ -1,10 +1,8 @@
 """What agents share: limits of an episode, checks of arguments, and where their parts compute."""
 
 import copy
-from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from time import perf_counter
 from typing import Any, Literal, TypeVar
 
@@ -92,37 +90,6 @@ def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
                 f"{name}: expected None for a picture that is looked at by {kind!r}, got {value}; use {instead}, or "
                 f"how={suits!r}"
             )
-
-
-@contextmanager
-def known_options(options: Collection[str], known: Iterable[str], what: str) -> Iterator[None]:
-    """Raise `InputError` in place of the `TypeError` for an option that the functions called inside do not have.
-
-    Args:
-        options: names of the options that were given.
-        known: names of options that may be meant.
-        what: whose options are passed on, for the message.
-
-    Raises:
-        InputError: one of the options is unknown; the message has the nearest names.
-        TypeError: any other one is not changed.
-
-    >>> with known_options(["gird"], ["grid", "sigma"], "this agent"):
-    ...     (lambda grid: grid)(gird=(12, 8))
-    Traceback (most recent call last):
-    semfov.errors.InputError: gird: expected an option of this agent, got an unknown one; did you mean grid=?
-    """
-    try:
-        yield
-    except TypeError as error:
-        name = next((name for name in options if f"unexpected keyword argument '{name}'" in str(error)), None)
-        if name is None:
-            raise
-        names = list(known)
-        cells = name in ("columns", "rows", "cells") and "grid" in names
-        near = ["grid"] if cells else get_close_matches(name, names, n=3)
-        hint = f"; did you mean {' or '.join(f'{each}=' for each in near)}?" if near else ""
-        raise InputError(f"{name}: expected an option of {what}, got an unknown one{hint}") from None
 
 
 def without_none(**values: Any) -> dict[str, Any]:

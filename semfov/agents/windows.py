@@ -3,21 +3,20 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from inspect import signature
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, known_options, on_cpu
+from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, on_cpu
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
 from semfov.decision import check_thresholds
 from semfov.detection.detections import Detections
-from semfov.detection.load import load_detector, load_yolo
+from semfov.detection.load import detector_options, load_detector
 from semfov.detection.objects import LEAST, Objects
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths.endings import Ending
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
@@ -93,8 +92,8 @@ class ZoomAgent(nn.Module):
             InputError: no evidence is shipped for a detector of this name.
             DataError: the weights cannot be downloaded, or they are damaged.
         """
-        with known_options(options, ["finest", "cut", *signature(load_yolo).parameters], "semfov.load_detector"):
-            eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
+        check_options(options, ["finest", "cut", *detector_options()], "the agent or of semfov.load_detector")
+        eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
         return cls(eye, evidence).eval().requires_grad_(False)
 

@@ -1,6 +1,7 @@
 """Loading of detectors by name, file or model: `load_detector`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from inspect import Parameter, signature
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import YoloV3
-from semfov.errors import DataError, InputError, check, lookup
+from semfov.errors import DataError, InputError, check, check_options, lookup
 from semfov.io.files import check_regular
 
 _WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; use load_detector('x.cfg', weights='{}')"
@@ -69,42 +70,73 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
     if isinstance(model, Detector):
         check(not options, "options", "none for a detector that is made already", ", ".join(options))
         return model
-    if not isinstance(model, str | PathLike):
-        return load_module(model, **options)
-    name = detector_name(model)
+    if isinstance(model, str | PathLike):
+        name = detector_name(model)
+        return _load(_loader(name), name, name, options)
+    return _load(_wrapper(model), model, f"a {type(model).__name__}", options)
+
+
+def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:
+    """Call a loader with options that it has."""
+    check_options(options, _options_of(load), f"semfov.load_detector for {what}")
+    return load(model, **options)
+
+
+def _loader(name: str) -> Callable[..., Detector]:
+    """The function that loads a detector by its name or file."""
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
         from semfov.detection.onnx import load_onnx
 
-        return load_onnx(name, **options)
+        return load_onnx
     if name.startswith("torchvision:"):
         from semfov.detection.torchvision import load_torchvision
 
-        return load_torchvision(name, **options)
+        return load_torchvision
     if name.startswith("hf:"):
         from semfov.detection.transformers import load_hub
 
-        return load_hub(name, **options)
-    return load_yolo(name, **options)
+        return load_hub
+    return load_yolo
 
 
-def load_module(module: nn.Module, **options: Any) -> Detector:
-    """Make a detector of a module of another library (in memory, not a copy), which is known by its class."""
-    if comes_from(module, "torchvision.models.detection"):
+def _wrapper(model: nn.Module) -> Callable[..., Detector]:
+    """The function that makes a detector of a module (in memory, not a copy), which is known by its class."""
+    if comes_from(model, "torchvision.models.detection"):
         from semfov.detection.torchvision import wrap_torchvision
 
-        return wrap_torchvision(module, **options)
-    if comes_from(module, "transformers.models"):
+        return wrap_torchvision
+    if comes_from(model, "transformers.models"):
         from semfov.detection.transformers import wrap_transformers
 
-        return wrap_transformers(module, **options)
-    if comes_from(module, "ultralytics"):
+        return wrap_transformers
+    if comes_from(model, "ultralytics"):
         from semfov.detection.ultralytics import wrap_ultralytics
 
-        return wrap_ultralytics(module, **options)
+        return wrap_ultralytics
     raise InputError(
-        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(module).__module__}."
-        f"{type(module).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
+        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
+        f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
     )
+
+
+def _options_of(load: Callable[..., Detector]) -> list[str]:
+    """Names of the options of a loader, and of the one that it passes further options on to."""
+    from semfov.detection.transformers import load_hub, wrap_transformers
+
+    loaders = (load, wrap_transformers) if load is load_hub else (load,)
+    options = (each for loader in loaders for each in signature(loader).parameters.values())
+    return [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
+
+
+def detector_options() -> list[str]:
+    """Names of the options of `load_detector` for any detector."""
+    from semfov.detection.onnx import load_onnx
+    from semfov.detection.torchvision import load_torchvision, wrap_torchvision
+    from semfov.detection.transformers import load_hub
+    from semfov.detection.ultralytics import wrap_ultralytics
+
+    loaders = load_yolo, load_onnx, load_torchvision, wrap_torchvision, load_hub, wrap_ultralytics
+    return [name for load in loaders for name in _options_of(load)]
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:

@@ -35,6 +35,28 @@ def test_unknown_names_are_refused_with_the_known_ones(name):
         load_detector(name)
 
 
+@pytest.mark.parametrize(
+    ("model", "options", "refused"),
+    [
+        (
+            "yolov3-tiny",
+            {"treshold": 0.1},
+            r"treshold: .* for yolov3-tiny.*; did you mean threshold=",
+        ),
+        ("yolov3-tiny", {"processor": {}}, "processor: .* for yolov3-tiny, got an unknown one$"),
+        ("yolox-nano", {"runtime": "torch"}, "runtime: .* for yolox-nano"),
+        ("mine.onnx", {"inputsize": 320}, "inputsize: .* for mine.onnx, .*; did you mean input_size="),
+        ("torchvision:ssd300_vgg16", {"revision": "main"}, "revision: .* for torchvision:ssd300_vgg16"),
+        ("hf:owner/name", {"proccessor": {}}, "proccessor: .* for hf:owner/name, .*; did you mean processor="),
+        (torch.nn.Linear, {}, "detector: expected a model of torchvision, transformers or Ultralytics"),
+    ],
+)
+def test_options_that_a_detector_does_not_have_are_refused_before_it_is_loaded(model, options, refused):
+    model = model if isinstance(model, str) else model(1, 1)
+    with pytest.raises(InputError, match=f"^{refused}"):
+        load_detector(model, **options)
+
+
 def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_path):
     with pytest.raises(InputError, match=r"expected a cfg and its weights"):
         load_detector("x.weights")
