@@ -3,10 +3,12 @@
     python -m eval.sensors --data.root val --data.annotations instances_val.json \
       --fit.root train --fit.annotations instances_train.json
 
-Every sensor gets an observation model of its own, fitted to the same photographs (`--fit`), and target evidence of its
-own if `--learned` says so. Then it searches and explores the same other photographs (`--data`). `--fixations 0` fits
-nothing, and measures only what raw scores tell. The detector must take pictures of any size. To continue a stopped run,
-give the same command again.
+Every sensor gets an observation model of its own, fitted to the same photographs (`--fit`). Then it searches and
+explores the same other photographs (`--data`). `--fixations 0` fits nothing, and measures only what raw scores tell.
+The detector must take pictures of any size. To continue a stopped run, give the same command again.
+
+All models of a sensor are fitted by `semfov fit MODEL --sensor.name NAME`, and measured by `python -m eval.search`,
+`eval.decide` and `eval.explore` with `--models FOLDER`.
 """
 
 import sys
@@ -28,7 +30,6 @@ from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
 from semfov.eye import Eye
-from semfov.fit.evidence import FitSearchConfig, fit_search
 from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.fit.outputs import model_path
 from semfov.io.files import clean, write_text
@@ -91,9 +92,6 @@ class SensorsConfig(LookingConfig):
         belief: the belief; its columns and rows are the cells.
         protocol: the protocol of searches and explorations.
         fixations: random fixations in each photograph of the fit (0: no observation model is fitted).
-        learned: number of the photographs of the fit from which target evidence is learned, from looks from every cell
-            (0: none is learned).
-        steps: training steps of the target evidence.
         classes: largest number of classes of a photograph that are told present or absent, and as many that it lacks.
         candidates: the sensors to compare, of `CANDIDATES`.
         out: folder for models, records and the table.
@@ -102,8 +100,6 @@ class SensorsConfig(LookingConfig):
     fit: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(starts=5, shifts=15))
     fixations: Whole = 4
-    learned: Whole = 0
-    steps: Count = 250
     classes: Count = 8
     candidates: tuple[str, ...] = tuple(CANDIDATES)[:-1]
     out: Path = Path("runs/sensors")
@@ -143,8 +139,6 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
         file, mapping = _observation(config, name), "random-calibrated"
         belief = replace(belief, model=str(file))
         model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
-    if config.learned:
-        belief = replace(belief, target_model=str(_evidence(config, name)))
     common = {"data": config.data, "protocol": config.protocol, "store": config.store, **shared}
     common["belief"] = belief
     search = SearchRun(SearchConfig(policies=searchers, out=folder / "search", **common))
@@ -167,11 +161,8 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
 
 def policies(config: SensorsConfig) -> tuple[str, ...]:
     """The searchers that are compared, the random one first."""
-    calibrated, learned = (
-        ["non-predictive-calibrated"] * bool(config.fixations),
-        ["target-evidence"] * bool(config.learned),
-    )
-    return ("random", "non-predictive-raw", *calibrated, *learned)
+    calibrated = ["non-predictive-calibrated"] * bool(config.fixations)
+    return ("random", "non-predictive-raw", *calibrated)
 
 
 def _observation(config: SensorsConfig, name: str) -> Path:
@@ -186,23 +177,6 @@ def _observation(config: SensorsConfig, name: str) -> Path:
     file = model_path(fitting, "")
     if not file.is_file():
         fit_fom(fitting)
-    return file
-
-
-def _evidence(config: SensorsConfig, name: str) -> Path:
-    """File of the target evidence of a sensor, which is fitted unless it is there."""
-    fitting = FitSearchConfig(
-        data=replace(config.fit, limit=config.learned),
-        columns=config.belief.columns,
-        rows=config.belief.rows,
-        steps=config.steps,
-        name=f"evidence-{config.learned}",
-        out=config.folder(name) / "evidence",
-        **config.settings(name),
-    )
-    file = model_path(fitting, "")
-    if not file.is_file():
-        fit_search(fitting)
     return file
 
 
