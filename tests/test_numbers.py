@@ -232,6 +232,7 @@ SHARES = {
         "less than half of themselves": "visibility in the annotations of the street",
         "less than a tenth of an object": "the border of faint cells in the code",
         "count for a tenth of their promise": "in the file of the model and its card",
+        "about a tenth of the products": "50 of 540 million",
     },
 }
 """What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""
