@@ -39,7 +39,8 @@ _LOOKS = """\
 
 _OUTPUT = """\
   --out FILE           results as .json, .csv, .geojson, or for COCO .coco.json, written while it runs
-  --out FOLDER         figures and results of each picture; --draw scanpath,views,belief,belief_bars,animation or none
+  --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
+                       also views,belief, and in a search belief_bars
   --report PAGE.html   a page in which to step through the looks; --looks prints them
   --workers N          processes that look at several pictures; --scheduler tcp://HOST:8786 for those of a Dask cluster
 

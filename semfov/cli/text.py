@@ -34,9 +34,7 @@ def _headline(record: GazeRecord) -> str:
 
 def decision_text(record: GazeRecord, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    # Beliefs without thresholds are no probabilities in the plain sense, and slices have scores alone.
-    what = {"fovea": "belief", "windows": "score"}[record.how] if record.ending == "detection" else "probability"
-    name, probability = record.target_name, f"{what} {decision.probability:.2f}"
+    name, probability = record.target_name, f"{record.decided_by} {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"
@@ -123,7 +121,10 @@ def looks_text(record: GazeRecord) -> str:
         ]
         for look in record
     ]
-    lines = [f"  {line}" for line in table_lines([["look", "at (x, y)", "shows", "detections", "value", "ms"], *rows])]
+    head = ["look", "at (x, y)", "shows", "detections", "value", "ms"]
+    if not any(row[-1] for row in rows):  # windows have no times
+        rows, head = [row[:-1] for row in rows], head[:-1]
+    lines = [f"  {line}" for line in table_lines([head, *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
         lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")

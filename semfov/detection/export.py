@@ -14,7 +14,7 @@ from semfov.detection.darknet_onnx import network_model
 from semfov.detection.detector import Detector
 from semfov.detection.onnx_file import METADATA_KEY
 from semfov.detection.yolo import YoloV3
-from semfov.errors import InputError
+from semfov.errors import InputError, SemfovError
 from semfov.io.files import write_bytes
 
 
@@ -82,16 +82,19 @@ def main() -> None:
     parser.add_argument("--input-size", type=int, help="side of the canvas in pixels")
     parser.add_argument("--static", action="store_true", help="fix the batch to one image, and fix the image's size")
     arguments = parser.parse_args()
-    detector = load_yolo(
-        arguments.detector,
-        weights=arguments.weights,
-        classes=arguments.classes,
-        input_size=arguments.input_size,
-        stride=None if arguments.static else 32,
-        runtime="torch",
-    )
-    export_onnx(detector, arguments.output, static=arguments.static)
-    difference = largest_difference(detector, arguments.output)
+    try:
+        detector = load_yolo(
+            arguments.detector,
+            weights=arguments.weights,
+            classes=arguments.classes,
+            input_size=arguments.input_size,
+            stride=None if arguments.static else 32,
+            runtime="torch",
+        )
+        export_onnx(detector, arguments.output, static=arguments.static)
+        difference = largest_difference(detector, arguments.output)
+    except SemfovError as error:
+        parser.exit(1, f"error: {error}\n")
     print(f"{arguments.output}: largest difference from the torch network {difference:.1e}")
 
 

@@ -133,7 +133,8 @@ def make_examples(
         DataError: no photograph has a class that may be searched for.
     """
     rows = []
-    for index in track(range(len(run.scenes)) if scenes is None else scenes, "describing looks", "scene"):
+    those, title = (range(len(run.scenes)), "describing looks") if scenes is None else (scenes, "describing others")
+    for index in track(those, title, "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         covered = grid.footprint(annotation.boxes)
         chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed, absent)
@@ -417,6 +418,7 @@ class EvidenceFit(PartFit):
         return {
             "describing looks": 0.05 * len(self.run.scenes),
             "training": 0.1 * self.settings.steps,
+            "describing others": 0.05 * len(self.inputs.held_out),
             "searching": judged,
             "deciding": judged,
         }

@@ -232,7 +232,7 @@ class TemperingFit(PartFit):
     def tasks(self) -> dict[str, float]:
         """The tasks and their seconds."""
         tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in self.settings.exponents]
-        return dict.fromkeys(tried, 0.005 * len(self.run.scenes))
+        return dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
 
     def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""

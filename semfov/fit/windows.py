@@ -459,8 +459,7 @@ def fit_counts(
     """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
     prepare_worker()
     fitted, judged = searched_kinds(config).values()
-    # These mosaics have three and nine times as many photographs.
-    some = {"far": max(1, config.searched // 5), "small": max(1, config.searched // 10)}
+    some = some_explored(config.searched)
     names = dict.fromkeys((*fitted, *some)), dict.fromkeys(judged)
     training, held_out = (
         {kind: (pictures[kind], open_all(eye, pictures[kind], store)[: some.get(kind)]) for kind in kinds}
@@ -469,6 +468,11 @@ def fit_counts(
     lines = certainty_again(model, training, held_out, passes=config.passes)
     model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
     return lines
+
+
+def some_explored(searched: int) -> dict[str, int]:
+    """Number of explored mosaics that have three and nine times as many photographs, for so many others."""
+    return {"far": max(1, searched // 5), "small": max(1, searched // 10)}
 
 
 @torch.no_grad()

@@ -111,6 +111,11 @@ class Record(Conversion):
         return x2 - x1 > width - 1 and y2 - y1 > height - 1
 
     @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
+        return "probability"
+
+    @property
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
         return None if self.target is None else self.classes[self.target]

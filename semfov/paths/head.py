@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -240,7 +241,8 @@ class HeadPath(GazeRecord):
         return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
 
     def _value(self, number: int) -> float | None:
-        return self.values[number] if self.values else None
+        value = self.values[number] if self.values else math.inf
+        return value if math.isfinite(value) else None  # the first look has none
 
     def _decision_in_picture(self) -> Decision | None:
         decision = self.decision

@@ -132,6 +132,11 @@ class Scanpath(GazeRecord):
         distances = [distances_to(look.boxes[0], point) for look, point in zip(self.detections, points, strict=True)]
         return merge_fixations(self.detections, distances, self.closer)
 
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, or a `belief` without thresholds."""
+        return "belief" if self.ending == "detection" else "probability"
+
     def views(self) -> list[Tensor]:
         """The foveated photograph at each fixation.
 

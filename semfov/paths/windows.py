@@ -159,6 +159,11 @@ class ZoomPath(GazeRecord):
         """Number of passes of the detector, closer looks included."""
         return len(self.glances)
 
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
+        return "score" if self.unseen is None else "probability"
+
     def describe(self) -> str:
         """Summarise the result."""
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"

@@ -42,7 +42,7 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
         f"Click on the number or the border of a window to choose its look.{confirmed}</p>"
         f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data)}</figure>'
-        f'{looks}</div><p class="hint">{data["values"]}A look brought the objects whose final box comes from it.</p>'
+        f'{looks}</div><p class="hint">{data["values"]}A look brought the objects that it shows most sharply.</p>'
         f"<h3>Objects</h3>{_objects(data, count)}</article>"
     )
 
@@ -125,7 +125,7 @@ def _objects(data: Data, count: int) -> str:
         sure = ["yes" if each["confirmed"] else "no"] if data["confirmable"] else []
         place = _corners(each["box"])
         rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), *sure])
-    caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the look of each box"
+    caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the sharpest look"
     return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
 
 

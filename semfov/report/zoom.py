@@ -208,7 +208,8 @@ def outcome_in_words(path: Record) -> str:
         text = f"{path.objects_in_words()}."
     else:
         outcome, probability = path.decision.outcome, path.decision.probability
-        text = f"“{path.target_name}” {outcome}, probability that the picture holds it: {probability:.2f}."
+        what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"
+        text = f"“{path.target_name}” {outcome}, {what}: {probability:.2f}."
     return f"{text} {reason}".rstrip()
 
 

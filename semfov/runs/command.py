@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 import threading
+from argparse import SUPPRESS
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,7 +71,9 @@ def make_parser(
         hint = setting_types(config)[positional[0]]
         several = get_origin(hint) is tuple
         kind = str if several or hint is str else Path
-        parser.add_argument(positional[0], help=positional[1], nargs="*" if several else "?", type=kind)
+        # Without a default of its own it leaves what a file of --config says.
+        given: dict[str, Any] = {"nargs": "*" if several else "?", "type": kind, "default": SUPPRESS}
+        parser.add_argument(positional[0], help=positional[1], **given)
     skip = {*config.unused, *([] if positional is None else positional[:1])}
     parser.add_class_arguments(config, as_group=True, skip=skip)
     return parser

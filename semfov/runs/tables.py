@@ -23,13 +23,13 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:
-    """A value and its standard error, such as `12.3 ± 0.4`; with `sign="+"` the value always has its sign."""
-    return f"{value:{sign}.{digits}f} ± {error:.{digits}f}"
+    """A value and its standard error, if there is one: `12.3 ± 0.4`; with `sign="+"` the value always has its sign."""
+    return f"{value:{sign}.{digits}f}" + (f" ± {error:.{digits}f}" if math.isfinite(error) else "")
 
 
 def percent(value: float, error: float) -> str:
     """A share in percent with its standard error, if there is one."""
-    return plus_minus(100 * value, 100 * error) if math.isfinite(error) else f"{100 * value:.1f}"
+    return plus_minus(100 * value, 100 * error)
 
 
 def share(count: int, total: int) -> str:

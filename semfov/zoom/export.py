@@ -18,7 +18,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import OnnxDetector, probe
 from semfov.detection.scores import Candidates, score_vectors
-from semfov.errors import InputError, check
+from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence, pool_all
 from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
@@ -260,9 +260,12 @@ def main() -> None:
     parser.add_argument("--evidence", help="fitted evidence by magnification: a name or a file")
     parser.add_argument("--cells", type=int, default=FINEST, help="cells along a side of the window, for the evidence")
     options = parser.parse_args()
-    detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
-    evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
-    export_look(WindowEye(detector).eval(), options.output, evidence, cells=options.cells)
+    try:
+        detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
+        evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
+        export_look(WindowEye(detector).eval(), options.output, evidence, cells=options.cells)
+    except SemfovError as error:
+        parser.exit(1, f"error: {error}\n")
     print(f"written: {options.output}")
 
 

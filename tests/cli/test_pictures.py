@@ -45,6 +45,19 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
     assert (round(result["x"]), round(result["y"])) == (int(found[1]), int(found[2]))
 
 
+def test_a_file_of_settings_names_the_picture_unless_the_command_does(run, photo, tmp_path):
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(json.dumps({"pictures": [str(photo)], "target": "red", "start": "47"}))
+    code, printed = run("search", "--config", settings)
+    assert code == 0
+    assert f"{photo.name}, 160 × 120 px: found red" in printed.out
+    other = photo.with_name("other.png")
+    Image.open(photo).crop((0, 0, 80, 60)).save(other)
+    _, printed = run("search", other, "--config", settings)
+    assert "other.png, 80 × 60 px" in printed.out
+    assert photo.name not in printed.out
+
+
 def test_nothing_is_written_unless_it_is_asked_for(run, photo, tmp_path):
     before = set(tmp_path.rglob("*"))
     code, printed = run("search", photo, "--target", "red", "--start", 47)
@@ -264,6 +277,7 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
         r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, probability 0\.50", printed.out
     )
     assert "A closer look confirmed the target." in printed.out
+    assert re.search(r"^  look +at \(x, y\) +shows +detections +value$", printed.out, re.M)
     assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}
     (episode,) = episodes_of(tmp_path / "page.html")

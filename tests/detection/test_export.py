@@ -1,4 +1,6 @@
+import importlib
 import json
+import re
 import sys
 
 import numpy as np
@@ -65,6 +67,16 @@ def test_other_detectors_and_unwritable_files_are_refused(make_small, tmp_path, 
     with pytest.raises(DataError, match="cannot write"):
         export_onnx(make_small(), tmp_path / "file" / "out.onnx")
     assert not (tmp_path / "out.onnx").exists()
+
+
+@pytest.mark.parametrize("command", ["semfov.detection.export", "semfov.zoom.export"])
+def test_command_lines_refuse_a_missing_file_in_one_line(command, tmp_path, monkeypatch, capsys):
+    words = ["export", "yolov3-tiny", str(tmp_path / "tiny.onnx"), "--weights", str(tmp_path / "no.weights")]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(command).main()
+    assert ended.value.code == 1
+    assert re.fullmatch(r"error: .*no\.weights.*\n", capsys.readouterr().err)
 
 
 @pytest.mark.slow

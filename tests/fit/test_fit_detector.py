@@ -51,7 +51,16 @@ def home(tmp_path_factory):
     """The parent folder of a network, photographs and the models fitted to them."""
     folder = write_home(tmp_path_factory.mktemp("fit_detector"))
     torch.set_num_threads(1)
-    assert command(arguments(folder)) == 0
+    task, foreign = WholeBar.task, []
+
+    def noting(bar, title, total):
+        foreign.extend([title] * (title not in bar._tasks))
+        return task(bar, title, total)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(WholeBar, "task", noting)
+        assert command(arguments(folder)) == 0
+    (folder / "foreign.json").write_text(json.dumps(foreign))
     return folder
 
 
@@ -517,6 +526,10 @@ def test_one_progress_bar_covers_all_stages(capsys):
     # Outside the stages a task has its own bar again.
     assert list(track(range(2), "alone", "unit")) == [0, 1]
     assert "alone" in capsys.readouterr().err
+
+
+def test_all_work_of_a_fit_moves_its_bar(home):
+    assert json.loads((home / "foreign.json").read_text()) == []
 
 
 def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig
 from semfov.runs.looking import looking_of
+from semfov.runs.progress import WholeBar
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -51,8 +52,12 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
         return replace(usual(*given), mosaics=2, crowded=1, judged=2, searched=2)
 
     monkeypatch.setattr(WindowsFit, "mosaics", fewer)
-    folder = folder_of(home)
-    fitted = folder.fit("windows")
+    folder, used = folder_of(home), []
+    tasks, task = folder.fits["windows"].tasks, WholeBar.task
+    with monkeypatch.context() as noting, WholeBar("fitting", {"windows": tasks}) as whole, whole.stage("windows"):
+        noting.setattr(WholeBar, "task", lambda bar, title, total: used.append(title) or task(bar, title, total))
+        fitted = folder.fit("windows")
+    assert {*used} == {*tasks}
     config = folder.fits["windows"].settings
     assert isinstance(config, FitZoomConfig)
     # Slots of 4 to 3 that hold square photographs of 64 pixels would be 85 wide, more than the detector needs.

@@ -157,6 +157,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
         (Decision("undecided", 0.6), "decision", "0.60. No remaining look is worth a pass, but .* probably there.$"),
         (Decision("undecided", 0.2), "windows", "0.20. No window is left that can show more.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
+        (Decision("found", 0.7), "detection", "“cat” found, best score: 0.70. A detection shows the target.$"),
         (None, "passes", "^0 × cat from score 0.3. All 3 passes were used.$"),
         (None, "worth", "^0 × cat from score 0.3. No remaining look is expected to show enough new objects.$"),
         (None, None, "^0 × cat from score 0.3.$"),
@@ -164,7 +165,15 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
 )
 def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, ending, told):
     nothing = zoom_path.candidates.above(1)
-    path = replace(zoom_path, target=1, decision=decision, candidates=nothing, ending=ending)
+    learned = decision is not None and ending != "detection"
+    path = replace(
+        zoom_path,
+        target=1,
+        decision=decision,
+        candidates=nothing,
+        ending=ending,
+        unseen=(0.0, 0.0) if learned else None,
+    )
     data = zoom_data(path, large_picture, name="field.png")
     assert re.search(told, data["decision"])
     page = page_html("t", [data])

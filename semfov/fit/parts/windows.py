@@ -24,6 +24,7 @@ from semfov.fit.windows import (
     look_at_all,
     make_mosaics,
     make_store,
+    some_explored,
     survey_again,
 )
 from semfov.fit.windows_choice import open_all
@@ -122,17 +123,17 @@ class WindowsFit(PartFit):
         config = self.settings
         if isinstance(config, LeftOut):
             return {}
+        sets = {"searched": config.searched, "judged": config.judged}
         return {
             "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
             "learning what closer looks show": 0.1 * config.steps,
             "learning the expected number of objects": 0.2 * config.steps,
             "learning the survey": 0.4 * config.survey_steps,
-            "searching": 4 * config.searched,
-            "searching held-out mosaics": 4 * config.judged,
+            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
+            "fitting decisions": 0.01 * config.judging,
             "looking closely": 4 * config.searched,
-            "looking closely at held-out mosaics": 4 * config.judged,
-            "exploring": config.searched,
-            "exploring held-out mosaics": config.judged,
+            "looking closely at held-out pictures": 4 * config.judged,
+            **{f"exploring, {kind}": 2 * count for kind, count in (sets | some_explored(config.searched)).items()},
         }
 
     def fit(self) -> PartResult:
