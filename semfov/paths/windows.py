@@ -162,7 +162,8 @@ class ZoomPath(GazeRecord):
     @property
     def decided_by(self) -> str:
         """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
-        return "score" if self.unseen is None else "probability"
+        learned = self.unseen is not None or self.closer or self.ending == "decision"
+        return "probability" if learned else "score"
 
     def describe(self) -> str:
         """Summarise the result."""

@@ -45,7 +45,7 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
     assert (round(result["x"]), round(result["y"])) == (int(found[1]), int(found[2]))
 
 
-def test_a_file_of_settings_names_the_picture_unless_the_command_does(run, photo, tmp_path):
+def test_a_file_of_settings_names_the_picture_unless_one_follows_it(run, photo, tmp_path):
     settings = tmp_path / "settings.yaml"
     settings.write_text(json.dumps({"pictures": [str(photo)], "target": "red", "start": "47"}))
     code, printed = run("search", "--config", settings)
@@ -53,7 +53,7 @@ def test_a_file_of_settings_names_the_picture_unless_the_command_does(run, photo
     assert f"{photo.name}, 160 × 120 px: found red" in printed.out
     other = photo.with_name("other.png")
     Image.open(photo).crop((0, 0, 80, 60)).save(other)
-    _, printed = run("search", other, "--config", settings)
+    _, printed = run("search", "--config", settings, other)
     assert "other.png, 80 × 60 px" in printed.out
     assert photo.name not in printed.out
 
