@@ -448,7 +448,7 @@ def verification_report(
             *table(chances),
             "",
             "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
-            "the target evidence decide. Area under the ROC of the final probability: "
+            "the evidence decide. Area under the ROC of the final probability: "
             f"{_figure_text(figures['area'])}.",
             "",
             *table(decisions),
