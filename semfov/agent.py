@@ -23,7 +23,7 @@ from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import LargePicture, open_large, picture_size
 from semfov.decision import MOST_CLOSER, check_thresholds
-from semfov.detection.load import DetectorLike, detector_options
+from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
 from semfov.errors import InputError, SemfovError, check, check_number, check_options, check_whole, lookup
 from semfov.eye import Eye
@@ -207,7 +207,7 @@ class ActivePerception(nn.Module):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *given: Any, **options: Any) -> Self:
         """The agent with the parts that a function makes from the options of a constructor, ready for use."""
-        known = [*signature(make).parameters, *detector_options()]
+        known = [*signature(make).parameters, *loader_options()]
         check_options(options, known, "the agent or of semfov.load_detector")
         return cls(**make(*given, **options)).eval().requires_grad_(False)
 

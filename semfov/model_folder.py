@@ -222,11 +222,11 @@ class ModelFolder:
         model = self._models.get("windows")
         return model if isinstance(model, GlimpseEvidence) else None
 
-    def arguments(self, **source: Any) -> dict[str, Any]:
-        """Arguments of `semfov.ActivePerception`; takes arguments for `load_detector`."""
+    def arguments(self, *, detector: str | PathLike[str] | None = None, **options: Any) -> dict[str, Any]:
+        """Arguments of `semfov.ActivePerception`; takes the arguments of `load_detector`."""
         grid = self.manifest.grid
         return {
-            "eye": self.eye(**source),
+            "eye": self.eye(detector=detector, **options),
             "search": self.search(),
             "explore": self.explore(),
             "verification": self.verification(),

@@ -14,7 +14,7 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, picture_size
 from semfov.decision import check_thresholds
 from semfov.detection.detections import Detections
-from semfov.detection.load import detector_options, load_detector
+from semfov.detection.load import load_detector, loader_options
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths.endings import Ending
@@ -92,7 +92,7 @@ class ZoomAgent(nn.Module):
             InputError: no evidence is shipped for a detector of this name.
             DataError: the weights cannot be downloaded, or they are damaged.
         """
-        check_options(options, ["finest", "cut", *detector_options()], "the agent or of semfov.load_detector")
+        check_options(options, ["finest", "cut", *loader_options()], "the agent or of semfov.load_detector")
         eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
         return cls(eye, evidence).eval().requires_grad_(False)

@@ -128,7 +128,7 @@ def _options_of(load: Callable[..., Detector]) -> list[str]:
     return [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
 
 
-def detector_options() -> list[str]:
+def loader_options() -> list[str]:
     """Names of the options of `load_detector` for any detector."""
     from semfov.detection.onnx import load_onnx
     from semfov.detection.torchvision import load_torchvision, wrap_torchvision

@@ -315,7 +315,7 @@ class Record(Conversion):
         """The objects as a table of plain values, one row for each object, most confident first.
 
         `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
-        number of the look that the box comes from.
+        number of the look that shows it most sharply.
 
         Returns:
             One dictionary for each object.
@@ -328,15 +328,12 @@ class Record(Conversion):
                 "class": self.classes[label],
                 "score": score,
                 "confirmed": sure,
-                "x": (x1 + x2) / 2,
-                "y": (y1 + y2) / 2,
-                "x1": x1,
-                "y1": y1,
-                "x2": x2,
-                "y2": y2,
+                "x": (box[0] + box[2]) / 2,
+                "y": (box[1] + box[3]) / 2,
+                **dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
                 "look": look,
             }
-            for number, (label, score, sure, look, (x1, y1, x2, y2)) in enumerate(
+            for number, (label, score, sure, look, box) in enumerate(
                 zip(*(column.tolist() for column in columns), strict=True)
             )
         ]
@@ -419,11 +416,8 @@ class Record(Conversion):
             raise InputError(
                 "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
             ) from None
-        return (
-            pandas.DataFrame(self.rows())
-            if table == "looks"
-            else pandas.DataFrame(self.object_rows(), columns=_COLUMNS)
-        )
+        rows, columns = (self.rows(), None) if table == "looks" else (self.object_rows(), _COLUMNS)
+        return pandas.DataFrame(rows, columns=columns)
 
     def _detected(self, look: Detections) -> dict[str, Any]:
         """Columns of a table on the detections of a look: their number, and the most confident one."""
