@@ -14,7 +14,6 @@ from semfov.detection.objects import LEAST
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import InputError, check, check_shape
-from semfov.sensor.lines import constant
 
 
 def cells(canvas: tuple[int, int], stride: int) -> tuple[int, int]:
@@ -27,16 +26,13 @@ def cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
     return sum(columns * rows for columns, rows in (cells(canvas, stride) for stride in strides))
 
 
-@constant
-def grid_points(
-    canvas: tuple[int, int], strides: tuple[int, ...], offset: float, dtype: torch.dtype, device: torch.device
-) -> Tensor:
+def grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, like: Tensor) -> Tensor:
     """Column plus `offset`, row plus `offset`, and stride of every cell, `(N, 3)`, level by level and row-major."""
     levels = []
     for stride in strides:
         columns, rows = cells(canvas, stride)
-        column = torch.arange(columns, device=device, dtype=dtype) + offset
-        row = torch.arange(rows, device=device, dtype=dtype) + offset
+        column = torch.arange(columns, device=like.device, dtype=like.dtype) + offset
+        row = torch.arange(rows, device=like.device, dtype=like.dtype) + offset
         x, y = torch.meshgrid(column, row, indexing="xy")
         levels.append(torch.stack([x, y, torch.full_like(x, stride)], -1).reshape(-1, 3))
     return torch.cat(levels)
@@ -195,7 +191,7 @@ def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offse
     expected = cell_count(canvas, strides)
     what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
     check(tensor.shape[1] == expected, "output of the head", what, tensor.shape[1])
-    return grid_points(canvas, tuple(strides), offset, tensor.dtype, tensor.device)
+    return grid_points(canvas, strides, offset, tensor)
 
 
 def _corners(boxes: Tensor) -> Tensor:

@@ -186,8 +186,7 @@ class ZoomBelief:
 
     def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""
-        if self._predicted < len(self.gists):
-            self._predict()
+        self._predict()
         expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
         return expected
 
