@@ -186,6 +186,29 @@ def test_a_table_without_objects_has_its_columns():
     assert (len(table), table.columns.tolist()) == (0, list(head_path().object_rows()[0]))
 
 
+@pytest.mark.parametrize("make", [scanpath, zoom_path, head_path])
+def test_the_first_look_was_not_chosen_by_a_value(make):
+    first, *others = make()
+    assert first.value is None
+    assert all(look.value is not None for look in others)
+
+
+@pytest.mark.parametrize(
+    ("record", "word"),
+    [
+        (scanpath(), "probability"),
+        (replace(scanpath(), ending="detection"), "belief"),
+        (zoom_path(), "probability"),
+        (replace(zoom_path(), closer=(), ending="detection"), "score"),
+        (replace(zoom_path(), closer=(), ending="passes"), "score"),
+        (replace(zoom_path(), closer=(), ending="passes", unseen=(0.0, 0.0)), "probability"),
+        (head_path(), "probability"),
+    ],
+)
+def test_a_record_tells_what_the_number_of_its_decision_is(record, word):
+    assert record.decided_by == word
+
+
 @pytest.mark.parametrize("make", RECORDS)
 def test_every_record_is_saved_and_loaded(make, tmp_path):
     record = make()
