@@ -352,7 +352,11 @@ def test_invalid_grids_are_refused(grid):
         (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one$"),
         (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
-        (HeadAgent.recommended, {"grid": (3, 3)}, r"grid: .* of semfov.load_detector for yolov3-tiny, got an unknown"),
+        (
+            HeadAgent.recommended,
+            {"grid": (3, 3)},
+            r"grid: expected an option of semfov.load_detector for yolov3-tiny, got an unknown",
+        ),
     ],
 )
 def test_unknown_options_are_named_with_the_nearest_ones(make, options, refused):

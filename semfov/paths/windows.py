@@ -162,8 +162,7 @@ class ZoomPath(GazeRecord):
     @property
     def decided_by(self) -> str:
         """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
-        learned = self.unseen is not None or self.closer or self.ending == "decision"
-        return "probability" if learned else "score"
+        return "probability" if self.closer or self.ending == "decision" else self.measure
 
     def describe(self) -> str:
         """Summarise the result."""

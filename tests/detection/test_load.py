@@ -38,11 +38,7 @@ def test_unknown_names_are_refused_with_the_known_ones(name):
 @pytest.mark.parametrize(
     ("model", "options", "refused"),
     [
-        (
-            "yolov3-tiny",
-            {"treshold": 0.1},
-            r"treshold: .* for yolov3-tiny.*; did you mean threshold=",
-        ),
+        ("yolov3-tiny", {"treshold": 0.1}, "treshold: .* for yolov3-tiny.*; did you mean threshold="),
         ("yolov3-tiny", {"processor": {}}, "processor: .* for yolov3-tiny, got an unknown one$"),
         ("yolox-nano", {"runtime": "torch"}, "runtime: .* for yolox-nano"),
         ("mine.onnx", {"inputsize": 320}, "inputsize: .* for mine.onnx, .*; did you mean input_size="),
