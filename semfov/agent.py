@@ -40,7 +40,7 @@ from semfov.presets import published_arguments, raw_arguments, recommended_argum
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
 
-KindOfLook = Literal["fovea", "windows", "head"]
+_KindOfLook = Literal["fovea", "windows", "head"]
 """Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
 How = Literal["auto", "fovea", "windows", "head"]
@@ -50,7 +50,7 @@ PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
 `semfov.Panorama`, a `semfov.Flat`, or a camera that turns."""
 
-Targets = str | int | Sequence[str | int] | None
+_Targets = str | int | Sequence[str | int] | None
 """A class by name or index, several of them, or None for all classes."""
 
 
@@ -253,7 +253,7 @@ class ActivePerception(nn.Module):
             )
         return HeadAgent(self.eye, search.model, explore.model)
 
-    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> KindOfLook:
+    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> _KindOfLook:
         """How the agent looks at a picture.
 
         Args:
@@ -383,7 +383,7 @@ class ActivePerception(nn.Module):
     def find_all(
         self,
         picture: PictureLike,
-        target: Targets = None,
+        target: _Targets = None,
         *,
         how: How = "auto",
         passes: int | None = None,
@@ -504,7 +504,7 @@ class ActivePerception(nn.Module):
 
     def live(
         self,
-        target: Targets = None,
+        target: _Targets = None,
         *,
         how: How = "auto",
         rate: float | None = None,

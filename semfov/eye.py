@@ -18,13 +18,7 @@ from semfov.sensor.glimpse import glimpse, window_around
 
 @dataclass(frozen=True)
 class View:
-    """An opened image: everything that does not depend on the fixation.
-
-    Attributes:
-        canvas: `(1, 3, h, w)`, the image fitted into the detector's input.
-        placement: scale and position of the image on the canvas.
-        state: data that the sensor computes once from the canvas, such as a pyramid.
-    """
+    """An opened image: everything that does not depend on the fixation; canvas `(1, 3, h, w)`."""
 
     canvas: Tensor
     placement: Placement

@@ -41,18 +41,7 @@ KINDS: dict[str, type[FolderModel]] = {
 
 
 def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
-    """Open a folder of models.
-
-    Args:
-        name: path of the folder, or the name of a detector.
-
-    Returns:
-        The folder; None for a detector.
-
-    Raises:
-        InputError: it is neither.
-        DataError: the folder has no models, or they are damaged.
-    """
+    """Open a folder of models."""
     path, text = Path(name), os.fspath(name)
     if path.is_dir():
         return ModelFolder(path)
@@ -70,15 +59,6 @@ class ModelFolder:
     The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
     The verification is compared with the same agent without closer looks, and the evidence for large pictures with
     looks at slices in the order of raw scores.
-
-    Args:
-        path: the folder.
-
-    Attributes:
-        manifest: description of the folder.
-
-    Raises:
-        DataError: it is no such folder, or a file in it is missing, damaged or changed.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -98,18 +78,7 @@ class ModelFolder:
     def detector_source(
         self, detector: str | PathLike[str] | None = None, weights: str | PathLike[str] | None = None
     ) -> tuple[str, dict[str, Any]]:
-        """Arguments with which `semfov.load_detector` loads the detector.
-
-        Args:
-            detector: file of the network, if it was moved.
-            weights: file of the weights, if they are in a separate file that was moved.
-
-        Returns:
-            A name or a path, and options.
-
-        Raises:
-            DataError: a file is neither at its path relative to the folder nor at its absolute path.
-        """
+        """Arguments with which `semfov.load_detector` loads the detector."""
         record = self.manifest.detector
         options = dict(record["options"])
         place = record.get("weights_file")
@@ -128,19 +97,7 @@ class ModelFolder:
         weights: str | PathLike[str] | None = None,
         **options: Any,
     ) -> Detector:
-        """Load the detector, with the options of the time when the models were fitted.
-
-        Args:
-            detector: file of the network, if it was moved.
-            weights: file of the weights, if they are in a separate file that was moved.
-            options: further options of `semfov.load_detector`, which replace those of the folder.
-
-        Returns:
-            The detector.
-
-        Raises:
-            DataError: the file is missing, or is another network by its sha256.
-        """
+        """Load the detector, with the options of the time when the models were fitted."""
         source, own = self.detector_source(detector, weights)
         loaded = load_detector(source, **{**own, **options})
         digest = self.manifest.detector["sha256"]
@@ -175,14 +132,7 @@ class ModelFolder:
         return {part: KINDS[part].from_pretrained(file) for part, file in files.items() if file is not None}
 
     def observation(self) -> FovealObservationModel:
-        """Load the observation model, whether the agent uses it or not.
-
-        Returns:
-            The model.
-
-        Raises:
-            InputError: none was fitted.
-        """
+        """Load the observation model, whether the agent uses it or not."""
         file = self.file("observation")
         if file is None:
             raise InputError(

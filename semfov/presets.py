@@ -60,14 +60,6 @@ def recommended_arguments(
 def published_model(detector: str, sensor: str, threshold: float) -> str:
     """Name the observation model of the published agent.
 
-    Args:
-        detector: name of the detector.
-        sensor: name of a sensor in `PUBLISHED_SENSORS`.
-        threshold: the detector's score threshold; a threshold that no model was fitted at has the model of the default.
-
-    Returns:
-        The name of the model, whether or not it is shipped.
-
     >>> published_model("yolox-nano", "published", 0.02), published_model("yolox-nano", "published", 0.03)
     ('yolox-nano-published', 'yolox-nano-published')
     """

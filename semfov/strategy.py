@@ -13,15 +13,7 @@ from semfov.gaze.policies import NonPredictive, Policy, Random
 
 
 class Strategy(nn.Module):
-    """Observer and policy for a task.
-
-    Args:
-        observer: turns looks into a belief.
-        policy: chooses the next fixation from the belief.
-
-    Raises:
-        InputError: one of them is something else, such as a name or a class.
-    """
+    """Observer and policy for a task."""
 
     def __init__(self, observer: Observer, policy: Policy) -> None:
         super().__init__()
@@ -32,18 +24,7 @@ class Strategy(nn.Module):
         self.policy = policy
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
-        """Prepare the search for a target.
-
-        Args:
-            target: a class by name or index, several, or several with weights.
-            classes: names of the classes, background first.
-
-        Returns:
-            Observer and policy for the target, its class with the largest weight, and the weights of all its classes.
-
-        Raises:
-            InputError: a class is unknown, or the policy cannot search for several classes.
-        """
+        """Prepare the search for a target."""
         if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}

@@ -8,7 +8,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-MANY_ELEMENTS = 1 << 22
+_MANY_ELEMENTS = 1 << 22
 """Number of elements of a tensor from which on several threads are used."""
 
 _Arguments = ParamSpec("_Arguments")
@@ -20,12 +20,6 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
 
     PyTorch divides an operation on more than 32,768 elements among its threads, and waits for the last one. If another
     program uses a core, that thread waits for its turn, at each of the many operations of a fixation.
-
-    Args:
-        function: a function whose first arguments are tensors, or tuples or dataclasses of tensors.
-
-    Returns:
-        The function; tensors of `MANY_ELEMENTS` elements and more are worked on by all threads.
 
     >>> @one_thread_if_small
     ... def threads(x):
@@ -39,7 +33,7 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
         before = torch.get_num_threads()
-        if before == 1 or max(sizes(args), default=0) >= MANY_ELEMENTS:
+        if before == 1 or max(sizes(args), default=0) >= _MANY_ELEMENTS:
             return function(*args, **kwargs)
         torch.set_num_threads(1)
         try:

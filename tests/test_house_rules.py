@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import semfov
-from docs.api import MODULES
+from docs.api import MODULES, entries
 
 PACKAGE = Path(semfov.__file__).parent
 ROOT = PACKAGE.parent
@@ -73,7 +73,6 @@ def test_no_private_names_of_other_packages_are_used():
 
 def test_files_of_the_library_have_at_most_600_lines():
     lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in LIBRARY}
-    assert len(lines) > 200
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
@@ -87,12 +86,6 @@ def test_names_in_all_exist_once_and_are_public(module):
     assert len(set(names)) == len(names)
     assert [name for name in names if not hasattr(importlib.import_module(module), name)] == []
     assert not [name for name in names if _is_private(name)]
-
-
-REPEATED = {
-    "main": "the command line of each program",
-}
-"""Public names that several modules define, each with the reason."""
 
 
 def public_names(source: str) -> set[str]:
@@ -112,8 +105,7 @@ def test_the_scan_finds_public_names():
     assert public_names(source) == {"A", "B", "f", "D", "h"}
 
 
-def test_a_public_name_means_one_thing():
-    files = LIBRARY + sorted(file for folder in ("eval", "train") for file in (ROOT / folder).rglob("*.py"))
-    counts = Counter(name for file in files for name in public_names(file.read_text(encoding="utf-8")))
-    assert len(counts) > 1000
-    assert {name for name, count in counts.items() if count > 1} == set(REPEATED)
+def test_a_name_of_the_reference_means_one_thing():
+    counts = Counter(name for file in LIBRARY for name in public_names(file.read_text(encoding="utf-8")))
+    shown = {name for things in entries().values() for name, _ in things}
+    assert {name for name in shown if counts[name] > 1} == set()

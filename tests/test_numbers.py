@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from semfov import FovealObservationModel
-from semfov.agents.head import CONFIRM
+from semfov.agents.head import _CONFIRM
 from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
@@ -29,7 +29,7 @@ from semfov.head import Speeds
 from semfov.live.fovea import RATE
 from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
-from semfov.sensor.log_polar import Retina
+from semfov.sensor.log_polar import _Retina
 from semfov.zoom.export import OPSET
 from tests.test_house_rules import MOST_LINES
 
@@ -94,7 +94,7 @@ LINK = re.compile(r"\]\(([^)#\s]+\.md)?(#[\w-]+)?\)")
 _DATA, _DETECTOR, _SPEEDS = DataConfig(), DetectorConfig(), Speeds()
 _COUNTS = torch.tensor(FovealObservationModel.from_pretrained("yolox-nano-published-narrow").metadata["counts"])
 _VERIFICATION = Verification.from_pretrained("yolox-nano")
-_RINGS, _WEDGES = Retina(60.0).receptors((640, 480))
+_RINGS, _WEDGES = _Retina(60.0).receptors((640, 480))
 _OBJECTS, _DETECTIONS = _COUNTS[1:].sum(0).tolist(), _COUNTS.sum(0).tolist()
 
 KNOWN = {
@@ -129,7 +129,7 @@ KNOWN = {
     },
     "docs/head.md": {
         f"{1000 * _SPEEDS.eye_start:.0f} + {1000 * _SPEEDS.eye:.1f} A": "code",
-        f"{CONFIRM}": "code",
+        f"{_CONFIRM}": "code",
     },
     "docs/detectors.md": {
         f"({_DETECTOR.threshold}), ({_DETECTOR.iou}, over all classes), ({_DETECTOR.limit})": "code",

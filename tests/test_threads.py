@@ -7,7 +7,7 @@ from semfov import DirichletBelief, Grid, acquisition, foveate
 from semfov.belief import fuse
 from semfov.sensor import laplacian_pyramid
 from semfov.sensor import pyramid as pyramids
-from semfov.threads import MANY_ELEMENTS, one_thread_if_small
+from semfov.threads import _MANY_ELEMENTS, one_thread_if_small
 from tests.small import draw, model
 
 
@@ -25,7 +25,7 @@ def used(*values):
 
 
 def test_only_small_tensors_are_worked_on_by_one_thread(threads):
-    small, large = torch.zeros(MANY_ELEMENTS - 1), torch.zeros(MANY_ELEMENTS)
+    small, large = torch.zeros(_MANY_ELEMENTS - 1), torch.zeros(_MANY_ELEMENTS)
     bands = pyramids.Bands((large,), small, "kornia")
     assert [used(), used(small), used((small,), 1.0)] == [1, 1, 1]
     assert [used(large), used(small, large), used((small, (large,))), used(bands)] == [threads] * 4

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Foveation, Grid
-from semfov.agents.fovea import WORTH
+from semfov.agents.fovea import _WORTH
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.errors import InputError
@@ -99,8 +99,8 @@ def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, i
 
 def test_until_none_means_the_default_price(model, image):
     agent = agent_of(model)
-    model.worth[-1].bias.fill_(WORTH / 3.5)
-    free, default, same = (agent.explore(image, start=0, shifts=19, worth=worth, seed=3) for worth in (0, None, WORTH))
+    model.worth[-1].bias.fill_(_WORTH / 3.5)
+    free, default, same = (agent.explore(image, start=0, shifts=19, worth=worth, seed=3) for worth in (0, None, _WORTH))
     assert free.ending == "cells"
     assert default.ending == same.ending == "worth"
     assert torch.equal(default.cells, same.cells)

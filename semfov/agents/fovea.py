@@ -30,11 +30,11 @@ from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.paths import Ending, Scanpath, Stimulus, Trace
 from semfov.strategy import Strategy
 
-WORTH = 0.1
+_WORTH = 0.1
 """Default least gain of a look in an exploration by a learned map: the expected increase in the number of correctly
 classified cells for which the exploration continues."""
 
-MOST_SHIFTS = 10_000
+_MOST_SHIFTS = 10_000
 """Largest number of gaze shifts that can be asked for."""
 
 Start = int | tuple[int, int] | None
@@ -47,17 +47,7 @@ class FoveaAgent:
 
     The arguments of its methods are those of `ActivePerception`, which makes it.
 
-    Args:
-        eye: sensor and detector.
-        searching: observer and policy for search.
-        exploring: observer and policy for exploration; during a search this observer keeps the map of all classes.
-        verification: probabilities after closer looks; None searches without them.
-        cells: `(columns, rows)` of the belief.
-
-    Example::
-
-        agent = ActivePerception.recommended().fovea
-        scanpath = agent.search(read_image("kitchen.jpg")[None], "cup", EpisodeLimits())
+    Shapes: cells `(columns, rows)`.
     """
 
     eye: Eye
@@ -131,7 +121,7 @@ class FoveaAgent:
         """Explore a photograph, without a target (`ActivePerception.explore`)."""
         grid, observer, outcome = self.grid(image), self.exploring.observer, None
         if isinstance(observer, LearnedMap):
-            outcome = outcome_by_gain(ExpectedGain(observer.model, grid), WORTH if worth is None else worth)
+            outcome = outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
         elif worth:
             raise InputError(
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
@@ -195,8 +185,8 @@ class _Episode:
     def run(self, start: Start, shifts: int | None, default: int, seed: int) -> tuple[Scanpath, int, Step]:
         """Move the gaze; returns the scanpath, the number of the outcome and the last step."""
         if shifts is None:
-            shifts = default if self.limits.passes is None else MOST_SHIFTS
-        check_whole(shifts, "shifts", 0, MOST_SHIFTS)
+            shifts = default if self.limits.passes is None else _MOST_SHIFTS
+        check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
         first, generator = first_cell(cell_at(start, self.agent.cells), seed, len(self.grid))
         eye, grid = self.agent.eye, self.grid
         looks = LiveLooks(eye, eye.open(self.image), grid, self.target)
@@ -238,16 +228,6 @@ class _Episode:
 
 def cell_at(start: Start, cells: tuple[int, int]) -> int | None:
     """The number of the cell at `(column, row)`; numbers and None stay as they are.
-
-    Args:
-        start: number of a cell, its column and row, or None.
-        cells: columns and rows of the grid.
-
-    Returns:
-        The number of the cell.
-
-    Raises:
-        InputError: the column or the row is not in the grid.
 
     >>> cell_at((3, 2), (10, 10)), cell_at(7, (10, 10))
     (23, 7)

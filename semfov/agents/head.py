@@ -30,13 +30,13 @@ from semfov.sensor.foveation import Foveation
 SIGMA = 100.0
 """Width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels."""
 
-PASSES = 40
+_PASSES = 40
 """Default of the largest number of looks."""
 
-DURATION = 30.0
+_DURATION = 30.0
 """Default time limit of a scene in seconds."""
 
-CONFIRM = 0.7
+_CONFIRM = 0.7
 """Probability of the target in the fixated cell at which a search ends as found."""
 
 
@@ -110,7 +110,7 @@ class HeadAgent(nn.Module):
         *,
         passes: int | None = None,
         seconds: float | None = None,
-        duration: float = DURATION,
+        duration: float = _DURATION,
         on_look: OnLook | None = None,
         start: int | None = None,
         confirm: float | None = None,
@@ -157,7 +157,7 @@ class HeadAgent(nn.Module):
         views = self.views(scene, color)
         evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
         gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
-        sure = CONFIRM if confirm is None else confirm
+        sure = _CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
         return self._look(observer, gain, (index,), start, limits, duration, seed, thresholds=thresholds)
 
@@ -168,7 +168,7 @@ class HeadAgent(nn.Module):
         *,
         passes: int | None = None,
         seconds: float | None = None,
-        duration: float = DURATION,
+        duration: float = _DURATION,
         on_look: OnLook | None = None,
         worth: float = 0.0,
         start: int | None = None,
@@ -221,7 +221,7 @@ class HeadAgent(nn.Module):
         return self.find_all(scene, None, **options)
 
     def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
-        return EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
+        return EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
 
     @torch.inference_mode()
     def _look(
@@ -271,9 +271,9 @@ class HeadAgent(nn.Module):
             target=target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
         ):  # fmt: skip
             steps.append(step)
-            maps.append(probabilities_of(step.belief, target))
+            maps.append(_probabilities_of(step.belief, target))
             if thresholds is not None and target is not None:
-                decision = decide_look(views, step, target, thresholds)
+                decision = _decide_look(views, step, target, thresholds)
             reached = limits.reached(len(steps), record)
             ending = "decision" if decision is not None and decision.outcome != "undecided" else reached
             if ending is not None:
@@ -285,33 +285,15 @@ class HeadAgent(nn.Module):
         return record()
 
 
-def probabilities_of(belief: SceneBelief, target: int | None) -> Tensor:
-    """Probability that each cell of a scene holds the target, `(S,)`; or any object, where the cell was seen.
-
-    Args:
-        belief: about the scene.
-        target: class 1..K; None for any object.
-
-    Returns:
-        `(S,)`.
-    """
+def _probabilities_of(belief: SceneBelief, target: int | None) -> Tensor:
+    """Probability that each cell of a scene holds the target, `(S,)`; or any object, where the cell was seen."""
     if target is not None:
         return belief.probability(target)[0]
     return (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
 
 
-def decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:
-    """Decide after a look, by the rule of all searches (`semfov.decision.settle`); only the present gaze can find.
-
-    Args:
-        views: the possible views and fixations.
-        step: the look.
-        target: class 1..K.
-        thresholds: the thresholds; `give_up` is compared with the cells that can be seen and were not fixated.
-
-    Returns:
-        The decision. Its cell is one of the scene, and its box is in pixels of the view.
-    """
+def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:
+    """Decide after a look, by the rule of all searches (`semfov.decision.settle`); only the present gaze can find."""
     belief, cell = step.belief, views.gaze_cell[step.action]
     cells = belief.probability(target).double()
     looked = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)

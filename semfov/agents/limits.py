@@ -23,15 +23,6 @@ OnLook = Callable[[Any], object]
 class EpisodeLimits:
     """Limits of one episode. It ends at the first one that is reached.
 
-    Args:
-        passes: largest number of passes of the detector, closer looks included, 1 to 1,000,000; None for no limit.
-        seconds: time in seconds that looks may take on this machine, from the making of this object; a look that has
-            begun is finished, so there is at least one. None for no limit.
-        on_look: called after each look with the record so far; returning False ends the episode.
-
-    Raises:
-        InputError: a limit is out of range, or `on_look` cannot be called.
-
     >>> limits = EpisodeLimits(passes=3, on_look=lambda record: record != "enough")
     >>> [limits.reached(1, lambda: "more"), limits.reached(1, lambda: "enough"), limits.reached(3, lambda: "more")]
     [None, 'stopped', 'passes']
@@ -50,15 +41,7 @@ class EpisodeLimits:
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
 
     def reached(self, passes: int, record: Callable[[], Any]) -> Literal["stopped", "passes", "seconds"] | None:
-        """The limit that is reached after a look. Call it once after each look.
-
-        Args:
-            passes: number of passes so far.
-            record: makes the record so far; it is called only if `on_look` was given.
-
-        Returns:
-            The reason for the end; None if the episode goes on.
-        """
+        """The limit that is reached after a look. Call it once after each look."""
         if self.on_look is not None and self.on_look(record()) is False:
             return "stopped"
         if self.passes is not None and passes >= self.passes:
@@ -73,17 +56,7 @@ class EpisodeLimits:
 
 
 def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
-    """Raise `InputError` for arguments that suit another kind of look.
-
-    Args:
-        kind: the kind of look.
-        suits: the kind of look that the arguments suit.
-        instead: what to give in their place.
-        arguments: the arguments; None is no argument.
-
-    Raises:
-        InputError: an argument was given, and the kind of look is another one.
-    """
+    """Raise `InputError` for arguments that suit another kind of look."""
     for name, value in arguments.items():
         if value is not None and kind != suits:
             raise InputError(
@@ -99,12 +72,6 @@ def without_none(**values: Any) -> dict[str, Any]:
 
 def on_cpu(module: _Module) -> _Module:
     """A module on the CPU, without moving the given one, which other parts of the agent may share.
-
-    Args:
-        module: the module.
-
-    Returns:
-        The module itself if all of it is on the CPU, else a copy.
 
     >>> layer = nn.Linear(2, 1)
     >>> on_cpu(layer) is layer

@@ -32,7 +32,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects
 from semfov.zoom.slices import ranked, usual_slices
 
-USUAL_PASSES = 24
+_USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
 
 LIKELY = 0.5
@@ -152,14 +152,14 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
         glances, evidence = self._open(picture), self._evidence()
         with torch.inference_mode():
             if evidence is None:
-                return search_slices(glances, self.classes, index, limits, confirm)
+                return _search_slices(glances, self.classes, index, limits, confirm)
             return search_windows(
                 glances, evidence, self.classes, index, limits, confirm=confirm, give_up=give_up, closer=closer
             )
@@ -201,7 +201,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:
@@ -250,16 +250,10 @@ class ZoomAgent(nn.Module):
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     """Tell whether a picture is large enough for windows to pay.
 
-    Args:
-        size: `(width, height)` of the picture.
-        canvas: `(width, height)` of the detector's input.
-
-    Returns:
-        True where there are two octaves or more to zoom in: the longer side of the picture is at least four times
-        that of the detector's input.
-
     >>> pays((3840, 2160), (416, 416)), pays((640, 480), (416, 416))
     (True, False)
+
+    Shapes: size `(width, height)`, canvas `(width, height)`.
     """
     return Lattice.over(size, canvas).levels >= 3
 
@@ -285,19 +279,6 @@ def search_windows(
     When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
     if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
     passes are used up.
-
-    Args:
-        glances: source of looks at the picture.
-        evidence: learned evidence by magnification.
-        classes: names of the classes, background first.
-        target: class 1..K.
-        limits: limits of the search.
-        confirm: probability from which on the target is found, as for `ZoomAgent.search`.
-        give_up: probability that a look shows the target, below which no look is worth a pass.
-        closer: largest number of closer looks.
-
-    Returns:
-        The looks, the objects of the class, and the decision.
     """
     path = _Windows(glances, classes, target, (), evidence)
     looks, values = path.looks, path.values
@@ -324,22 +305,10 @@ def search_windows(
     return replace(path.record(ending or "windows"), decision=decision, closer=tuple(deciding.looks))
 
 
-def search_slices(
+def _search_slices(
     glances: Glances, classes: tuple[str, ...], target: int, limits: EpisodeLimits, confirm: float | None = None
 ) -> ZoomPath:
-    """Search a picture by slices, in the order of the overview's scores; nothing is learned, so nothing is `absent`.
-
-    Args:
-        glances: source of looks at the picture.
-        classes: names of the classes, background first.
-        target: class 1..K.
-        limits: limits of the search.
-        confirm: score from which on a detection whose best class is the target ends the search as `found`; None takes
-            0.5.
-
-    Returns:
-        The looks, the objects of the class, and the decision: `found` or `undecided`, with the highest score.
-    """
+    """Search a picture by slices, in the order of the overview's scores; nothing is learned, so nothing is `absent`."""
     path = _Windows(glances, classes, target)
     ending: Ending | None = None
     for turn in look_by_look(glances, ranked(usual_slices(glances.lattice), [target]), None):
@@ -368,20 +337,7 @@ def window_objects(
     *,
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float] | None]:
-    """The objects of some looks, and the number of those that no look has shown, with its variance.
-
-    Args:
-        glances: the looks, the overview first.
-        lattice: lattice of the picture.
-        target: class 1..K, several, or None for all (`semfov.zoom.merge`).
-        certainty: gives objects probabilities; None leaves them their scores.
-        belief: belief after the looks; None expects no further objects.
-        promised: number of objects that the looks after the first were expected to find.
-        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
-
-    Returns:
-        The objects, and the number and its variance; None without a certainty.
-    """
+    """The objects of some looks, and the number of those that no look has shown, with its variance."""
     if certainty is None:
         return merge(glances, target), None
     # A belief about objects of any class says nothing about those of several.
@@ -391,12 +347,7 @@ def window_objects(
 
 
 class _Windows:
-    """The looks of an episode so far, of which records are made.
-
-    Attributes:
-        looks: the looks.
-        values: their values when they were chosen.
-    """
+    """The looks of an episode so far, of which records are made."""
 
     def __init__(
         self,

@@ -201,14 +201,7 @@ class DirichletBelief(Belief):
 
 
 def dirichlet_belief(belief: Belief) -> DirichletBelief:
-    """Check that a belief is a `DirichletBelief`.
-
-    Returns:
-        The belief.
-
-    Raises:
-        InputError: it is of another kind.
-    """
+    """Check that a belief is a `DirichletBelief`."""
     if not isinstance(belief, DirichletBelief):
         raise InputError(
             f"belief: expected a belief about all classes (DirichletBelief), got {type(belief).__name__}; use "
@@ -220,19 +213,11 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
 def pick(values: Tensor, target: Tensor) -> Tensor:
     """Select the values of one class along the last dimension.
 
-    Args:
-        values: `(B, ..., K+1)`.
-        target: class index, a scalar or `(B,)` with one for each episode.
-
-    Returns:
-        `(B, ...)`.
-
-    Raises:
-        InputError: an index is out of range.
-
     >>> pick(torch.tensor([[[0.1, 0.9]], [[0.3, 0.7]]]), torch.tensor([1, 0]))
     tensor([[0.9000],
             [0.3000]])
+
+    Shapes: values `(B, ..., K+1)`, target `(B,)` → `(B, ...)`.
     """
     components = values.shape[-1]
     if values_known(target):
@@ -247,20 +232,15 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     """Apply a function to each row of tensors separately, and concatenate the results.
 
-    The rounding of matrix products depends on their size. So does that of exponentials and logarithms, because the
-    last few elements of a tensor are not computed in vectors. Computed separately, the result for an episode does not
-    depend on how many other episodes run with it. While a graph is traced, and inside `torch.func.vmap`, all rows are
-    computed at once.
-
-    Args:
-        function: takes one batch of size 1 for each tensor, and returns a tensor.
-        rows: tensors `(B, ...)`.
-
-    Returns:
-        The results, concatenated to `(B, ...)`.
+    The rounding of matrix products depends on their size. So does that of exponentials and logarithms, because the last
+    few elements of a tensor are not computed in vectors. Computed separately, the result for an episode does not depend
+    on how many other episodes run with it. While a graph is traced, and inside `torch.func.vmap`, all rows are computed
+    at once.
 
     >>> one_by_one(lambda row: row @ torch.ones(3, 1), torch.ones(2, 1, 3)).shape
     torch.Size([2, 1, 1])
+
+    Shapes: rows `(B, ...)` → `(B, ...)`.
     """
     if not values_known(*rows) or len(rows[0]) <= 1:
         return function(*rows)

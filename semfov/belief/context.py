@@ -18,7 +18,7 @@ from semfov.io.files import sha256
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Array, Field, Number, Object, Pair, Schema
 
-TABLE_WEIGHTS = (0.1, 0.2)
+_TABLE_WEIGHTS = (0.1, 0.2)
 """Weights of place and co-occurrence in a context from a table: the better of two pairs on 40 photographs."""
 
 
@@ -203,7 +203,7 @@ class ContextPrior(Pretrained):
         The value v of a target t and another class j may have any scale; larger values mean that the classes belong
         together. Only differences count: a value is compared with the other values of either class, and a place with
         the other places of its class. Unknown values count as 0 after this comparison. The weights of place and
-        co-occurrence are `TABLE_WEIGHTS`.
+        co-occurrence are `_TABLE_WEIGHTS`.
 
         Args:
             path: CSV file with the names of other classes in the first row and of targets in the first column; an
@@ -233,7 +233,7 @@ class ContextPrior(Pretrained):
         if places is not None:
             place = places_from(read_named_table(places), classes)
             origin["places_sha256"] = _digest(places)
-        weights = dict.fromkeys(("evidence", "map"), TABLE_WEIGHTS)
+        weights = dict.fromkeys(("evidence", "map"), _TABLE_WEIGHTS)
         return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": origin})
 
     @classmethod

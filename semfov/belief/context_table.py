@@ -19,32 +19,16 @@ _LARGEST = 1e3
 
 
 @dataclass(frozen=True)
-class NamedTable:
-    """A table of numbers with named rows and columns.
-
-    Attributes:
-        rows: names of the rows.
-        columns: names of the columns.
-        values: `(rows, columns)`, NaN for unknown values.
-    """
+class _NamedTable:
+    """A table of numbers with named rows and columns; values `(rows, columns)`."""
 
     rows: tuple[str, ...]
     columns: tuple[str, ...]
     values: Tensor
 
 
-def read_named_table(path: str | PathLike[str]) -> NamedTable:
-    """Read a table from CSV: names in the first row and the first column, numbers or empty cells elsewhere.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: the file is missing, or is not such a table; the message has the line.
-    """
+def read_named_table(path: str | PathLike[str]) -> _NamedTable:
+    """Read a table from CSV: names in the first row and the first column, numbers or empty cells elsewhere."""
     check_regular(path)
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
@@ -69,7 +53,7 @@ def read_named_table(path: str | PathLike[str]) -> NamedTable:
             raise DataError(
                 f"{path}: expected different names in the first {what}, got {', '.join(twice) or 'no name'}"
             )
-    return NamedTable(tuple(rows), tuple(columns), torch.tensor(values))
+    return _NamedTable(tuple(rows), tuple(columns), torch.tensor(values))
 
 
 def _number(cell: str, where: str) -> float:
@@ -86,20 +70,8 @@ def _number(cell: str, where: str) -> float:
     return value
 
 
-def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[Tensor, list[str]]:
-    """Log ratios of co-occurrence from a table, by the formula of `ContextPrior.from_table`.
-
-    Args:
-        table: values of targets (rows) by other classes (columns).
-        classes: names of the K classes.
-        bands: N, number of bands of distance.
-
-    Returns:
-        `(K+1, K+1, N)`, and the names of the classes that the table lacks.
-
-    Raises:
-        InputError: the table has none of the classes.
-    """
+def cooccurrence_from(table: _NamedTable, classes: Sequence[str], bands: int) -> tuple[Tensor, list[str]]:
+    """Log ratios of co-occurrence from a table, by the formula of `ContextPrior.from_table`; → `(K+1, K+1, N)`."""
     values = _picked(_picked(table.values, table.rows, classes).mT, table.columns, classes).mT
     values.fill_diagonal_(torch.nan)
     missing = [name for name, row, column in zip(classes, values, values.mT, strict=True)
@@ -114,7 +86,7 @@ def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> 
     return cooccurrence, missing
 
 
-def places_from(table: NamedTable, classes: Sequence[str]) -> Tensor:
+def places_from(table: _NamedTable, classes: Sequence[str]) -> Tensor:
     """Log odds of places `(K+1, R, R)`, minus the mean of each class, from a table of classes by heights."""
     values = _picked(table.values, table.rows, classes)
     relative = (values - values.nanmean(1, keepdim=True)).nan_to_num(0)

@@ -24,15 +24,8 @@ _REACH = 1 / 6
 class Gathered:
     """Accumulated evidence about one class from all looks of an episode so far.
 
-    Attributes:
-        nearest: `(B, X·Y)`, evidence of the closest look at each cell.
-        best: `(B, X·Y)`, strongest evidence of any look.
-        mean: `(B, X·Y)`, mean evidence of all looks, in which closer looks have larger weights (`nearness`).
-        distance: `(B, X·Y)`, from each cell to its closest fixation, in longer sides of the image.
-        score: `(B,)`, highest score of the class in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
-        target: `(B,)`, the class.
+    Shapes: nearest `(B, X·Y)`, best `(B, X·Y)`, mean `(B, X·Y)`, distance `(B, X·Y)`, score `(B,)`, looks `(B,)`,
+    visited `(B, X·Y)`, target `(B,)`.
     """
 
     nearest: Tensor
@@ -145,16 +138,10 @@ class Evidence(PretrainedForEye):
 def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Size) -> Tensor:
     """Apply a network with one output to its inputs, one tensor each.
 
-    Args:
-        network: maps `(M, n)` to `(M, 1)`.
-        inputs: n tensors, each broadcast to `shape`.
-        shape: shape of the result, of M numbers.
-
-    Returns:
-        The outputs in this shape.
-
     >>> apply_network(nn.Linear(2, 1), [torch.ones(3, 4), torch.ones(1)], torch.Size([3, 4])).shape
     torch.Size([3, 4])
+
+    Shapes: network `(M, n)`.
     """
     # Each input is copied in one piece, and the matrix product reads the table transposed. To interleave the inputs
     # takes longer than the product.
@@ -186,16 +173,10 @@ def logarithm(odds: Tensor) -> Tensor:
 def blur(values: Tensor, columns: int, sigma: float) -> Tensor:
     """Gaussian average over the neighbourhood, with σ in cells; cells outside the grid count as 0.
 
-    Args:
-        values: `(B, X·Y)`.
-        columns: X, cells in a row.
-        sigma: σ.
-
-    Returns:
-        `(B, X·Y)`.
-
     >>> blur(torch.tensor([[0.0, 1.0, 0.0]]), columns=3, sigma=0.6).argmax()
     tensor(1)
+
+    Shapes: values `(B, X·Y)` → `(B, X·Y)`.
     """
     rows = values.shape[-1] // columns
     across, down = (_averages(length, sigma, values.dtype, values.device) for length in (columns, rows))
@@ -230,15 +211,10 @@ def _places(columns: int, rows: int, dtype: torch.dtype, device: torch.device) -
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
     """Largest value in the square about each cell of maps.
 
-    Args:
-        values: `(T, rows, columns)`.
-        side: side of the square in cells, an odd number.
-
-    Returns:
-        `(T, rows, columns)`.
-
     >>> neighbourhood_peak(torch.tensor([[[1.0, 0.0, 0.0, 2.0]]]), 3)
     tensor([[[1., 1., 2., 2.]]])
+
+    Shapes: values `(T, rows, columns)` → `(T, rows, columns)`.
     """
     # One axis after the other: fewer comparisons.
     along = F.max_pool1d(values, side, 1, side // 2)

@@ -15,16 +15,11 @@ _FLOOR = 1e-6
 def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
     """Highest score of a class among the detections of each look; 0 without detections.
 
-    Args:
-        detections: a batch of B looks.
-        target: a class, or several `(T,)`.
-
-    Returns:
-        `(B,)`, or `(B, T)` for several classes.
-
     >>> seen = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.2, 0.8], [0.7, 0.3]]]), torch.ones(1, 2).bool())
     >>> highest_score(seen, 1)
     tensor([0.8000])
+
+    Shapes: target `(T,)` → `(B,)`.
     """
     scores = detections.scores * detections.mask[..., None]
     highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
@@ -109,14 +104,10 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
 def nothing_seen(distance: Tensor) -> Tensor:
     """`look_features` for a look without detections.
 
-    Args:
-        distance: `(...)`, from the fixation to the cells, in longer sides of the image.
-
-    Returns:
-        `(..., 10)`.
-
     >>> nothing_seen(torch.tensor([0.5])).shape
     torch.Size([1, 10])
+
+    Shapes: → `(..., 10)`.
     """
     none = torch.zeros_like(distance)
     least = _log(none)

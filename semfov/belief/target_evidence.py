@@ -23,14 +23,6 @@ _EMPTY = -8.0
 class Thresholds:
     """Thresholds on probabilities at which a search decides.
 
-    Attributes:
-        confirm: least probability that the image holds the target for a search to end with `found`. A cell nearly as
-            probable as the most probable one must have been fixated, too.
-        give_up: least probability for a cell to be worth a look, given that no fixated cell holds the target. A search
-            ends when no remaining cell reaches it.
-        place: least probability that the fixated cell itself holds the target, for `found`. Below it the image may
-            hold the target, but its place is not known.
-
     >>> Thresholds(confirm=0.9, give_up=0.3).changed(confirm=0.8)
     Thresholds(confirm=0.8, give_up=0.3, place=0.0)
     """

@@ -49,16 +49,6 @@ def make_agent(options: AgentOptions) -> ActivePerception:
 def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:
     """The classes that a text names, with commas between them; None for all.
 
-    Args:
-        text: the text.
-        classes: names of the detector's classes; None does not check them.
-
-    Returns:
-        The names.
-
-    Raises:
-        InputError: a class is unknown; the message has the nearest names.
-
     >>> several_classes("Cups, fork", ("cup", "fork"))
     ['cup', 'fork']
     """

@@ -15,7 +15,7 @@ from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
 from semfov.zoom import GlimpseEvidence
 
-PURPOSES: dict[str, type[Pretrained]] = {
+_PURPOSES: dict[str, type[Pretrained]] = {
     "search": TargetEvidence,
     "closer looks": Verification,
     "explore": MapEvidence,
@@ -37,7 +37,7 @@ def list_detectors(options: DetectorsOptions) -> int:
     for name, weights in WEIGHTS.items():
         elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
         there = "here" if (cache_folder() / weights.file).is_file() else elsewhere
-        models = [what for what, kind in PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
+        models = [what for what, kind in _PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
         rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
     print("\n".join(table_lines(rows)))
     print(f"\nWeights are kept in {cache_folder()}.")

@@ -40,18 +40,7 @@ from semfov.runs.workers import run_tasks
 
 
 class PictureJob(ABC):
-    """Looks at pictures as the options say; any process can make it from the options.
-
-    Args:
-        options: the options.
-
-    Attributes:
-        agent: the agent.
-        title: title of the page.
-        target: class that is searched for, which an embedded scene must hold; None for none.
-        drawings: figures that looks of a fovea have.
-        every: whether all objects are to be found (`ActivePerception.kind_of_look`).
-    """
+    """Looks at pictures as the options say; any process can make it from the options."""
 
     agent: ActivePerception
     title: str
@@ -128,18 +117,8 @@ def _outcome(number: int) -> PictureOutcome | SemfovError:
 
 
 @dataclass
-class PictureFiles:
-    """Files that a command writes about its pictures: results, figures and a page.
-
-    Attributes:
-        job: the job.
-        results: the file of results; None for none.
-        folder: folder of the figures; None for none.
-        written: the files of figures.
-        episodes: parts of the page by the numbers of the pictures.
-        finished: outcomes of pictures on disk while not all are done, so that the same command continues; None for a
-            single picture, and without a file of results.
-    """
+class _PictureFiles:
+    """Files that a command writes about its pictures: results, figures and a page."""
 
     job: PictureJob
     results: ResultsFile | None = None
@@ -206,21 +185,12 @@ def look_at_pictures(job: PictureJob) -> int:
 
     A picture that cannot be read is reported and left out, unless it is the only one. With a file of results, a command
     that was stopped continues.
-
-    Args:
-        job: looks at one picture.
-
-    Returns:
-        The exit code: 1 if a picture was left out.
-
-    Raises:
-        SemfovError: nothing could be looked at.
     """
     job.check_drawings()
     sources, several = job.sources, job.several
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")
-    outputs = PictureFiles(job)
+    outputs = _PictureFiles(job)
     skipped, complete, endings = 0, False, Counter[str]()
     before = outputs.before()
     if before:

@@ -186,13 +186,6 @@ _COMMANDS = {
 def in_command_words(message: str, options: Iterable[str]) -> str:
     """Say a message of the library in the words of the command: arguments become options.
 
-    Args:
-        message: the message.
-        options: names of the options, as in Python.
-
-    Returns:
-        The message.
-
     >>> in_command_words("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"])
     'use --how windows or --give-up 0.1, or `semfov find`'
     >>> in_command_words("give its path as weights=", ["weights"])

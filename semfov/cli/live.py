@@ -16,22 +16,12 @@ from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
-UNKNOWN_RATE = 15.0
+_UNKNOWN_RATE = 15.0
 """Frames per second of the written video if the source does not give its own."""
 
 
 def look_live(options: LiveOptions) -> int:
-    """Look at the frames of a video, a camera or a stream.
-
-    Args:
-        options: the options.
-
-    Returns:
-        The exit code.
-
-    Raises:
-        InputError: there is no source, or an option does not fit.
-    """
+    """Look at the frames of a video, a camera or a stream."""
     check(options.source is None or options.camera is None, "camera", "a video or a camera, not both", options.camera)
     if options.source is None and options.camera is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
@@ -40,7 +30,7 @@ def look_live(options: LiveOptions) -> int:
     check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", options.out)
     start = start_of(options.start)
     _sought(options, detector_classes(options))
-    stream = open_live(options)
+    stream = _open_live(options)
     agent = make_agent(options)
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
@@ -56,7 +46,7 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
     return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
 
 
-def open_live(options: LiveOptions) -> Stream:
+def _open_live(options: LiveOptions) -> Stream:
     """Open the video, the camera or the stream that the options name."""
     source = options.source if options.camera is None else options.camera
     assert source is not None
@@ -69,12 +59,12 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
         path = path if path.suffix and not path.is_dir() else path / f"live{video_suffix()}"
     rate = FrameRate()
     print(f"{stream.name}: {live.describe()}")
-    with nullcontext() if path is None else video(path, stream.rate or UNKNOWN_RATE) as add:
+    with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add:
         try:
             for picture in stream.frames:
                 moment = live.step(picture.image)
                 rate.add()
-                print(f"  {moment_line(moment)}  {rate}", flush=True)
+                print(f"  {_moment_line(moment)}  {rate}", flush=True)
                 if add is not None:
                     add(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
         except KeyboardInterrupt:
@@ -83,7 +73,7 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
     return path
 
 
-def moment_line(moment: Moment) -> str:
+def _moment_line(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
     if isinstance(moment, WindowMoment):
         x, y = moment.window.centre(moment.lattice)

@@ -19,16 +19,8 @@ from semfov.version import __version__
 
 
 @dataclass(frozen=True)
-class Subcommand:
-    """A subcommand.
-
-    Attributes:
-        text: its help, one screen.
-        options: returns the dataclass of its options.
-        run: runs it with these options, and returns the exit code.
-        positional: name and help of the positional argument.
-        goes_on: what is said after an interruption.
-    """
+class _Subcommand:
+    """A subcommand."""
 
     text: str
     options: Callable[[], type[Any]]
@@ -70,13 +62,13 @@ def _detectors(options: Any) -> int:
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
 _MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
-SUBCOMMANDS: dict[str, Subcommand] = {
-    "search": Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
-    "find": Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
-    "explore": Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
-    "live": Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
-    "fit": Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
-    "detectors": Subcommand(
+_SUBCOMMANDS: dict[str, _Subcommand] = {
+    "search": _Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
+    "find": _Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
+    "explore": _Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
+    "live": _Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
+    "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
+    "detectors": _Subcommand(
         texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")
     ),
 }
@@ -86,15 +78,7 @@ _LOOKING = "search", "find", "explore", "live"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
-
-    Args:
-        arguments: command-line arguments; None for those of the process.
-
-    Returns:
-        The exit code: 0, or 1 after an error (printed in one line) and if a picture was left out. Usage errors exit
-        with 2.
-    """
+    """Run the command."""
     command_line = list(sys.argv[1:] if arguments is None else arguments)
     if command_line[:1] == ["help"]:
         command_line = [*command_line[1:2], "--help"]
@@ -105,11 +89,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("--help", "-h", "--help-all"):
         print(texts.OVERVIEW, end="")
         return 0
-    refused = _of_other_commands(SUBCOMMANDS[name], rest) if name in SUBCOMMANDS else _unknown(name)
+    refused = _of_other_commands(_SUBCOMMANDS[name], rest) if name in _SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
-    command = SUBCOMMANDS[name]
+    command = _SUBCOMMANDS[name]
     if "--help" in rest or "-h" in rest:
         print(command.text, end="")
         return 0
@@ -129,25 +113,25 @@ def _unknown(name: str) -> str:
     if Path(name).exists():
         return f"expected a command before {name!r}; try `semfov search {name} --target CLASS`"
     if name.startswith("-"):
-        return f"expected a command before {name}: {', '.join(SUBCOMMANDS)}"
-    near = get_close_matches(name, SUBCOMMANDS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(SUBCOMMANDS)}"
+        return f"expected a command before {name}: {', '.join(_SUBCOMMANDS)}"
+    near = get_close_matches(name, _SUBCOMMANDS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(_SUBCOMMANDS)}"
     return f"unknown command {name!r}; {hint}"
 
 
-def _of_other_commands(command: Subcommand, rest: Sequence[str]) -> str | None:
+def _of_other_commands(command: _Subcommand, rest: Sequence[str]) -> str | None:
     """What to say about an option that only other subcommands have; None if there is none."""
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
         having = [
-            name for name in _LOOKING if option in _options(SUBCOMMANDS[name]) and option not in _options(command)
+            name for name in _LOOKING if option in _options(_SUBCOMMANDS[name]) and option not in _options(command)
         ]
-        if having and command in map(SUBCOMMANDS.get, _LOOKING):
+        if having and command in map(_SUBCOMMANDS.get, _LOOKING):
             return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
 
 
-def _options(command: Subcommand) -> set[str]:
+def _options(command: _Subcommand) -> set[str]:
     """Names of the options of a subcommand."""
     return {field.name for field in fields(command.options())} - {command.positional[0]}
 

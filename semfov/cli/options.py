@@ -20,7 +20,7 @@ ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 OF_ANY_LOOK: tuple[Drawing, ...] = ("scanpath", "animation")
 """Figures of looks of any kind; the others are of a fovea, and `belief_bars` of a search."""
 
-MostCloserLooks = Annotated[int, Range(0, 100)]
+_MostCloserLooks = Annotated[int, Range(0, 100)]
 """Largest number of closer looks."""
 
 
@@ -112,7 +112,7 @@ class SearchOptions(PictureOptions):
     embeddings: Path | None = None
     confirm: Share | None = None
     give_up: Share | None = None
-    closer: MostCloserLooks | None = None
+    closer: _MostCloserLooks | None = None
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class LiveOptions(AgentOptions):
     rate: Annotated[float, Range(0, 100)] | None = None
     confirm: Share | None = None
     give_up: Share | None = None
-    closer: MostCloserLooks | None = None
+    closer: _MostCloserLooks | None = None
     out: Path | None = None
 
 
@@ -191,15 +191,6 @@ class DetectorsOptions(Settings):
 
 def start_of(text: str | None) -> int | tuple[int, int] | None:
     """The first cell as a number, or as column and row.
-
-    Args:
-        text: `47`, or `5,5`.
-
-    Returns:
-        The cell.
-
-    Raises:
-        InputError: it is neither.
 
     >>> start_of("5,7"), start_of("47"), start_of(None)
     ((5, 7), 47, None)

@@ -25,16 +25,7 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class PictureOutcome:
-    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), and figures.
-
-    Attributes:
-        ended: how it ended, for counting.
-        text: lines to print.
-        row: its part of the file of results (`semfov.cli.results.result_row`); None without such a file.
-        episode: its part of the page (`semfov.report`); None without a page.
-        names: names of the files of the figures.
-        figures: the files of the figures by name.
-    """
+    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), and figures."""
 
     ended: str
     text: str
@@ -48,7 +39,7 @@ class PictureOutcome:
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
-def drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
+def _drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
     """The figures to draw: those that are named, or the usual ones if the output is a folder."""
     usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
     return usual if options.draw is None else options.draw
@@ -57,19 +48,8 @@ def drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
 def picture_outcome(
     record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
 ) -> PictureOutcome:
-    """Make the text, the row, the part of a page and the figures of a record, as the options say.
-
-    Args:
-        record: the record.
-        source: the picture.
-        options: the options.
-        seconds: time that it took.
-        settings: settings of the eye (`Eye.settings`).
-
-    Returns:
-        The outcome.
-    """
-    drawings = drawings_of(options)
+    """Make the text, the row, the part of a page and the figures of a record, as the options say."""
+    drawings = _drawings_of(options)
     views: list[Tensor] = []
     if isinstance(record, Scanpath) and (options.report or {"views", "animation"} & set(drawings)):
         views = record.views()
@@ -85,7 +65,7 @@ def picture_outcome(
             # A scene has no more pixels than the record keeps.
             whole = source.file if source.scene is None else source.scene.image
             episode = zoom_data(record, whole if isinstance(record, ZoomPath) else None, name=name, settings=settings)
-    figures = draw_episode(record, source.boxes, views, drawings)
+    figures = _draw_episode(record, source.boxes, views, drawings)
     return PictureOutcome(
         ended="looked at" if record.decision is None else record.decision.outcome,
         text=f"{text}\n{looks_text(record)}" if options.looks else text,
@@ -96,7 +76,7 @@ def picture_outcome(
     )
 
 
-def draw_episode(
+def _draw_episode(
     record: GazeRecord, boxes: Tensor | None, views: list[Tensor], drawings: Sequence[Drawing]
 ) -> dict[str, bytes]:
     """Draw those figures and the animation that a record of this kind has; returns the files by name."""

@@ -16,7 +16,7 @@ from semfov.errors import check
 from semfov.io.files import write_text
 from semfov.paths import GazeRecord
 
-RESULT_KINDS = (".coco.json", ".json", ".csv", ".geojson")
+_RESULT_KINDS = (".coco.json", ".json", ".csv", ".geojson")
 """Ends of the names of files of results."""
 
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
@@ -27,41 +27,20 @@ _DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", "x1", "y1
 def kind_of(path: Path) -> str | None:
     """The kind of a file of results by its name; None for a folder.
 
-    Args:
-        path: a file or a folder.
-
-    Returns:
-        One of `RESULT_KINDS`.
-
-    Raises:
-        InputError: it is another kind of file.
-
     >>> kind_of(Path("boxes.json")), kind_of(Path("boxes.coco.json")), kind_of(Path("runs/one"))
     ('.json', '.coco.json', None)
     """
     name = path.name.lower()
-    kind = next((kind for kind in RESULT_KINDS if name.endswith(kind)), None)
+    kind = next((kind for kind in _RESULT_KINDS if name.endswith(kind)), None)
     fits = kind is not None or not path.suffix or path.is_dir()
-    check(fits, "out", f"a folder, or a file that ends in {', '.join(RESULT_KINDS)}", path)
+    check(fits, "out", f"a folder, or a file that ends in {', '.join(_RESULT_KINDS)}", path)
     return kind
 
 
 def result_row(
     record: GazeRecord, name: str, seconds: float, kind: str | None, file: Path | None = None
 ) -> dict[str, Any]:
-    """Make the entry of a picture in a file of results.
-
-    Args:
-        record: the record of the picture.
-        name: name of the picture.
-        seconds: time that it took.
-        kind: one of `RESULT_KINDS`; None for the results in a folder.
-        file: file of the picture, which may tell its place on earth; None for an embedded scene.
-
-    Returns:
-        JSON values: `picture`, and for some kinds `parts` of the file, one for each object, with what they have in
-        common.
-    """
+    """Make the entry of a picture in a file of results."""
     row: dict[str, Any] = {"picture": {**_summary(name, record, seconds), "objects": record.object_rows()}}
     if kind == ".geojson":
         collection = record.to_geojson(source=file)
@@ -74,13 +53,7 @@ def result_row(
 
 
 class ResultsFile:
-    """A file of results that is complete for the pictures so far, whenever the command ends.
-
-    Args:
-        path: the file.
-        kind: one of `RESULT_KINDS`.
-        searched: whether pictures were searched; a table then has a line for each picture and not for each object.
-    """
+    """A file of results that is complete for the pictures so far, whenever the command ends."""
 
     def __init__(self, path: Path, kind: str, *, searched: bool) -> None:
         self.path, self.kind, self.searched = path, kind, searched
@@ -89,12 +62,7 @@ class ResultsFile:
         self._due = 0.0
 
     def add(self, number: int, row: dict[str, Any]) -> None:
-        """Add a picture.
-
-        Args:
-            number: its place among the pictures, which may come in any order.
-            row: what the file has of it (`result_row`).
-        """
+        """Add a picture."""
         self._rows[number] = row
         if time.monotonic() >= self._due:
             self.write()

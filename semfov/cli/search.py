@@ -19,12 +19,8 @@ from semfov.paths import GazeRecord
 from semfov.report.page import page_path
 
 
-class SearchJob(PictureJob):
-    """Searches pictures for a class.
-
-    Args:
-        options: the options.
-    """
+class _SearchJob(PictureJob):
+    """Searches pictures for a class."""
 
     drawings = get_args(Drawing)
 
@@ -45,22 +41,15 @@ class SearchJob(PictureJob):
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
         kind = agent.kind_of_look(picture, shared["how"])
         if kind != "fovea":
-            only_likeliest(weights)
+            _only_likeliest(weights)
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
         start = start_beside(agent, source, options.seed) if beside else self.start
         return agent.search(picture, aim, start=start, **settings, **shared)
 
 
-class FindJob(PictureJob):
-    """Finds all objects in pictures.
-
-    Args:
-        options: the options.
-
-    Raises:
-        InputError: an option does not fit.
-    """
+class _FindJob(PictureJob):
+    """Finds all objects in pictures."""
 
     every = True
 
@@ -83,12 +72,8 @@ class FindJob(PictureJob):
         return self.agent.find_all(picture, self.targets, **settings, **shared)
 
 
-class ExploreJob(PictureJob):
-    """Explores pictures.
-
-    Args:
-        options: the options.
-    """
+class _ExploreJob(PictureJob):
+    """Explores pictures."""
 
     title = "exploration"
 
@@ -105,9 +90,9 @@ class ExploreJob(PictureJob):
 
 
 _JOBS: dict[type[PictureOptions], Callable[[Any], PictureJob]] = {
-    SearchOptions: SearchJob,
-    FindOptions: FindJob,
-    ExploreOptions: ExploreJob,
+    SearchOptions: _SearchJob,
+    FindOptions: _FindJob,
+    ExploreOptions: _ExploreJob,
 }
 
 
@@ -127,18 +112,7 @@ def _check(options: PictureOptions) -> Any:
 
 
 def meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
-    """The classes that a target may mean, each with a weight, the most likely first.
-
-    Args:
-        options: the options.
-        classes: names of the detector's classes.
-
-    Returns:
-        Weights by class.
-
-    Raises:
-        InputError: the target is no class, and there are no word vectors, or they do not help.
-    """
+    """The classes that a target may mean, each with a weight, the most likely first."""
     target = options.target or ""
     try:
         return {classes[class_index(target, classes, "target") - 1]: 1.0}
@@ -162,7 +136,7 @@ def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
     return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"
 
 
-def only_likeliest(weights: dict[str, float]) -> None:
+def _only_likeliest(weights: dict[str, float]) -> None:
     """Say so if only the most likely class of a description is searched for."""
     if len(weights) > 1:
         print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")

@@ -19,13 +19,7 @@ from semfov.head import Flat, Panorama
 
 @dataclass(frozen=True)
 class PictureSource:
-    """A picture to look at.
-
-    Attributes:
-        name: its name in texts.
-        file: its file; None for an embedded scene.
-        scene: the embedded scene.
-    """
+    """A picture to look at."""
 
     name: str
     file: Path | None = None
@@ -53,18 +47,7 @@ class PictureSource:
 
 
 def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
-    """The pictures that are named, those of folders in the order of their names.
-
-    Args:
-        pictures: files and folders.
-
-    Returns:
-        The pictures; none stands for an embedded scene.
-
-    Raises:
-        InputError: one is a video or an address.
-        DataError: one does not exist, or a folder has no pictures.
-    """
+    """The pictures that are named, those of folders in the order of their names."""
     sources: list[PictureSource] = []
     for name in pictures:
         path = Path(name)

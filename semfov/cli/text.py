@@ -10,7 +10,7 @@ from semfov.paths import GazeRecord, Scanpath, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.semantic import named_regions
 
-OBJECTS_LISTED = 20
+_OBJECTS_LISTED = 20
 """Largest number of objects that are listed."""
 
 
@@ -21,25 +21,25 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
     lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
     if record.decision is None:
-        lines += regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
-        lines += objects_lines(record)
+        lines += _regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
+        lines += _objects_lines(record)
     return "\n".join(lines)
 
 
 def _headline(record: GazeRecord) -> str:
     if record.decision is not None:
-        return decision_text(record, record.decision)
+        return _decision_text(record, record.decision)
     return record.objects_in_words()
 
 
-def decision_text(record: GazeRecord, decision: Decision) -> str:
+def _decision_text(record: GazeRecord, decision: Decision) -> str:
     """Say whether the target was found, and where."""
     name, probability = record.target_name, f"{record.decided_by} {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"
     point, box = found_place(record, decision)
-    edges = f", box {box_text(box)}" if box is not None else ""
+    edges = f", box {_box_text(box)}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
     return f"found {name}{where}{edges}, {probability}"
 
@@ -47,15 +47,7 @@ def decision_text(record: GazeRecord, decision: Decision) -> str:
 def found_place(
     record: GazeRecord, decision: Decision
 ) -> tuple[tuple[float, float] | None, tuple[float, float, float, float] | None]:
-    """Middle and box of what was found, in picture pixels; the middle of the cell where there is no box.
-
-    Args:
-        record: the record.
-        decision: its decision.
-
-    Returns:
-        `(x, y)` and `(x1, y1, x2, y2)`, each None where it is not known.
-    """
+    """Middle and box of what was found, in picture pixels; the middle of the cell where there is no box; → `(x, y)`."""
     if decision.box is not None:
         x1, y1, x2, y2 = (float(edge) for edge in decision.box)
         return ((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1, x2, y2)
@@ -65,26 +57,20 @@ def found_place(
     return None, None
 
 
-def objects_lines(record: GazeRecord) -> list[str]:
+def _objects_lines(record: GazeRecord) -> list[str]:
     """A line for each of the most confident objects."""
     rows = record.object_rows()
     lines = [
         f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
-        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' if row['confirmed'] else ''}"
-        for row in rows[:OBJECTS_LISTED]
+        f"box {_box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' if row['confirmed'] else ''}"
+        for row in rows[:_OBJECTS_LISTED]
     ]
-    more = len(rows) - OBJECTS_LISTED
+    more = len(rows) - _OBJECTS_LISTED
     return [*lines, f"  and {more} more (--out FILE.json writes all)"] if more > 0 else lines
 
 
-def box_text(box: Sequence[float]) -> str:
+def _box_text(box: Sequence[float]) -> str:
     """Corners of a box in whole pixels.
-
-    Args:
-        box: `(x1, y1, x2, y2)`.
-
-    Returns:
-        The text.
 
     >>> box_text((380.2, 190.0, 443.9, 276.4))
     '380,190–444,276'
@@ -93,7 +79,7 @@ def box_text(box: Sequence[float]) -> str:
     return f"{x1},{y1}–{x2},{y2}"
 
 
-def regions_lines(scanpath: Scanpath) -> list[str]:
+def _regions_lines(scanpath: Scanpath) -> list[str]:
     """A line for each class that was looked for and that the final map names, with its most probable cell."""
     by_class: dict[str, list[int]] = {}
     for label, cells, _ in named_regions(scanpath):
@@ -114,7 +100,7 @@ def looks_text(record: GazeRecord) -> str:
         [
             str(look.number),
             f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
-            "the whole picture" if record.is_whole(look.region) else box_text(look.region),
+            "the whole picture" if record.is_whole(look.region) else _box_text(look.region),
             detections_in_words(look.detections, record.classes, score=CONFIDENT),
             "" if look.value is None else f"{look.value:.3f}",
             "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
@@ -127,18 +113,12 @@ def looks_text(record: GazeRecord) -> str:
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
-        lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
+        lines.append(f"  closer look {number} at {_box_text(close_up.box.tolist())}: {chance}")
     return "\n".join(lines)
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows of equal length as lines with aligned columns.
-
-    Args:
-        rows: the cells.
-
-    Returns:
-        The lines.
 
     >>> table_lines([["name", "size"], ["a", "12"]])
     ['name  size', 'a     12']
@@ -168,12 +148,6 @@ def columns(names: Sequence[str], width: int = 100) -> str:
 
 def plain_name(name: str) -> str:
     """Make a name valid on every file system.
-
-    Args:
-        name: any text.
-
-    Returns:
-        The name.
 
     >>> plain_name("my cup, frame 3")
     'my-cup-frame-3'

@@ -89,7 +89,7 @@ def _read(table: str) -> dict[str, tuple[str, ...]]:
     return classes
 
 
-SYNONYMS = _read(_TABLE)
+_SYNONYMS = _read(_TABLE)
 """Names of COCO's classes by their synonyms, in lower case and without spaces.
 
 >>> SYNONYMS["mug"], SYNONYMS["glass"]
@@ -99,12 +99,6 @@ SYNONYMS = _read(_TABLE)
 
 def names_of(name: str) -> tuple[str, ...]:
     """List the synonyms of a class, with spaces.
-
-    Args:
-        name: name of the class in COCO's spelling.
-
-    Returns:
-        The synonyms.
 
     >>> names_of("fork"), names_of("kite")
     (('cutlery',), ())
@@ -123,7 +117,7 @@ ALIASES = {
     "tvmonitor": "tv",
 }
 _SPELT = {"".join(new.split()): [old for old in ALIASES if ALIASES[old] == new] for new in ALIASES.values()}
-MOST_NAMED = 12
+_MOST_NAMED = 12
 """Largest number of classes that a message names."""
 
 _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "scissor"}
@@ -147,15 +141,6 @@ def canonical_name(name: str) -> str:
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
     """Index the classes by their canonical names.
-
-    Args:
-        classes: names of the K classes.
-
-    Returns:
-        The index of each class, from 1 (0 is background), by its canonical name.
-
-    Raises:
-        InputError: two names are the same.
 
     >>> class_indices(("person", "sofa"))
     {'person': 1, 'couch': 2}
@@ -190,8 +175,8 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return _index(name, len(classes), argument)
     if name in classes:
         return list(classes).index(name) + 1
-    name_key, keys = plain_key(name), [plain_key(other) for other in classes]
-    forms = [set().union(*map(other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
+    name_key, keys = _plain_key(name), [_plain_key(other) for other in classes]
+    forms = [set().union(*map(_other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
     for fits in (
         [index for index, key in enumerate(keys, 1) if key == name_key],
         [index for index, form in enumerate(forms, 1) if name_key in form],
@@ -200,8 +185,8 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
             return fits[0]
         if fits:
             raise InputError(_unknown(argument, name, [classes[index - 1] for index in fits], classes))
-    singular = [word for word in SYNONYMS if name_key in other_numbers(word)]
-    meant = [key for word in (name_key, *singular) for key in map(plain_key, SYNONYMS.get(word, ())) if key in keys]
+    singular = [word for word in _SYNONYMS if name_key in _other_numbers(word)]
+    meant = [key for word in (name_key, *singular) for key in map(_plain_key, _SYNONYMS.get(word, ())) if key in keys]
     near = get_close_matches(name_key, keys, n=3, cutoff=0.8 if meant else 0.6)
     raise InputError(_unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes))
 
@@ -210,17 +195,6 @@ def class_numbers(
     names: str | int | Sequence[str | int] | None, classes: Sequence[str], argument: str = "class"
 ) -> tuple[int, ...]:
     """Look up the indices of one class, of several, or of all classes.
-
-    Args:
-        names: name or index 1..K of a class, several of them, or None for all.
-        classes: names of the K classes.
-        argument: name of the argument, for the message.
-
-    Returns:
-        The indices, each once, from 1; none stand for all classes.
-
-    Raises:
-        InputError: there is no such class, or the sequence is empty.
 
     >>> class_numbers(["cups", 1, "cup"], ("person", "cup")), class_numbers(None, ("person", "cup"))
     ((2, 1), ())
@@ -256,18 +230,18 @@ def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[s
 
 def _few(classes: Sequence[str]) -> str:
     """The classes, or of many the first ones and where the others are listed."""
-    if len(classes) <= MOST_NAMED:
+    if len(classes) <= _MOST_NAMED:
         return ", ".join(classes)
     return f"{', '.join(classes[:5])} and {len(classes) - 5} more; agent.classes lists them"
 
 
-def plain_key(name: str) -> str:
+def _plain_key(name: str) -> str:
     """A name in lower case, without spaces, underscores and hyphens, in COCO's spelling."""
     plain = re.sub(r"[\s_-]+", "", name.lower())
     return re.sub(r"\s", "", ALIASES.get(plain, plain))
 
 
-def other_numbers(key: str) -> set[str]:
+def _other_numbers(key: str) -> set[str]:
     """Plural forms of a class name; for a name that is a plural, also its singular."""
     forms = {f"{key}s", f"{key}es", _IRREGULAR.get(key, f"{key}s")}
     for end, plural in (("y", "ies"), ("f", "ves"), ("fe", "ves")):
@@ -279,19 +253,12 @@ def other_numbers(key: str) -> set[str]:
 def alike(name: str, names: Sequence[str]) -> list[int]:
     """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms.
 
-    Args:
-        name: name of the class.
-        names: names to search in.
-
-    Returns:
-        Positions of the matching names, from 0.
-
     >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
     ([1], [0, 1], [0])
     """
-    name_key, keys = plain_key(name), [plain_key(other) for other in names]
-    forms = {name_key, *other_numbers(name_key)}
-    same = [place for place, key in enumerate(keys) if key in forms or name_key in other_numbers(key)]
+    name_key, keys = _plain_key(name), [_plain_key(other) for other in names]
+    forms = {name_key, *_other_numbers(name_key)}
+    same = [place for place, key in enumerate(keys) if key in forms or name_key in _other_numbers(key)]
     if same:
         return same
     return [place for place, key in enumerate(keys) if _calls(key, name_key) or _calls(name_key, key)]
@@ -299,4 +266,4 @@ def alike(name: str, names: Sequence[str]) -> list[int]:
 
 def _calls(other: str, key: str) -> bool:
     """Whether `other` is a synonym of a class."""
-    return key in map(plain_key, SYNONYMS.get(other, ()))
+    return key in map(_plain_key, _SYNONYMS.get(other, ()))

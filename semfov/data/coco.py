@@ -27,22 +27,12 @@ from semfov.io.schema import excerpt, is_number, is_plain
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
 
 
-def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
+def _read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     """Read and check a COCO instances file.
 
     Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
     `height`. Every category needs `id` and `name`. Every annotation needs `id`, `image_id`, `category_id` and `bbox` =
     `[x, y, width, height]`, and may have `iscrowd`. Other keys are ignored.
-
-    Args:
-        path: the file.
-
-    Returns:
-        A `pycocotools.coco.COCO` index, and the sha256 of the file.
-
-    Raises:
-        DataError: the file is missing or not JSON, or an entry lacks a key, has a value of the wrong type, repeats an
-            id or refers to an id that does not exist.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -226,7 +216,7 @@ class CocoScenes:
         check(coverage in ("sum", "union"), "coverage", "'sum' or 'union'", repr(coverage))
         check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
         self.classes = tuple(classes)
-        coco, digest = read_annotations(annotations)
+        coco, digest = _read_annotations(annotations)
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:

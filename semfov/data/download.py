@@ -20,21 +20,15 @@ from urllib.request import Request, urlopen
 
 from semfov.errors import DataError, SemfovError, check, lookup
 
-ADDRESS = "http://images.cocodataset.org"
+_ADDRESS = "http://images.cocodataset.org"
 _CHUNK = 1 << 20
 _TIMEOUT = 30.0
 _ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
-class Archive:
-    """A zip file on the server.
-
-    Attributes:
-        path: its path on the server.
-        size: its size in bytes.
-        sha256: sha256 of the whole file.
-    """
+class _Archive:
+    """A zip file on the server."""
 
     path: str
     size: int
@@ -47,46 +41,36 @@ class Archive:
 
 
 # COCO publishes no digests; these were recorded by many independent users of the files.
-_ANNOTATIONS = Archive(
+_ANNOTATIONS = _Archive(
     "annotations/annotations_trainval2017.zip",
     252_907_541,
     "113a836d90195ee1f884e704da6304dfaaecff1f023f49b6ca93c4aaae470268",
 )
-SPLITS = {
-    "val2017": Archive(
+_SPLITS = {
+    "val2017": _Archive(
         "zips/val2017.zip", 815_585_330, "4f7e2ccb2866ec5041993c9cf2a952bbed69647b115d0f74da7ce8f4bef82f05"
     ),
-    "train2017": Archive(
+    "train2017": _Archive(
         "zips/train2017.zip", 19_336_861_798, "69a8bb58ea5f8f99d24875f21416de2e9ded3178e903f1f7603e283b9e06d929"
     ),
 }
 
 
-def download_coco(split: str, root: str | os.PathLike[str], *, address: str = ADDRESS, keep: bool = False) -> None:
+def _download_coco(split: str, root: str | os.PathLike[str], *, address: str = _ADDRESS, keep: bool = False) -> None:
     """Fetch a split's images into `root/<split>` and its boxes into `root/annotations/instances_<split>.json`.
 
     Files that are already complete are not fetched again, and an interrupted transfer continues where it stopped.
     Archives that are already in `root` are verified, used and left there.
-
-    Args:
-        split: `"val2017"` or `"train2017"`.
-        root: folder of the data set.
-        address: address of the server, or of a mirror that has the same files under the same paths.
-        keep: keep the archives that were fetched.
-
-    Raises:
-        InputError: the split is unknown.
-        DataError: the network fails, the disk is full, or a file is not the official one.
     """
-    images = SPLITS[lookup(split, SPLITS, "split")]
+    images = _SPLITS[lookup(split, _SPLITS, "split")]
     check(address.startswith(("http://", "https://")), "address", "http://... or https://...", repr(address))
     fetch_split(split, Path(root), images, _ANNOTATIONS, address=address, keep=keep)
 
 
 def fetch_split(
-    split: str, root: Path, images: Archive, annotations: Archive, *, address: str, keep: bool, pause: float = 1.0
+    split: str, root: Path, images: _Archive, annotations: _Archive, *, address: str, keep: bool, pause: float = 1.0
 ) -> None:
-    """`download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
+    """`_download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
     instances = f"annotations/instances_{split}.json"
     try:
         if _is_complete(root, split, instances):
@@ -97,7 +81,7 @@ def fetch_split(
                 _verify(brought, archive, f"delete it, and run again to fetch {address}/{archive.path}")
                 unpack_members(brought, root, members)
                 continue
-            file = fetch_archive(archive, root / ".download", address=address, pause=pause)
+            file = _fetch_archive(archive, root / ".download", address=address, pause=pause)
             unpack_members(file, root, members)
             if keep:
                 file.replace(brought)
@@ -111,7 +95,7 @@ def fetch_split(
         ) from error
 
 
-def fetch_archive(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
+def _fetch_archive(archive: _Archive, folder: Path, *, address: str = _ADDRESS, pause: float = 1.0) -> Path:
     """Fetch an archive and verify it; what an earlier run transferred is not fetched again."""
     file, part = folder / archive.name, folder / f"{archive.name}.part"
     if file.exists():
@@ -163,14 +147,7 @@ def unpack_members(file: Path, root: Path, members: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m semfov.data.coco`.
-
-    Args:
-        arguments: command-line arguments; None for those of the process.
-
-    Returns:
-        The exit status: 0, 1 after an error, 130 after an interrupt.
-    """
+    """Run `python -m semfov.data.coco`."""
     parser = argparse.ArgumentParser(
         prog="python -m semfov.data.coco",
         description="Fetch the official COCO 2017 photographs and their boxes. An interrupted run is resumed by "
@@ -178,14 +155,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog="Without a network, copy the zip files from another machine into DIR and run the same command.",
     )
     parser.add_argument(
-        "split", choices=sorted(SPLITS), help="val2017: 5,000 images, 1.1 GB; train2017: 118,287, 20 GB"
+        "split", choices=sorted(_SPLITS), help="val2017: 5,000 images, 1.1 GB; train2017: 118,287, 20 GB"
     )
     parser.add_argument("--root", required=True, metavar="DIR", help="folder of the data set; created if missing")
-    parser.add_argument("--address", default=ADDRESS, metavar="URL", help="server or mirror (default: %(default)s)")
+    parser.add_argument("--address", default=_ADDRESS, metavar="URL", help="server or mirror (default: %(default)s)")
     parser.add_argument("--keep", action="store_true", help="keep the zip files that were fetched")
     options = parser.parse_args(arguments)
     try:
-        download_coco(options.split, options.root, address=options.address, keep=options.keep)
+        _download_coco(options.split, options.root, address=options.address, keep=options.keep)
     except SemfovError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -198,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _transfer(url: str, archive: Archive, part: Path) -> None:
+def _transfer(url: str, archive: _Archive, part: Path) -> None:
     """Append the missing bytes to `part`; raise `ConnectionError` where the server stops early."""
     from tqdm import tqdm
 
@@ -246,7 +223,7 @@ def _read(response: HTTPResponse) -> bytes:
         raise ConnectionError(error) from error
 
 
-def _verify(file: Path, archive: Archive, remedy: str) -> None:
+def _verify(file: Path, archive: _Archive, remedy: str) -> None:
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     if digest != archive.sha256:
@@ -268,7 +245,7 @@ def _inside(root: Path, member: zipfile.ZipInfo, file: Path) -> Path:
     return root.joinpath(*path.parts)
 
 
-def _check_space(folder: Path, archive: Archive, part: Path) -> None:
+def _check_space(folder: Path, archive: _Archive, part: Path) -> None:
     needed = 2 * archive.size - _size(part)  # for the archive and for the files in it
     free = shutil.disk_usage(folder).free
     if free < needed:

@@ -105,15 +105,7 @@ def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
 
     That is upright, or as stored where only the stored pixels have the recorded size.
 
-    Args:
-        path: the file.
-        size: `(width, height)` recorded in the annotations.
-
-    Returns:
-        `(3, height, width)`, RGB in [0, 1].
-
-    Raises:
-        DataError: the file cannot be read (see `read_image`), or the image has another size.
+    Shapes: size `(width, height)` → `(3, height, width)`.
     """
     image = read_image(path)
     if image.shape[-2:] == size[::-1]:
@@ -144,17 +136,7 @@ def orientation(image: Any) -> int:
 
 
 def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
-    """Turn a picture upright, or back to the orientation of its file.
-
-    Args:
-        image: the picture, a Pillow image.
-        stored: orientation in its file.
-        left: orientation after loading. Pillow turns TIFFs upright by itself, and then this is 1.
-        upright: True to turn it upright, False for the orientation of the file.
-
-    Returns:
-        The turned picture.
-    """
+    """Turn a picture upright, or back to the orientation of its file."""
     from PIL.Image import Transpose
 
     orientation = left if upright else _INVERSE.get(stored, stored) if left != stored else 1

@@ -71,17 +71,10 @@ def as_images(
 ) -> Tensor:
     """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`.
 
-    Args:
-        images: the picture or pictures.
-        like: a tensor with the dtype and device of the result, as for `as_image`.
-        argument: name of the argument, for the message.
-        color: order of the channels, as for `as_image`.
-
-    Returns:
-        `(B, 3, H, W)`.
-
     >>> as_images(torch.rand(2, 3, 8, 9)).shape
     torch.Size([2, 3, 8, 9])
+
+    Shapes: → `(B, 3, H, W)`.
     """
     pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
     pixels = in_rgb(pixels, images, color)
@@ -131,19 +124,7 @@ def check_local(path: str | PathLike[str], argument: str) -> None:
 
 
 def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = True) -> Tensor:
-    """Convert pixels from any layout that `as_image` accepts to channels first.
-
-    Args:
-        pixels: one picture or a batch, of any dtype.
-        argument: name of the argument, for the message.
-        choose: whether an ambiguous shape `(3, H, 3)` is taken as channels first; otherwise it is refused.
-
-    Returns:
-        Pixels `(B, 3, H, W)`.
-
-    Raises:
-        InputError: the shape is not the shape of pictures, or is ambiguous.
-    """
+    """Convert pixels from any layout that `as_image` accepts to channels first; choose `(3, H, 3)` → `(B, 3, H, W)`."""
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")
     check(pixels.numel() > 0, argument, "at least one pixel", f"shape {shape}")
@@ -166,18 +147,10 @@ def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = Tr
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
     """Convert points to a tensor; tensors stay as they are, other numbers become float64.
 
-    Args:
-        points: one point `(x, y)` or several, in pixels.
-        argument: name of the argument, for the message.
-
-    Returns:
-        Points `(..., 2)`.
-
-    Raises:
-        InputError: they are not numbers, or not pairs.
-
     >>> as_points((320, 240))
     tensor([320., 240.], dtype=torch.float64)
+
+    Shapes: → `(..., 2)`.
     """
     if isinstance(points, Tensor):
         return points

@@ -44,38 +44,17 @@ _WHITE_IS_ZERO, _PALETTE = 0, 3  # photometric interpretations of a TIFF
 
 
 class LargePicture(ABC):
-    """Base of 8-bit pictures that are read window by window.
-
-    Attributes:
-        size: `(width, height)` in pixels.
-        path: its file; None for a picture in memory.
-    """
+    """Base of 8-bit pictures that are read window by window; size `(width, height)`."""
 
     size: tuple[int, int]
     path: Path | None = None
 
     @abstractmethod
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window.
-
-        Args:
-            box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
-
-        Returns:
-            RGB bytes `(h, w, 3)`.
-        """
+        """Read a window; → `(h, w, 3)`."""
 
     def reduction(self, ratio: float, oversampling: float = OVERSAMPLING) -> int:
-        """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it.
-
-        Args:
-            ratio: pixels of a window for each wanted pixel.
-            oversampling: pixels that a reduced window keeps for each wanted pixel.
-
-        Returns:
-            A power of two; 1 for windows that are read as they are: those of pictures of up to 16 million pixels, and
-            those that keep more than a sixth of the pixels along a side (of very large pictures, a twelfth or less).
-        """
+        """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
         many = self.size[0] * self.size[1] > LARGE
         reduction = reduction_for(ratio, oversampling) if many else 1
         return reduction if reduction >= self._first else 1
@@ -83,19 +62,11 @@ class LargePicture(ABC):
     def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
         """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
 
-        The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels
-        (25 MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture,
-        and at most 134 MB: copies of pictures of more than 537 million pixels begin at a coarser one.
+        The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels (25
+        MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture, and
+        at most 134 MB: copies of pictures of more than 537 million pixels begin at a coarser one.
 
-        Args:
-            box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
-            reduction: factor by which the window may be reduced, a power of two.
-
-        Returns:
-            `(3, h, w)`, bytes, channels last in memory.
-
-        Raises:
-            InputError: the box is empty or not inside the picture.
+        Shapes: → `(3, h, w)`.
         """
         self._inside(box)
         if reduction < self._first or self.size[0] * self.size[1] <= LARGE:
@@ -120,11 +91,10 @@ class LargePicture(ABC):
         return ReducedCopies(self.size, self.pixels)
 
 
-class ArrayPicture(LargePicture):
+class _ArrayPicture(LargePicture):
     """A picture in an array, which may be a `numpy.memmap`; only the pixels of the windows are read.
 
-    Args:
-        array: bytes `(H, W, 3)` or `(H, W)`.
+    Shapes: array `(H, W, 3)`.
     """
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
@@ -140,13 +110,8 @@ class ArrayPicture(LargePicture):
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
 
 
-class MemoryPicture(ArrayPicture):
-    """A picture of any common type (`semfov.as_image`), kept in memory as bytes.
-
-    Args:
-        image: the picture.
-        color: order of the channels of arrays and tensors.
-    """
+class _MemoryPicture(_ArrayPicture):
+    """A picture of any common type (`semfov.as_image`), kept in memory as bytes."""
 
     def __init__(self, image: ImageLike, *, color: Color = "rgb") -> None:
         if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
@@ -174,17 +139,11 @@ def _from_16(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return pixels.astype(np.uint8, copy=False)
 
 
-class PhotographPicture(LargePicture):
+class _PhotographPicture(LargePicture):
     """A picture in a file that Pillow reads.
 
     Formats such as JPEG cannot be read window by window. The whole picture is decoded when a window is first needed,
     and is kept in memory (three bytes for each pixel). Its pixels are those that `semfov.data.read_image` reads.
-
-    Args:
-        path: the file.
-
-    Raises:
-        DataError: the file is missing, or is not a picture.
     """
 
     path: Path
@@ -227,18 +186,11 @@ def _rgb(image: "Image") -> NDArray[np.uint8]:
     return array
 
 
-class TiffPicture(LargePicture):
+class _TiffPicture(LargePicture):
     """A TIFF of 8 or 16 bits, read tile by tile (or strip by strip) through `tifffile`.
 
     Only the tiles that overlap a window are decoded, one at a time. Those of 16 bits are scaled by their white, 65535,
     to 8 bits.
-
-    Args:
-        path: the file; its first page is read.
-
-    Raises:
-        DataError: `tifffile` is not installed, or has no codec for the file, or the page is not grey or RGB with 8 or
-            16 bits.
     """
 
     path: Path
@@ -310,24 +262,12 @@ class TiffPicture(LargePicture):
         return 255 - tile if self._page.photometric == _WHITE_IS_ZERO else tile
 
 
-class RasterPicture(LargePicture):
+class _RasterPicture(LargePicture):
     """A picture in a file that GDAL reads: a cloud-optimised GeoTIFF, a mosaic of files (`.vrt`), JPEG 2000.
 
     Windows are read alone. Coarse windows are read from the overviews of the file, if it has some. Bands that the file
     calls red, green and blue are the channels, else the first three, or a single one as grey. Bands of 16 bits are
     scaled by their white, 65535, to 8 bits.
-
-    Args:
-        path: the file.
-
-    Raises:
-        DataError: rasterio is not installed, GDAL cannot read the file, or it has a palette or other numbers than bytes
-            and 16 bits.
-
-    Example::
-
-        picture = RasterPicture("orthophoto.tif")
-        picture.size, picture.read((0, 0, 4096, 4096), 8).shape
     """
 
     path: Path
@@ -389,15 +329,8 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
 
     Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, and by rasterio if that is installed and
     they have overviews or are of a kind that `tifffile` leaves; else as other photographs. Rasters `.vrt` and `.jp2`
-    need rasterio (`RasterPicture`). Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows
-    of a `numpy.memmap` are read.
-
-    Args:
-        source: the picture.
-        color: order of the channels of arrays and tensors.
-
-    Returns:
-        The opened picture.
+    need rasterio. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows of a
+    `numpy.memmap` are read.
 
     >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
     torch.Size([3, 10, 20])
@@ -405,33 +338,33 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
     if isinstance(source, LargePicture):
         return source
     if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.size and _by_rows(source.shape):
-        return ArrayPicture(source[..., ::-1] if color == "bgr" and source.ndim == 3 else source)
+        return _ArrayPicture(source[..., ::-1] if color == "bgr" and source.ndim == 3 else source)
     if not isinstance(source, str | PathLike):
-        return MemoryPicture(source, color=color)
+        return _MemoryPicture(source, color=color)
     check_local(source, "picture")
     if Path(source).suffix.lower() in RASTERS:
-        return RasterPicture(source)
+        return _RasterPicture(source)
     if Path(source).suffix.lower() in _TILED:
         return _tiff(source)
-    return PhotographPicture(source)
+    return _PhotographPicture(source)
 
 
 def _tiff(path: str | PathLike[str]) -> LargePicture:
     """A TIFF read by windows; by rasterio if it has overviews, or of a kind that `tifffile` leaves; else by Pillow."""
     try:
-        tiff = TiffPicture(path)
+        tiff = _TiffPicture(path)
         if not tiff.has_overviews:
             return tiff
     except DataError as error:
         with suppress(DataError):
-            return RasterPicture(path)
+            return _RasterPicture(path)
         with suppress(DataError):
-            photograph = PhotographPicture(path)
+            photograph = _PhotographPicture(path)
             photograph.read((0, 0, 1, 1))
             return photograph
         raise error from None
     try:
-        return RasterPicture(path)
+        return _RasterPicture(path)
     except DataError:
         return tiff
 
@@ -439,18 +372,10 @@ def _tiff(path: str | PathLike[str]) -> LargePicture:
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
     """Size of a picture of any common type, without decoding a file.
 
-    Args:
-        source: the picture.
-
-    Returns:
-        `(width, height)` in pixels, upright.
-
-    Raises:
-        InputError: it is no picture.
-        DataError: the file cannot be read.
-
     >>> picture_size(np.zeros((48, 64, 3), np.uint8))
     (64, 48)
+
+    Shapes: → `(width, height)`.
     """
     from PIL import Image as Pillow
 

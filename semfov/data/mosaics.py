@@ -17,14 +17,8 @@ _VERSION = 1  # raise it whenever the same seed would give another picture
 
 
 @dataclass(frozen=True)
-class Tile:
-    """The place of a photograph in a mosaic.
-
-    Attributes:
-        index: index of the photograph in its set of scenes.
-        slot: `(x1, y1, x2, y2)` of its slot, in pixels of the mosaic.
-        box: `(x1, y1, x2, y2)` of the photograph, centred in its slot.
-    """
+class _Tile:
+    """The place of a photograph in a mosaic."""
 
     index: int
     slot: tuple[int, int, int, int]
@@ -38,21 +32,12 @@ class Mosaics(ComposedScenes):
     depends only on the seed, on `i` and on the photographs. No photograph is in a mosaic twice, unless there are fewer
     photographs than slots.
 
-    Args:
-        scenes: the photographs with their boxes, a COCO-format set or embedded scenes.
-        columns: number of photographs in a row.
-        rows: number of photographs in a column.
-        tile: `(width, height)` of a slot in pixels.
-        count: number of mosaics.
-        seed: seed of the compositions.
-        fill: value of the pixels outside the photographs.
-        alike: whether the photographs of a mosaic share a class. It is drawn among those that a quarter as many
-            photographs show as there are slots; if there is none, any photographs are taken.
-
     >>> from semfov.data import EmbeddedScenes
     >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)
     >>> mosaics[0].size
     (640, 480)
+
+    Shapes: tile `(width, height)`.
     """
 
     def __init__(
@@ -76,7 +61,7 @@ class Mosaics(ComposedScenes):
         what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill, *([alike] if alike else [])]
         self.fingerprint = json_sha256(what)
 
-    def tiles(self, index: int) -> list[Tile]:
+    def tiles(self, index: int) -> list[_Tile]:
         """List the photographs of a mosaic, row by row."""
         generator = self._generator(index)
         slots, photographs = self.columns * self.rows, np.arange(len(self.scenes))
@@ -95,13 +80,13 @@ class Mosaics(ComposedScenes):
         least = -(-self.columns * self.rows // 4)
         return [column.nonzero()[0] for column in presence.T if column.sum() >= least]
 
-    def _tile(self, scene: int, slot: int) -> Tile:
+    def _tile(self, scene: int, slot: int) -> _Tile:
         (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
         scale = min(wide / width, high / height)
         width, height = (max(1, round(side * scale)) for side in (width, height))
         left, top = slot % self.columns * wide, slot // self.columns * high
         x, y = left + (wide - width) // 2, top + (high - height) // 2
-        return Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height))
+        return _Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height))
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a mosaic."""
@@ -127,7 +112,7 @@ class Mosaics(ComposedScenes):
         return json_sha256([_VERSION, self.size, self.fill, tiles])
 
 
-def _moved(part: Annotation, tile: Tile) -> Tensor:
+def _moved(part: Annotation, tile: _Tile) -> Tensor:
     """Boxes of a photograph `(M, 4)` in pixels of the mosaic."""
     x1, y1, x2, y2 = tile.box
     scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)

@@ -15,20 +15,7 @@ from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 
 class Pictures:
-    """Photographs by the names of their files, as `Scenes` without objects.
-
-    Args:
-        root: folder of the photographs.
-        names: names of the files; repeated names count once.
-        classes: names of the detector's classes.
-
-    Raises:
-        DataError: a name leads out of the folder, or a file is missing.
-
-    Example::
-
-        pictures = Pictures("osie/images", ["1001.jpg", "1005.jpg"], detector.classes)
-    """
+    """Photographs by the names of their files, as `Scenes` without objects."""
 
     def __init__(self, root: str | PathLike[str], names: Iterable[str], classes: tuple[str, ...]) -> None:
         self.root = Path(root)

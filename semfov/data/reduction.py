@@ -30,13 +30,6 @@ OVERSAMPLING = 1.5
 def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
     """Largest factor by which a window may be reduced that is resampled afterwards.
 
-    Args:
-        ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
-        oversampling: pixels that the reduced window keeps for each wanted pixel.
-
-    Returns:
-        A power of two.
-
     >>> [reduction_for(ratio) for ratio in (0, 2.9, 3, 9, 12.3)]
     [1, 1, 2, 4, 8]
     """
@@ -49,14 +42,10 @@ def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
 def first_for(size: tuple[int, int]) -> int:
     """Factor by which the largest copy of a picture is reduced, so that it has at most `LARGEST` pixels.
 
-    Args:
-        size: `(width, height)` of the picture.
-
-    Returns:
-        A power of two.
-
     >>> first_for((20_000, 15_000)), first_for((40_000, 40_000))
     (4, 8)
+
+    Shapes: size `(width, height)`.
     """
     first = FIRST
     while size[0] * size[1] > LARGEST * first**2:
@@ -90,14 +79,12 @@ class ReducedCopies:
     A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
     borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
 
-    Args:
-        size: `(width, height)` of the picture.
-        read: returns the bytes `(h, w, 3)` of a box `(x1, y1, x2, y2)`.
-
     >>> picture = np.full((40, 64, 3), 7, np.uint8)
     >>> copies = ReducedCopies((64, 40), lambda box: picture[box[1] : box[3], box[0] : box[2]])
     >>> copies.window((16, 8, 48, 40), 4).shape
     torch.Size([3, 8, 8])
+
+    Shapes: size `(width, height)`, read `(h, w, 3)`.
     """
 
     def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:
@@ -106,15 +93,7 @@ class ReducedCopies:
         self._copies: dict[int, Tensor] = {}
 
     def window(self, box: PixelBox, reduction: int) -> Tensor:
-        """Read a window from a copy.
-
-        Args:
-            box: `(x1, y1, x2, y2)` in pixels of the picture. Edges between multiples of the reduction move outwards.
-            reduction: factor by which the copy is reduced, a power of two from `first_for` on.
-
-        Returns:
-            `(3, h, w)`, bytes, channels last in memory.
-        """
+        """Read a window from a copy; → `(3, h, w)`."""
         copy = self._copy(reduction)
         high, wide = copy.shape[1:]
         x1, y1, x2, y2 = box

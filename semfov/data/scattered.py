@@ -30,14 +30,8 @@ _Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Cutout:
-    """A part of a photograph and its place in a picture.
-
-    Attributes:
-        index: index of the photograph in its set of scenes.
-        part: `(x1, y1, x2, y2)` in pixels of the photograph.
-        place: `(x1, y1, x2, y2)` in pixels of the picture.
-    """
+class _Cutout:
+    """A part of a photograph and its place in a picture."""
 
     index: int
     part: _Box
@@ -52,19 +46,12 @@ class Scattered(ComposedScenes):
     picture: between `sides` on the longer side. They stand in groups. Picture `i` depends only on the seed, on `i` and
     on the photographs.
 
-    Args:
-        scenes: the photographs with their boxes.
-        whole: scatter whole photographs; false: single objects.
-        size: `(width, height)` of the pictures in pixels.
-        sides: smallest and largest longer side of an object, or of a photograph, in pixels.
-        most: largest number of objects or photographs of a picture.
-        count: number of pictures.
-        seed: seed of the compositions.
-
     >>> from semfov.data import EmbeddedScenes
     >>> pictures = Scattered(EmbeddedScenes(("person", "cat"), count=3), whole=True, size=(640, 480), sides=(90, 120))
     >>> pictures[0].size, len(pictures[0].boxes) > 0
     ((640, 480), True)
+
+    Shapes: size `(width, height)`.
     """
 
     def __init__(
@@ -106,7 +93,7 @@ class Scattered(ComposedScenes):
                 by_class[int(annotation.labels[n])].append((index, (part[0], part[1], part[2], part[3])))
         return dict(by_class)
 
-    def cutouts(self, index: int) -> list[Cutout]:
+    def cutouts(self, index: int) -> list[_Cutout]:
         """List the parts of photographs in a picture."""
         draw = self._generator(index, 0)
         low, high = np.log(self.sides)
@@ -123,7 +110,7 @@ class Scattered(ComposedScenes):
             sources = [row[int(draw.integers(len(row)))] for row in rows]
         groups = draw.uniform(0, 1, (draw.integers(1, 5), 2)) * self.size
         spread = draw.uniform(0.03, 0.2) * self.size[0]
-        placed: list[Cutout] = []
+        placed: list[_Cutout] = []
         for number, part in sources:
             scale = min(1.0, side * draw.uniform(0.7, 1.3) / max(part[2] - part[0], part[3] - part[1]))
             wide, tall = (max(2, round(scale * (part[n + 2] - part[n]))) for n in (0, 1))
@@ -132,7 +119,7 @@ class Scattered(ComposedScenes):
                 place = round(x), round(y), round(x) + wide, round(y) + tall
                 inside = x >= 0 and y >= 0 and place[2] <= self.size[0] and place[3] <= self.size[1]
                 if inside and not any(_meet(place, other.place) for other in placed):
-                    placed.append(Cutout(number, part, place))
+                    placed.append(_Cutout(number, part, place))
                     break
         return placed
 

@@ -179,13 +179,7 @@ def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage
 
 
 class ComposedScenes(ABC):
-    """Base of sets whose scenes are composed by a seed: a scene depends only on the seed and on its number.
-
-    Args:
-        classes: names of the detector's classes 1..K.
-        count: number of scenes.
-        seed: seed of the compositions.
-    """
+    """Base of sets whose scenes are composed by a seed: a scene depends only on the seed and on its number."""
 
     def __init__(self, classes: tuple[str, ...], count: int, seed: int) -> None:
         check(count >= 1, "count", "at least 1", count)
@@ -230,13 +224,6 @@ class ComposedScenes(ABC):
 
 class Crowded:
     """The given share of a set's scenes, those with the most objects; among equals the first scenes count.
-
-    Args:
-        scenes: the set.
-        share: share of its scenes, above 0 and at most 1; rounded up.
-
-    Raises:
-        InputError: the share is outside its range, or the set is empty.
 
     >>> from semfov.data import EmbeddedScenes
     >>> scenes = EmbeddedScenes(("person", "cat"), count=6)

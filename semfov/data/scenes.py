@@ -37,16 +37,7 @@ _Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Photograph:
-    """A crop of a photograph from an installed package.
-
-    Attributes:
-        title: subject of the photograph.
-        package: the package that contains the file.
-        file: name of the file in the package.
-        crop: the part that is used, `(x1, y1, x2, y2)` in pixels of the photograph.
-        label: class of the object, `""` for a distractor.
-        box: box of the object in pixels of the photograph, inside the crop.
-    """
+    """A crop of a photograph from an installed package."""
 
     title: str
     package: str
@@ -56,7 +47,7 @@ class Photograph:
     box: _Box = (0, 0, 0, 0)
 
 
-PHOTOGRAPHED_OBJECTS = (
+_PHOTOGRAPHED_OBJECTS = (
     Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
     Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
     Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
@@ -64,7 +55,7 @@ PHOTOGRAPHED_OBJECTS = (
     Photograph("cup", "skimage", "coffee.png", (140, 0, 440, 330), "cup", (172, 17, 408, 312)),
     Photograph("motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)),
 )
-DISTRACTORS = (
+_DISTRACTORS = (
     Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
     Photograph("deep field", "skimage", "hubble_deep_field.jpg", (100, 100, 700, 700)),
     Photograph("colour wheel", "skimage", "color.png", (0, 0, 371, 370)),
@@ -75,18 +66,12 @@ DISTRACTORS = (
     Photograph("brick wall", "skimage", "brick.png", (0, 0, 512, 512)),
     Photograph("gravel", "skimage", "gravel.png", (0, 0, 400, 400)),
 )
-TEXTURES = ("brick.png", "grass.png", "gravel.png")
+_TEXTURES = ("brick.png", "grass.png", "gravel.png")
 
 
 @dataclass(frozen=True)
 class Item:
-    """The place of a photograph in a scene.
-
-    Attributes:
-        photograph: the photograph.
-        patch: `(x1, y1, x2, y2)` of its crop in scene pixels.
-        mirrored: whether it is mirrored left to right.
-    """
+    """The place of a photograph in a scene."""
 
     photograph: Photograph
     patch: _Box
@@ -126,11 +111,11 @@ class EmbeddedScenes(ComposedScenes):
     def __init__(self, classes: Sequence[str], *, count: int = 8, seed: int = 0) -> None:
         super().__init__(tuple(classes), count, seed)
         self._labels = class_indices(self.classes)
-        labels = {photograph.label for photograph in PHOTOGRAPHED_OBJECTS}
+        labels = {photograph.label for photograph in _PHOTOGRAPHED_OBJECTS}
         some = f"at least one of {', '.join(sorted(labels))}"
         check(not labels.isdisjoint(self._labels), "classes", some, self.classes)
         files = sorted(
-            {(p.package, p.file) for p in PHOTOGRAPHED_OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES}
+            {(p.package, p.file) for p in _PHOTOGRAPHED_OBJECTS + _DISTRACTORS} | {("skimage", t) for t in _TEXTURES}
         )
         digests = [sha256(_path(*file)) for file in files]
         self.fingerprint = json_sha256([_VERSION, self.classes, count, seed, digests])
@@ -189,8 +174,8 @@ class EmbeddedScenes(ComposedScenes):
 
 def _layout(generator: np.random.Generator) -> list[Item]:
     """Five objects and five distractors, each at a random position in a slot of its own."""
-    photographs = [PHOTOGRAPHED_OBJECTS[i] for i in generator.permutation(len(PHOTOGRAPHED_OBJECTS))[:5]]
-    photographs += [DISTRACTORS[i] for i in generator.permutation(len(DISTRACTORS))[:5]]
+    photographs = [_PHOTOGRAPHED_OBJECTS[i] for i in generator.permutation(len(_PHOTOGRAPHED_OBJECTS))[:5]]
+    photographs += [_DISTRACTORS[i] for i in generator.permutation(len(_DISTRACTORS))[:5]]
     columns, rows = _SLOTS
     pitch = _SIZE[0] // columns, _SIZE[1] // rows
     slots = generator.permutation(columns * rows)
@@ -212,8 +197,7 @@ def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
     The clouds are a sum of random grids, one for each octave, whose amplitude halves with the scale. All arithmetic is
     in integers, so every machine composes the same bits.
 
-    Returns:
-        Pixels `(H, W, 3)`.
+    Shapes: → `(H, W, 3)`.
     """
     from PIL import Image
 
@@ -222,7 +206,7 @@ def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
         grid = generator.integers(256, size=(3 << octave, 4 << octave), dtype=np.uint8)
         smooth = Image.fromarray(grid).resize(_SIZE, Image.Resampling.BICUBIC)
         clouds += (np.asarray(smooth, dtype=np.int64) - 128) << (5 - octave)
-    texture = _texture(TEXTURES[generator.integers(len(TEXTURES))])
+    texture = _texture(_TEXTURES[generator.integers(len(_TEXTURES))])
     tint = generator.integers(110, 180) + generator.integers(-20, 21, size=3)
     levels = tint + (clouds // 150 + texture // 8)[..., None]
     return levels.clip(0, 255).astype(np.uint8)

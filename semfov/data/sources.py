@@ -19,18 +19,12 @@ from semfov.io.files import check_regular
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture from a source.
-
-    Attributes:
-        name: its name in messages and file names.
-        image: `(3, H, W)`, RGB in [0, 1], or bytes, as streams give them.
-        boxes: ground-truth boxes of the target, `(M, 4)`; None where they are not known.
-    """
+    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`."""
 
     name: str
     image: Tensor
@@ -38,18 +32,8 @@ class Picture:
 
 
 def picture_files(source: Path) -> list[Path]:
-    """List a photograph, or the photographs of a folder in the order of their names.
-
-    Args:
-        source: a file or a folder.
-
-    Returns:
-        The files.
-
-    Raises:
-        DataError: the file is missing, or the folder has no photographs.
-    """
-    check_there(source)
+    """List a photograph, or the photographs of a folder in the order of their names."""
+    _check_there(source)
     if not source.is_dir():
         return [source]
     files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
@@ -59,7 +43,7 @@ def picture_files(source: Path) -> list[Path]:
     return files
 
 
-def check_there(source: Path) -> None:
+def _check_there(source: Path) -> None:
     """Raise `DataError` where a file or folder does not exist."""
     if not source.exists():
         raise DataError(f"picture: no such file or folder: {source}; check the path")
@@ -67,24 +51,11 @@ def check_there(source: Path) -> None:
 
 def is_video(source: Path) -> bool:
     """Tell by its name whether a file is a video."""
-    return source.suffix.lower() in VIDEOS and not source.is_dir()
+    return source.suffix.lower() in _VIDEOS and not source.is_dir()
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
-    """Compose the first embedded scene that holds a target.
-
-    Args:
-        classes: names of the detector's classes.
-        target: name of the target; None for the first scene.
-        seed: seed of the scenes.
-        scenes: number of scenes to search.
-
-    Returns:
-        The scene, with the boxes of the target.
-
-    Raises:
-        InputError: no scene holds the target.
-    """
+    """Compose the first embedded scene that holds a target."""
     embedded = EmbeddedScenes(classes, count=scenes, seed=seed)
     for index in range(len(embedded)):
         names = [embedded.classes[label - 1] for label in embedded.targets(index)]
@@ -101,13 +72,7 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
 
 @dataclass(frozen=True)
 class Stream:
-    """A video or a camera.
-
-    Attributes:
-        name: its name in messages.
-        rate: frames per second; None where it is not known.
-        frames: the frames, in order.
-    """
+    """A video or a camera."""
 
     name: str
     rate: float | None
@@ -115,19 +80,7 @@ class Stream:
 
 
 def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
-    """Open a video by its file, a camera by its number, or a stream by its address.
-
-    Args:
-        source: file of the video, number of the camera, or an address such as `rtsp://user:password@camera/stream1`.
-        most: largest number of frames; None for all.
-
-    Returns:
-        The stream. Its name has no password.
-
-    Raises:
-        InputError: no stream has such an address.
-        DataError: the source cannot be opened or has no frame, or OpenCV is not installed.
-    """
+    """Open a video by its file, a camera by its number, or a stream by its address."""
     address = isinstance(source, str) and "://" in source
     if not address and not isinstance(source, int):
         source = Path(source)
@@ -139,7 +92,7 @@ def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
             f"{name}: expected OpenCV for videos, cameras and streams; pip install opencv-python-headless"
         ) from None
     if isinstance(source, Path):
-        check_there(source)
+        _check_there(source)
         check_regular(source)
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised below

@@ -126,12 +126,6 @@ class WordVectors:
 def words_of(name: str) -> list[str]:
     """Split a name or a description into words, and leave out common words such as `the` and `something`.
 
-    Args:
-        name: a name or a description.
-
-    Returns:
-        The words in lower case; all of them where all are common words.
-
     >>> words_of("Wine_Glass"), words_of("something to drink from")
     (['wine', 'glass'], ['drink'])
     """

@@ -32,14 +32,7 @@ LookAt = Callable[[Tensor], Detections]
 
 @dataclass(frozen=True)
 class CandidatePlace:
-    """A place that seems to hold the target.
-
-    Attributes:
-        box: `(4,)`, box of the detection with the strongest evidence there.
-        evidence: that evidence: in a cell that of `strongest`; in a large picture the score of the detection.
-        probability: probability that the target is there.
-        cell: the cell; None in a large picture.
-    """
+    """A place that seems to hold the target; box `(4,)`."""
 
     box: Tensor
     evidence: float
@@ -48,11 +41,7 @@ class CandidatePlace:
 
 
 class CandidatePlaces(ABC, Generic[LookType]):
-    """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
-
-    Args:
-        forgetting: forgetting between frames; None forgets nothing.
-    """
+    """Base of the places that seem to hold the target of one search, the most evident first, each listed once."""
 
     def __init__(self, forgetting: Forgetting | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
@@ -83,48 +72,18 @@ class CandidatePlaces(ABC, Generic[LookType]):
 
     @abstractmethod
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """Find the place that is to be looked at closely now.
-
-        Args:
-            least: least probability of a place.
-            last: whether no other look follows.
-
-        Returns:
-            The most evident place that was not examined; None if it is not yet to be examined, or there is none.
-        """
+        """Find the place that is to be looked at closely now."""
 
     @abstractmethod
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Do not list a candidate again, nor others at its place.
-
-        Args:
-            candidate: the candidate.
-            box: `(4,)`, the box of the target in the closer look.
-        """
+        """Do not list a candidate again, nor others at its place; box `(4,)`."""
 
     @abstractmethod
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Make the record of the last closer look.
-
-        Args:
-            box: `(4,)`, the box of the target in it.
-            place: probability that the target is there.
-            presence: probability that the picture holds the target.
-
-        Returns:
-            The record.
-        """
+        """Make the record of the last closer look; box `(4,)`."""
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
-        """Look closely at a candidate, and dismiss it.
-
-        Args:
-            candidate: the candidate.
-            close_up: looks closely at a box.
-
-        Returns:
-            The features of the closer look `(7,)`, and the box of the target in it `(4,)` (`closer_features`).
-        """
+        """Look closely at a candidate, and dismiss it; → `(7,)`."""
         features, box = closer_features(
             self.presence,
             candidate.probability,
@@ -166,11 +125,6 @@ class CandidateCells(CandidatePlaces[Step]):
 
     In a scene that changes, evidence of earlier frames counts less, and places that were examined are listed again when
     half of the evidence is left (`semfov.episode.Forgetting`).
-
-    Args:
-        grid: the cells.
-        target: class 1..K that is searched for.
-        forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
     def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:

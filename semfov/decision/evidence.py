@@ -18,17 +18,7 @@ def strength(detections: Detections, grid: Grid, target: int) -> Tensor:
 
 
 def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
-    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint.
-
-    Args:
-        looks: the detections of each look, batches of one.
-        grid: the cells.
-        cell: the cell.
-        target: class 1..K.
-
-    Returns:
-        The evidence, and the box `(4,)` as `(x1, y1, x2, y2)`; 0 and None if no detection overlaps the cell.
-    """
+    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint; → `(4,)`."""
     evidence, box = 0.0, None
     for look in looks:
         weight = grid.footprint(look.boxes, "soft")[0, :, cell] * look.mask[0]
@@ -48,16 +38,7 @@ def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, scor
 def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
     """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
 
-    Args:
-        boxes: `(M, 4)`, as `(x1, y1, x2, y2)` in pixels of the image.
-        grid: the cells.
-        like: a tensor that gives dtype and device.
-
-    Returns:
-        `(X·Y,)` boolean.
-
-    Raises:
-        InputError: the shape is wrong, a number is not finite, or a box has no area.
+    Shapes: boxes `(M, 4)` → `(X·Y,)`.
     """
     tensor = torch.as_tensor(boxes).to(like)
     check_shape(tensor, "boxes", None, 4)

@@ -28,19 +28,7 @@ NEARLY = 0.9
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision of a search.
-
-    Attributes:
-        outcome: `found`; `absent`, if no cell is left that is worth a look and the image holds the target with a
-            probability below one half; or `undecided`, if that probability is larger but not large enough, or if the
-            search ran out of gaze shifts.
-        probability: probability that the image holds the target, after the last look.
-        cell: for `found`, the cell of the target (`conclude`).
-        box: `(4,)`, the box `(x1, y1, x2, y2)` of the detection with the strongest evidence for the target in that
-            cell; None if there is none.
-        place: for `found` after a closer look, the probability that the target is at that place
-            (`semfov.decision.Verifier`); otherwise None.
-    """
+    """Decision of a search; box `(4,)`."""
 
     outcome: Outcome
     probability: float
@@ -51,17 +39,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class CloseUp:
-    """A closer look at a place that seems to hold the target.
-
-    Attributes:
-        fixation: number of the fixation after which it was made; None in a large picture.
-        target: the class that was looked for, 1..K; in a search for several classes the most probable one at that time.
-        cell: the cell of the target, if it is there; None in a large picture.
-        box: `(4,)`, the box of the target as `(x1, y1, x2, y2)` in pixels, if it is there.
-        place: probability that the target is there.
-        presence: probability that the image holds the target, after the closer look.
-        number: in a large picture, number of the look in the path (the overview is 0); otherwise None.
-    """
+    """A closer look at a place that seems to hold the target; box `(4,)`."""
 
     fixation: int | None
     target: int
@@ -80,13 +58,7 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
     then absent, unless the image holds it with a probability of at least one half.
 
-    Args:
-        step: a step of searches, from `semfov.episode.rollout`.
-        target: class 1..K, or `(A,)` with one class for each search.
-        thresholds: the thresholds.
-
-    Returns:
-        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+    Shapes: target `(A,)` → `(A,)`.
     """
     looked = place_known(step.belief.probability(target), step.visited, thresholds.place)
     left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
@@ -96,18 +68,11 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
 def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Thresholds) -> Tensor:
     """Apply the thresholds of `decide` to the probabilities of searches.
 
-    Args:
-        presence: `(A,)`, probability that the image holds the target.
-        looked: `(A,)` boolean, whether the most probable place of the target was looked at.
-        left: `(A,)`, value of the best look that is left.
-        thresholds: the thresholds.
-
-    Returns:
-        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
-
     >>> settle(torch.tensor([0.95, 0.95, 0.2]), torch.tensor([True, False, False]), torch.tensor([0.1, 0.1, 0.01]),
     ...        Thresholds(confirm=0.9, give_up=0.05)).tolist()
     [1, 0, 2]
+
+    Shapes: presence `(A,)`, looked `(A,)`, left `(A,)` → `(A,)`.
     """
     rest = torch.where(left < thresholds.give_up, torch.where(presence < 0.5, 2, 3), 0)
     return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
@@ -118,16 +83,10 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
 
     All cells of a large object are about equally probable, and there is no need to fixate each of them.
 
-    Args:
-        cells: `(..., X·Y)`, probabilities of the target.
-        visited: `(..., X·Y)` boolean, cells that were fixated.
-        place: least probability of the fixated cell.
-
-    Returns:
-        `(...)` boolean.
-
     >>> place_known(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]), 0.8)
     tensor([True])
+
+    Shapes: cells `(..., X·Y)`, visited `(..., X·Y)`.
     """
     fixated = cells.masked_fill(~visited, 0).amax(-1)
     return (fixated >= NEARLY * cells.amax(-1)) & (fixated >= place)
@@ -176,15 +135,6 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
     It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
     enough; otherwise the target is absent if the picture holds it with a probability below one half.
 
-    Args:
-        places: for each closer look, the probability that the target is at its place.
-        presence: probability that the picture holds the target.
-        confirm: least probability of the place, for `found`.
-        over: whether no look follows.
-
-    Returns:
-        0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
-
     >>> verified([0.3, 0.96], 0.9, 0.9, over=False), verified([0.92], 0.9, 0.9, over=False)
     (1, 0)
     >>> [OUTCOMES[verified([place], presence, 0.9, over=True)] for place, presence in ((0.92, 0.9), (0.2, 0.3))]
@@ -205,18 +155,7 @@ def outcome_of(
     thresholds: Thresholds | None,
     confirm: float,
 ) -> Callable[[Step], Tensor]:
-    """Make the function that decides which searches end with a step.
-
-    Args:
-        weights: for each class 1..K of the target, the probability that it is meant; the belief is about all of them.
-        grid: the cells.
-        goal: `(X·Y,)` boolean, cells on which a search ends; None ends it by a decision.
-        thresholds: thresholds of the belief; None lets a detection in the fixated cell confirm the target.
-        confirm: least score of such a detection, times the probability that its class is meant.
-
-    Returns:
-        A function from a step to `(A,)`, 0 for a search that continues, otherwise its outcome in `OUTCOMES`.
-    """
+    """Make the function that decides which searches end with a step; goal `(X·Y,)` → `(A,)`."""
     first = next(iter(weights))
 
     def outcome(step: Step) -> Tensor:
@@ -235,15 +174,7 @@ def outcome_of(
 
 
 def outcome_by_gain(gain: AcquisitionFunction, worth: float) -> Callable[[Step], Tensor]:
-    """Make the function that decides which explorations end with a step.
-
-    Args:
-        gain: expected gain of a look at each cell.
-        worth: least expected gain for which a look is worth it; 0 never ends an exploration.
-
-    Returns:
-        A function from a step to `(A,)`, 1 for an exploration in which no cell is worth a look, otherwise 0.
-    """
+    """Make the function that decides which explorations end with a step; → `(A,)`."""
 
     def outcome(step: Step) -> Tensor:
         best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)

@@ -25,13 +25,8 @@ _FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A closer look at a place, and the number of frames since then.
-
-    Attributes:
-        look: the closer look; its box and its cell follow the target (`follow_target`).
-        age: number of frames since then.
-    """
+class _Verdict:
+    """A closer look at a place, and the number of frames since then."""
 
     look: CloseUp
     age: int = 0
@@ -57,7 +52,7 @@ class Verifier(Generic[LookType]):
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
     place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
     place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
-    and the boxes of the verdicts follow the detections of each look (`follow_target`).
+    and the boxes of the verdicts follow the detections of each look.
 
     Args:
         model: gives the probabilities after closer looks.
@@ -96,7 +91,7 @@ class Verifier(Generic[LookType]):
         check_whole(most, "most", 1, 100)
         self.model, self.places, self.close_up = model, places, close_up
         self.thresholds, self.most = thresholds, most
-        self.verdicts: list[Verdict] = []
+        self.verdicts: list[_Verdict] = []
         self.candidate: CandidatePlace | None = None
         self._last = False
 
@@ -112,23 +107,14 @@ class Verifier(Generic[LookType]):
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def see(self, look: LookType, *, last: bool = False) -> None:
-        """Take in a look of the search, and choose the place that is to be looked at closely.
-
-        Args:
-            look: the look.
-            last: whether no other look can follow.
-        """
+        """Take in a look of the search, and choose the place that is to be looked at closely."""
         self.places.see(look)
         if self.places.forgetting.rate:
             self.verdicts = [self._followed(verdict) for verdict in self.verdicts]
         self._choose(last=last)
 
     def look(self) -> CloseUp:
-        """Look closely at the candidate, and choose the next one.
-
-        Returns:
-            The closer look.
-        """
+        """Look closely at the candidate, and choose the next one."""
         assert self.candidate is not None
         features, box = self.places.examine(self.candidate, self.close_up)
         with torch.no_grad():
@@ -136,19 +122,12 @@ class Verifier(Generic[LookType]):
         look = self.places.record(box, place, presence)
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [old for old in self.verdicts if self._recent(old) or not _same(old.look, look)]
-        self.verdicts.append(Verdict(look))
+        self.verdicts.append(_Verdict(look))
         self._choose(last=self._last)
         return look
 
     def look_closely(self, room: float = math.inf) -> list[CandidatePlace]:
-        """Make all closer looks that are due.
-
-        Args:
-            room: number of passes of the detector that are left.
-
-        Returns:
-            The places that were looked at, in order.
-        """
+        """Make all closer looks that are due."""
         examined: list[CandidatePlace] = []
         while self.candidate is not None and len(examined) < room:
             examined.append(self.candidate)
@@ -158,11 +137,7 @@ class Verifier(Generic[LookType]):
     def __call__(self: "Verifier[Step]", step: Step) -> Tensor:
         """Decide whether a search ends with a step, after the closer looks. Call it once for every step, in order.
 
-        Args:
-            step: a step of one search.
-
-        Returns:
-            `(1,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+        Shapes: → `(1,)`.
         """
         self.see(step)
         self.look_closely()
@@ -174,23 +149,13 @@ class Verifier(Generic[LookType]):
         return self.places.left < self.thresholds.give_up or self._spent
 
     def outcome(self) -> int:
-        """Decide whether the search ends.
-
-        Returns:
-            0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
-        """
+        """Decide whether the search ends."""
         return self._verified(self._chances, over=self.over)
 
     def conclude(self, room: float = math.inf) -> Decision:
         """Make the decision of a search that is over.
 
         If it did not end, all its looks are spent: what is left of closer looks is made now.
-
-        Args:
-            room: number of passes of the detector that are left for closer looks.
-
-        Returns:
-            The decision.
         """
         if not self.outcome():
             self._choose(last=True)
@@ -198,15 +163,7 @@ class Verifier(Generic[LookType]):
         return self.decision(over=True)
 
     def decision(self, *, over: bool | None = None) -> Decision:
-        """Make the decision as it stands after the last look.
-
-        Args:
-            over: whether the search is over; None: it is if no look is worth a pass, and no place is left to examine.
-
-        Returns:
-            `found` if the probability of a place is at least `confirm`; otherwise `absent` or `undecided` for a search
-            that is over, and `undecided` before that.
-        """
+        """Make the decision as it stands after the last look."""
         over = self.candidate is None and self.over if over is None else over
         chances, presence = self._chances, self.presence
         outcome = OUTCOMES[verified(chances, presence, self.thresholds.confirm, over=True)]
@@ -255,21 +212,21 @@ class Verifier(Generic[LookType]):
         """For each verdict, the probability that the target is still there."""
         return [self._chance(verdict) for verdict in self.verdicts]
 
-    def _chance(self, verdict: Verdict) -> float:
+    def _chance(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""
         look, keep = verdict.look, self.places.forgetting.keep
         if keep**verdict.age == 1:
             return look.place
         return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
 
-    def _followed(self, verdict: Verdict) -> Verdict:
+    def _followed(self, verdict: _Verdict) -> _Verdict:
         """The verdict at the place to which a look has followed its target."""
         look = verdict.look
         return replace(
-            verdict, look=self.places.move(look, follow_target(look.box, self.places.detections, look.target))
+            verdict, look=self.places.move(look, _follow_target(look.box, self.places.detections, look.target))
         )
 
-    def _recent(self, verdict: Verdict) -> bool:
+    def _recent(self, verdict: _Verdict) -> bool:
         """Whether at least half of the evidence of a closer look is left."""
         return verdict.age <= self.places.forgetting.span
 
@@ -282,23 +239,17 @@ class Verifier(Generic[LookType]):
         return float((weight * odds + (1 - weight) * present).sigmoid())
 
 
-def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
+def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
     """Move the box of a target to the middle of the detection that best shows it (`best_detection`).
 
     The box keeps its size, because a closer look measures it better than a look of the fovea.
-
-    Args:
-        box: `(4,)`, the box.
-        detections: detections of a look, a batch of one.
-        target: class 1..K.
-
-    Returns:
-        The box `(4,)`, unmoved if no detection overlaps it by `MATCHED`.
 
     >>> box, scores = torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]])
     >>> detections = Detections(box, scores, torch.ones(1, 1).bool())
     >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
     tensor([ 3.,  0., 11.,  8.])
+
+    Shapes: box `(4,)` → `(4,)`.
     """
     real = detections.mask[0]
     boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]

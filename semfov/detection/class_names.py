@@ -22,23 +22,17 @@ toaster, sink, refrigerator, book, clock, vase, scissors, teddy bear, hair drier
 COCO_CLASSES: tuple[str, ...] = tuple(name.strip() for name in _NAMES.split(","))
 
 
-PLACEHOLDERS = ("", "N/A", "__background__")
+_PLACEHOLDERS = ("", "N/A", "__background__")
 """Names of outputs that do not stand for a class: gaps in COCO's category ids, and background."""
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Find the names that stand for a class.
 
-    Args:
-        classes: name of each output of a detector.
-
-    Returns:
-        The names that stand for a class, and their positions in `classes`.
-
     >>> named_outputs(["__background__", "cat", "N/A", "dog"])
     (('cat', 'dog'), (1, 3))
     """
-    places = tuple(index for index, name in enumerate(classes) if name not in PLACEHOLDERS)
+    places = tuple(index for index, name in enumerate(classes) if name not in _PLACEHOLDERS)
     names = tuple(classes[index] for index in places)
     check(len(set(names)) == len(names) > 0, "classes", "at least one name, all different", names)
     return names, places

@@ -15,27 +15,18 @@ def merge_crops(
 ) -> Detections:
     """Merge the detections in the crops of each fixation.
 
-    A crop shows its inside more sharply than every wider crop. So a box that lies in a finer crop, without being cut
-    by its border, is left out of the wider ones, whether the finer crop has a box there or not. Of the others, two
-    boxes of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole
-    box is kept rather than a cut one, and otherwise the one in the finer crop.
-
-    Args:
-        detections: detections in the crops, a batch of F·L, boxes in pixels of the picture.
-        windows: `(F·L, 4)`, the squares that the crops show, in pixels of the picture; finest first.
-        crops: number of crops of a fixation, L.
-        side: side of a crop in the detector's pixels.
-        size: `(width, height)` of the picture, whose border cuts no object.
-        limit: largest number of boxes of a fixation.
-
-    Returns:
-        A batch of F, boxes cut to the picture.
+    A crop shows its inside more sharply than every wider crop. So a box that lies in a finer crop, without being cut by
+    its border, is left out of the wider ones, whether the finer crop has a box there or not. Of the others, two boxes
+    of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole box is
+    kept rather than a cut one, and otherwise the one in the finer crop.
 
     >>> boxes = torch.tensor([[[6.0, 6, 14, 14]], [[6.0, 6, 14, 15]]])
     >>> detections = Detections(boxes, torch.tensor([[[0.2, 0.8]], [[0.1, 0.9]]]), torch.ones(2, 1, dtype=torch.bool))
     >>> windows = torch.tensor([[2.0, 2, 18, 18], [-6, -6, 26, 26]])
     >>> merge_crops(detections, windows, 2, 16, (40, 40), 100).boxes
     tensor([[[ 6.,  6., 14., 14.]]])
+
+    Shapes: windows `(F·L, 4)`, size `(width, height)`.
     """
     merged = []
     for first in range(0, len(detections.mask), crops):

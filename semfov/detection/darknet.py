@@ -19,7 +19,7 @@ from semfov.errors import DataError, check, check_shape
 from semfov.io.files import check_regular
 from semfov.io.schema import excerpt
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "linear": lambda x: x,
     "leaky": lambda x: F.leaky_relu(x, 0.1, inplace=True),
     "relu": lambda x: F.relu(x, inplace=True),
@@ -32,10 +32,6 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 class Convolution(nn.Conv2d):
     """Convolution and activation; batch norm is folded into the weight and the bias.
-
-    Attributes:
-        normalised: whether the weights file holds batch-norm statistics for this layer.
-        activation: name of the activation in `ACTIVATIONS`.
 
     Shape:
         - input: `(B, in_channels, H, W)`
@@ -59,7 +55,7 @@ class Convolution(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:
         """Convolve and activate."""
-        return ACTIVATIONS[self.activation](super().forward(input))
+        return _ACTIVATIONS[self.activation](super().forward(input))
 
 
 class MaxPool(nn.Module):
@@ -121,17 +117,11 @@ class Shortcut(nn.Module):
 
     def forward(self, image: Tensor, earlier: Tensor) -> Tensor:
         """Add two maps `(B, C, H, W)`."""
-        return ACTIVATIONS[self.activation](image + earlier)
+        return _ACTIVATIONS[self.activation](image + earlier)
 
 
 class Head(nn.Module):
-    """A yolo layer: it returns its map unchanged, and holds the settings for decoding it.
-
-    Attributes:
-        anchors: `(width, height)` of the anchors in canvas pixels.
-        classes: number of classes.
-        scale: Darknet's `scale_x_y`; with more than 1, centres of boxes may lie outside their cell.
-    """
+    """A yolo layer: it returns its map unchanged, and holds the settings for decoding it; anchors `(width, height)`."""
 
     def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
         super().__init__()
@@ -171,12 +161,10 @@ class Shape:
     step: Fraction
 
 
-class Builder:
+class _Builder:
     """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads.
 
-    Args:
-        channels: number of channels of the image.
-        size: `(width, height)` of the image.
+    Shapes: size `(width, height)`.
     """
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
@@ -326,8 +314,8 @@ def _check_kernel(section: Section, size: int, stride: int, padding: int) -> Non
 
 def _activation(section: Section, default: str) -> str:
     name = section.text("activation", default)
-    if name not in ACTIVATIONS:
-        raise DataError(f"{section.where}: activation {name!r} is not supported; known: {', '.join(ACTIVATIONS)}")
+    if name not in _ACTIVATIONS:
+        raise DataError(f"{section.where}: activation {name!r} is not supported; known: {', '.join(_ACTIVATIONS)}")
     return name
 
 
@@ -336,17 +324,6 @@ class Darknet(nn.Module):
 
     Supported layers are convolutional, maxpool, upsample, route, shortcut, yolo, and dropout, which does nothing.
 
-    Args:
-        sections: sections of the cfg, `[net]` first.
-
-    Attributes:
-        input_size: `(width, height)` of the input in the cfg.
-        stride: both sides of an input must be multiples of this number.
-        heads: the yolo layers, in order.
-        sections: sections of the cfg.
-        sources: for each layer, the layers that it reads; -1 is the image.
-        steps: for each layer, the number of image pixels along one pixel of its output.
-
     Shape:
         - input: `(B, C, H, W)`
         - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
@@ -354,6 +331,8 @@ class Darknet(nn.Module):
     >>> from semfov.detection.darknet_config import yolov3_tiny
     >>> [tuple(m.shape) for m in Darknet(yolov3_tiny())(torch.zeros(1, 3, 64, 96))]
     [(1, 255, 2, 3), (1, 255, 4, 6)]
+
+    Shapes: input_size `(width, height)`.
     """
 
     def __init__(self, sections: Sequence[Section]) -> None:
@@ -365,7 +344,7 @@ class Darknet(nn.Module):
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
         self.channels = sections[0].integer("channels", 3)
         check_canvas(sections[0].where, self.input_size)
-        builder = Builder(self.channels, self.input_size)
+        builder = _Builder(self.channels, self.input_size)
         self.layers = nn.ModuleList([builder.add(section) for section in sections[1:]])
         self.heads = [layer for layer in self.layers if isinstance(layer, Head)]
         if not self.heads:
@@ -420,7 +399,7 @@ class Darknet(nn.Module):
         return outputs
 
 
-EPSILON = 1e-5
+_EPSILON = 1e-5
 """Constant ε that batch norm adds to the variance."""
 
 
@@ -433,16 +412,6 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in float64:
 
         weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
-
-    Args:
-        network: the network; its parameters are overwritten.
-        path: the weights file.
-
-    Returns:
-        sha256 of the file.
-
-    Raises:
-        DataError: the file cannot be read, or its length or its numbers do not fit the network.
     """
     layers = [layer for layer in network.layers if isinstance(layer, Convolution)]
     check_regular(path, f"weights {str(path)!r}")
@@ -494,7 +463,7 @@ def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
             raise DataError(
                 f"weights {path!r}: expected variances of at least 0, got negative ones; the file does not fit the cfg"
             )
-        factor = scale / (variance + EPSILON).sqrt()
+        factor = scale / (variance + _EPSILON).sqrt()
         weight, bias = weight * factor[:, None, None, None], bias - mean * factor
     layer.weight.copy_(weight)
     cast(Tensor, layer.bias).copy_(bias)

@@ -17,11 +17,6 @@ _MOST_BYTES = 2**20
 class Section:
     """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first.
 
-    Attributes:
-        kind: the name in brackets.
-        options: keys and values as written.
-        where: file and line, for error messages.
-
     >>> Section("yolo", {"mask": "1,2,3"}).integers("mask")
     (1, 2, 3)
     """
@@ -70,7 +65,7 @@ class Section:
         )
 
 
-def parse_cfg(text: str, source: str = "cfg") -> list[Section]:
+def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
     r"""Parse the text of a cfg.
 
     Lines are `[kind]`, `key=value`, comments (`#` or `;`) or blank. Where a key is repeated in a section, the first
@@ -114,7 +109,7 @@ def read_cfg(path: str | PathLike[str]) -> list[Section]:
         if Path(path).stat().st_size > _MOST_BYTES:
             size = Path(path).stat().st_size
             raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes, got {size:,}")
-        return parse_cfg(Path(path).read_text(encoding="utf-8"), str(path))
+        return _parse_cfg(Path(path).read_text(encoding="utf-8"), str(path))
     except OSError as error:
         raise DataError(f"cannot read the cfg {str(path)!r}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -122,7 +117,7 @@ def read_cfg(path: str | PathLike[str]) -> list[Section]:
 
 
 ANCHORS = "10,13, 16,30, 33,23, 30,61, 62,45, 59,119, 116,90, 156,198, 373,326"
-TINY_ANCHORS = "10,14, 23,27, 37,58, 81,82, 135,169, 344,319"
+_TINY_ANCHORS = "10,14, 23,27, 37,58, 81,82, 135,169, 344,319"
 
 
 def yolov3(classes: int = 80) -> list[Section]:
@@ -130,7 +125,7 @@ def yolov3(classes: int = 80) -> list[Section]:
     return _yolov3(416, classes, [])
 
 
-def yolov3_spp(classes: int = 80) -> list[Section]:
+def _yolov3_spp(classes: int = 80) -> list[Section]:
     """YOLOv3-spp: YOLOv3 with parallel max pools of sizes 5, 9 and 13 before the first head, at 608 x 608."""
     pyramid = [
         _pool(5, 1),
@@ -144,16 +139,10 @@ def yolov3_spp(classes: int = 80) -> list[Section]:
     return _yolov3(608, classes, pyramid)
 
 
-def yolov3_tiny(classes: int = 80) -> list[Section]:
+def _yolov3_tiny(classes: int = 80) -> list[Section]:
     """YOLOv3-tiny: seven convolutions with max pools in between, heads at strides 32 and 16, at 416 x 416.
 
     The second head has the anchors 1, 2, 3. Some cfgs have 0, 1, 2, but the published weights fit 1, 2, 3.
-
-    Args:
-        classes: number of classes.
-
-    Returns:
-        The sections of the cfg.
     """
     backbone = []
     for filters in (16, 32, 64, 128, 256):
@@ -164,16 +153,16 @@ def yolov3_tiny(classes: int = 80) -> list[Section]:
         _convolution(1024, 3),
         _convolution(256, 1),
         _convolution(512, 3),
-        *_head("3,4,5", TINY_ANCHORS, classes),
+        *_head("3,4,5", _TINY_ANCHORS, classes),
     ]
     fine = [_route(-4), _convolution(128, 1), _upsample(), _route(-1, 8), _convolution(256, 3)]
-    return [_net(416), *backbone, *coarse, *fine, *_head("1,2,3", TINY_ANCHORS, classes)]
+    return [_net(416), *backbone, *coarse, *fine, *_head("1,2,3", _TINY_ANCHORS, classes)]
 
 
 ARCHITECTURES: dict[str, Callable[..., list[Section]]] = {
     "yolov3": yolov3,
-    "yolov3-tiny": yolov3_tiny,
-    "yolov3-spp": yolov3_spp,
+    "yolov3-tiny": _yolov3_tiny,
+    "yolov3-spp": _yolov3_spp,
 }
 
 

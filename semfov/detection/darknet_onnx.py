@@ -24,14 +24,14 @@ Runtime = Literal["auto", "torch", "onnxruntime"]
 
 RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
-VERSION = 1
+_VERSION = 1
 """Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
 
 _OPSET = 17
 _IR_VERSION = 8
 """IR version from the time of opset 17; some runtimes that could run the model refuse newer versions."""
 
-OUTPUTS = ("boxes", "objectness", "classes")
+_OUTPUTS = ("boxes", "objectness", "classes")
 
 
 class Graph:
@@ -171,7 +171,7 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
             graph.nodes,
             name,
             [helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])],
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in OUTPUTS],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in _OUTPUTS],
             list(graph.constants.values()),
         ),
         producer_name="semfov",
@@ -181,7 +181,7 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
 
 
 def _build(network: Darknet) -> _NetworkGraph:
-    """The whole graph, from `images` to `OUTPUTS`."""
+    """The whole graph, from `images` to `_OUTPUTS`."""
     graph = _NetworkGraph()
     names = {-1: "images"}
     heads = []
@@ -189,7 +189,7 @@ def _build(network: Darknet) -> _NetworkGraph:
         names[index] = graph.layer(layer, *(names[source] for source in network.sources[index]))
         if isinstance(layer, Head):
             heads.append(graph.decode(layer, names[index], float(network.steps[index])))
-    for name, outputs in zip(OUTPUTS, zip(*heads, strict=True), strict=True):
+    for name, outputs in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
         graph.add("Concat", *outputs, axis=1)
         graph.name_last(name)
     return graph
@@ -200,9 +200,6 @@ class OnnxTwin:
 
     The ONNX model is made when it is first needed (`exported`). A session has as many threads as torch has at that
     time. Every process opens its own session, because the threads of a pool do not survive a fork.
-
-    Args:
-        digest: `network_digest` of the network with its weights.
     """
 
     def __init__(self, digest: str) -> None:
@@ -274,7 +271,7 @@ def network_digest(network: Darknet) -> str:
 
 def exported(network: Darknet, folder: Path) -> Path:
     """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
-    source = json.dumps([network_digest(network), VERSION, torch.__version__])
+    source = json.dumps([network_digest(network), _VERSION, torch.__version__])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
     whole = _whole(folder.glob(f"{key}.*.onnx"))
     if whole is not None:

@@ -63,16 +63,6 @@ def category_ids(
 ) -> list[int]:
     """Find the category id of each class.
 
-    Args:
-        categories: the ids, which are returned as they are, or the `categories` of an annotation file.
-        classes: names of the classes, without background; needed for the `categories` of a file.
-
-    Returns:
-        The category id of each class.
-
-    Raises:
-        InputError: names are missing, or a class has no category.
-
     >>> category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "tvmonitor"])
     [1, 72]
     """

@@ -24,16 +24,6 @@ def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool =
     The model takes `images` `(B, 3, H, W)`, RGB in [0, 1]. It returns all boxes of all heads, before any selection:
     `boxes` `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`. Class
     names, input size and padding are in its metadata.
-
-    Args:
-        detector: a YOLOv3 detector.
-        path: path of the ONNX file.
-        static: fix the input to one image of the detector's `input_size`, for runtimes that need fixed sizes. Otherwise
-            the model takes any batch, and any size that is a multiple of the network's stride.
-
-    Raises:
-        InputError: the detector is not a Darknet network.
-        DataError: the file cannot be written.
     """
     if not isinstance(detector, YoloV3):
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
@@ -53,7 +43,7 @@ def _settings(detector: YoloV3, static: bool) -> dict[str, object]:
     } | ({} if static else {"stride": detector.stride})
 
 
-def largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
+def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
     """Largest absolute difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
     from semfov.detection.onnx import load_onnx
 
@@ -92,7 +82,7 @@ def main() -> None:
             runtime="torch",
         )
         export_onnx(detector, arguments.output, static=arguments.static)
-        difference = largest_difference(detector, arguments.output)
+        difference = _largest_difference(detector, arguments.output)
     except SemfovError as error:
         parser.exit(1, f"error: {error}\n")
     print(f"{arguments.output}: largest difference from the torch network {difference:.1e}")

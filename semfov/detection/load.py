@@ -142,16 +142,6 @@ def loader_options() -> list[str]:
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
     """Check without loading it that a detector exists.
 
-    Args:
-        name_or_path: name of the detector, or path of its file.
-
-    Returns:
-        Names of its classes, or None where they are known only after loading.
-
-    Raises:
-        InputError: no detector has this name.
-        DataError: the file does not exist.
-
     >>> check_detector("YOLOX-Nano")[:2]
     ('person', 'bicycle')
     """
@@ -165,15 +155,6 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
 
 def detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is.
-
-    Args:
-        name_or_path: name of the detector in any case, or path of its file.
-
-    Returns:
-        The name or the path.
-
-    Raises:
-        InputError: no detector has this name, or its file is not one that can be read.
 
     >>> detector_name("YOLOv3-tiny"), detector_name("Mine.onnx")
     ('yolov3-tiny', 'Mine.onnx')
@@ -211,28 +192,7 @@ def load_yolo(
 ) -> YoloV3:
     """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights.
 
-    Args:
-        name_or_cfg: name of the network, or path of a cfg.
-        weights: path of a Darknet weights file; None for the published weights of `name_or_cfg`.
-        classes: names of the classes, or path of a text file with a name on each line; None for the 80 of COCO.
-        input_size: size of the canvas in pixels, one side or `(width, height)`; None for the size in the cfg.
-        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        runtime: the runtime of the network: `"torch"`; `"onnxruntime"`, on a CPU and without gradients; or `"auto"`,
-            which uses onnxruntime where it can, because it is faster there, and torch elsewhere
-            (`semfov.detection.yolo.YoloV3`).
-        device: device of the network.
-        dtype: dtype of the network's parameters.
-
-    Returns:
-        The detector, in `eval` mode.
-
-    Raises:
-        InputError: the name or an option is unknown, or the weights of a cfg are not given.
+    Shapes: input_size `(width, height)`.
     """
     if name_or_cfg.endswith(".cfg"):
         if weights is None:

@@ -19,12 +19,7 @@ from semfov.errors import InputError, check_shape
 class ModuleDetector(Detector):
     """Base of detectors whose network is a torch module of another library; they are differentiable.
 
-    Args:
-        model: the network.
-        classes: name of each of its scores; names that do not stand for a class are left out (`PLACEHOLDERS`).
-        name: name of the model in tables and in fitted models.
-        input_size: `(width, height)` of the canvas in pixels.
-        options: further arguments of `Detector`.
+    Shapes: input_size `(width, height)`.
     """
 
     def __init__(
@@ -66,12 +61,6 @@ def resized_images(
 def module_digest(module: nn.Module) -> str:
     """Compute the sha256 of the names and values of a module's parameters and buffers.
 
-    Args:
-        module: the module.
-
-    Returns:
-        64 hexadecimal digits.
-
     >>> layer = nn.Linear(2, 1)
     >>> module_digest(layer) == module_digest(layer), module_digest(layer) == module_digest(nn.Linear(2, 1))
     (True, False)
@@ -86,13 +75,6 @@ def module_digest(module: nn.Module) -> str:
 
 def comes_from(module: object, package: str) -> bool:
     """Tell whether the class of an object, or a class that it inherits from, is defined in a package.
-
-    Args:
-        module: the object.
-        package: name of the package, which is not imported.
-
-    Returns:
-        Whether it is.
 
     >>> comes_from(nn.Linear(1, 1), "torch.nn"), comes_from(nn.Linear(1, 1), "torchvision")
     (True, False)

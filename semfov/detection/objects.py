@@ -12,8 +12,8 @@ from torch import Tensor
 
 from semfov.errors import InputError, check, check_number, check_shape
 
-Column = NDArray[np.float32]
-Index = NDArray[np.intp]
+_Column = NDArray[np.float32]
+_Index = NDArray[np.intp]
 
 LEAST = 0.3
 """Score from which on objects are shown, printed, drawn and counted, unless the detector or the user gives another."""
@@ -169,20 +169,7 @@ def merge_looks(
     of the same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
     sharply is kept, and of those the one with the higher score.
 
-    Args:
-        boxes: `(M, 4)`, in picture pixels.
-        scores: `(M,)`, scores.
-        labels: `(M,)`, classes.
-        looks: `(M,)`, number of the look of each box.
-        cut: `(M,)`, boolean, boxes that the border of their look cuts.
-        sharpness: `(M,)`, larger where the box was seen more sharply, in any unit.
-        score: boxes with a lower score are left out.
-        iou: intersection over union from which on two boxes are the same object.
-        inside: share of the area of a cut box from which on it is the same object.
-        around: width of a picture whose left and right borders meet; None for others.
-
-    Returns:
-        Objects, most confident first.
+    Shapes: boxes `(M, 4)`, scores `(M,)`, labels `(M,)`, looks `(M,)`, cut `(M,)`, sharpness `(M,)`.
     """
     enough = (scores >= score).nonzero()[:, 0]
     columns = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
@@ -239,7 +226,7 @@ def _unlike(
     same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
     part = shared / np.maximum(area, 1e-6)[second]
     same |= (part >= np.float32(inside)) & broken[second] & (looks[first] != looks[second])
-    return torch.from_numpy(survivors(count, first[same], second[same]))
+    return torch.from_numpy(_survivors(count, first[same], second[same]))
 
 
 def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
@@ -253,18 +240,13 @@ def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
     return tensor
 
 
-def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[Index, Index]:
+def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[_Index, _Index]:
     """Pairs of intervals of which the second starts within the first.
-
-    Args:
-        start: `(N,)`, in ascending order.
-        end: `(N,)`, none before its start.
-
-    Returns:
-        Indices `(P,)` of the first interval of each pair, and of the second.
 
     >>> neighbours(np.array([0.0, 1.0, 5.0]), np.array([2.0, 3.0, 6.0]))
     (array([0]), array([1]))
+
+    Shapes: start `(N,)`, end `(N,)` → `(P,)`.
     """
     stop = start.searchsorted(end, side="right")
     count = stop - np.arange(1, len(start) + 1)
@@ -274,27 +256,21 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     return first, second
 
 
-def intersection(x1: Column, y1: Column, x2: Column, y2: Column, first: Index, second: Index) -> Column:
+def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Index, second: _Index) -> _Column:
     """Area `(P,)` that the boxes of each pair share, given edges `(N,)` of the boxes and indices `(P,)` of both."""
     wide = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
     high = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
-    shared: Column = np.maximum(wide, 0) * np.maximum(high, 0)
+    shared: _Column = np.maximum(wide, 0) * np.maximum(high, 0)
     return shared
 
 
-def survivors(count: int, better: Index, worse: Index) -> Index:
+def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
     """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
-
-    Args:
-        count: number of boxes, the best first.
-        better: `(P,)`, index of the better box of each pair.
-        worse: `(P,)`, index of the worse one, which is higher.
-
-    Returns:
-        Indices of the boxes that stay, in ascending order.
 
     >>> survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
     array([0, 2])
+
+    Shapes: better `(P,)`, worse `(P,)`.
     """
     doubtful, gone = np.zeros((2, count), np.bool_)
     doubtful[worse] = True

@@ -24,27 +24,12 @@ from semfov.io.compatibility import NETWORKS
 from semfov.io.files import sha256
 from semfov.io.schema import excerpt
 
-ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
+_ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
 
 class OnnxDetector(Detector):
-    """A model in onnxruntime as a `Detector`; gradients do not flow through it.
-
-    Args:
-        session: the model.
-        head: name of its head, a key of `semfov.detection.onnx_heads.HEADS`.
-        classes: name of each score, in order; `"N/A"` for scores that do not stand for a class.
-        name: name of the model in tables and in fitted models.
-        input_size: `(width, height)` of the canvas; None for the model's fixed size.
-        stride: for models that take any size: pad the canvas only to a multiple of this number of pixels; None pads it
-            to `input_size`.
-        preprocessing: preprocessing that the network expects; None for the preprocessing of its family.
-        logits: whether the model returns scores before the sigmoid.
-        background: background policy of the scores; None for the policy of the head.
-        selection: settings of the selection of boxes.
-        digest: sha256 of the model's file.
-    """
+    """A model in onnxruntime as a `Detector`; gradients do not flow through it; input_size `(width, height)`."""
 
     def __init__(
         self,
@@ -164,47 +149,19 @@ def load_onnx(
     device: torch.device | str = "cpu",
     providers: Sequence[Provider] | None = None,
 ) -> OnnxDetector:
-    """Load a detector from an ONNX file, or a published one by its name (`ONNX_MODELS`).
+    """Load a detector from an ONNX file, or a published one by its name.
 
     A setting that is None is read from `model.json` in the folder of `model.onnx`, else from the model's metadata. If
     neither has it, it follows from the model's family.
 
-    Args:
-        name_or_path: path of the model, or name of a published one.
-        weights: for a published model, the path of its file; None downloads it.
-        head: one of `candidates` (boxes, scores and objectness under these names, as `semfov.detection.export`
-            writes them), `detr`, `nanodet`, `nanodet-plus`, `picodet`, `rtdetr`, `yolov5`, `yolov8`, `yolox`. None
-            recognises the head by names and shapes of the outputs.
-        classes: name of each score in order, `"N/A"` for scores that do not stand for a class. None is enough for
-            models with 80 or 91 scores, which are taken as COCO's.
-        input_size: size of the canvas in pixels, one side or `(width, height)`, for models that take any size, and for
-            those of `ONNX_MODELS`.
-        stride: for models that take any size: pad the canvas only to a multiple of this number of pixels.
-        preprocessing: settings of `Preprocessing` that differ from those of the family.
-        logits: whether the model returns scores before the sigmoid.
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        threads: number of threads of onnxruntime; None for `torch.get_num_threads()`.
-        device: device of onnxruntime.
-        providers: execution providers of onnxruntime in order, each by its name or as `(name, options)`, instead of
-            those of `device`.
-
-    Returns:
-        The detector.
-
-    Raises:
-        InputError: the head is not recognised, or an option does not fit the model (the message lists the choices).
-        DataError: the model or its settings file is missing or damaged.
+    Shapes: input_size `(width, height)`, providers `(name, options)`.
     """
     name = fspath(name_or_path)
     file = _locate(name, weights)
     digest = sha256(file) if file.is_file() else ""
-    published_name = name if name in ONNX_MODELS else NETWORKS.get(digest)
+    published_name = name if name in _ONNX_MODELS else NETWORKS.get(digest)
     path = file
-    if published_name in ONNX_MODELS and input_size is not None:
+    if published_name in _ONNX_MODELS and input_size is not None:
         path = with_input_size(file, _sides(input_size), STRIDES)
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(file, session.metadata)
@@ -238,7 +195,7 @@ def load_onnx(
             f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
         ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
-    names = coco_names(scores) if names is None else names
+    names = _coco_names(scores) if names is None else names
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
         session,
@@ -290,7 +247,7 @@ def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
     return session(torch.zeros(1, 3, size[1], size[0]))
 
 
-def coco_names(count: int) -> Sequence[str]:
+def _coco_names(count: int) -> Sequence[str]:
     """Names of 80 scores (COCO's classes) or of 91 scores (COCO's category ids with their gaps)."""
     if count == 80:
         return COCO_CLASSES
@@ -303,8 +260,8 @@ def coco_names(count: int) -> Sequence[str]:
 
 def _locate(name: str, weights: str | PathLike[str] | None) -> Path:
     """The file of a model that is given by name or path."""
-    if name in ONNX_MODELS:
+    if name in _ONNX_MODELS:
         return Path(fetch(name) if weights is None else weights)
     if weights is not None or not name.endswith(".onnx"):
-        lookup(name, ONNX_MODELS, "ONNX model")
+        lookup(name, _ONNX_MODELS, "ONNX model")
     return Path(name)

@@ -14,20 +14,20 @@ from semfov.errors import DataError, check
 from semfov.io.files import check_regular, inside, sha256, write_bytes
 from semfov.io.schema import excerpt, is_number, is_plain
 
-MOST_ELEMENTS = 2**28
+_MOST_ELEMENTS = 2**28
 """Largest number of elements of a tensor in a model; 1 GiB as float32."""
-MOST_METADATA = 2**20
+_MOST_METADATA = 2**20
 """Largest number of characters of a model's metadata."""
 MOST_BATCH = 1024
 """Largest fixed batch size of a model."""
-MOST_PIXELS = 89_478_485
+_MOST_PIXELS = 89_478_485
 """Largest number of pixels of a canvas, the same as for pictures that are read."""
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
 
 METADATA_KEY = "semfov"
 """Key of the settings, as JSON, in the metadata of models that semfov exports."""
 
-KEYS: dict[str, tuple[type, ...]] = {
+_KEYS: dict[str, tuple[type, ...]] = {
     "name": (str,),
     "head": (str,),
     "classes": (list,),
@@ -57,8 +57,8 @@ def check_file(path: Path) -> None:
                 if entry.key == "location":
                     check_regular(inside(path.parent, entry.value))
         _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
-        if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > MOST_METADATA:
-            raise DataError(f"ONNX model {str(path)!r}: expected at most {MOST_METADATA:,} characters of metadata")
+        if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
+            raise DataError(f"ONNX model {str(path)!r}: expected at most {_MOST_METADATA:,} characters of metadata")
         inferred = onnx.shape_inference.infer_shapes(_without_weights(model), data_prop=True).graph
     except DataError:
         raise
@@ -70,16 +70,16 @@ def check_file(path: Path) -> None:
 
 
 def check_elements(name: str, sizes: Iterable[int]) -> None:
-    """Raise `DataError` for a tensor of more than `MOST_ELEMENTS` numbers."""
+    """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
     sizes = list(sizes)
-    if min(sizes, default=0) < 0 or math.prod(sizes) > MOST_ELEMENTS:
-        raise DataError(f"{name}: expected at most {MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
+    if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
+        raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
 
 
 def check_canvas(name: str, size: tuple[int, int]) -> None:
-    """Raise `DataError` for a canvas `(width, height)` of more than `MOST_PIXELS` pixels."""
-    if size[0] * size[1] > MOST_PIXELS:
-        raise DataError(f"{name}: expected a canvas of at most {MOST_PIXELS:,} pixels, got {size[0]} x {size[1]}")
+    """Raise `DataError` for a canvas `(width, height)` of more than `_MOST_PIXELS` pixels."""
+    if size[0] * size[1] > _MOST_PIXELS:
+        raise DataError(f"{name}: expected a canvas of at most {_MOST_PIXELS:,} pixels, got {size[0]} x {size[1]}")
 
 
 def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> None:
@@ -114,16 +114,6 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
     Settings in `model.json` in the folder of `model.onnx` override settings in the model's metadata. The metadata of
     models that semfov or Ultralytics (class names, input size) have exported are understood.
-
-    Args:
-        path: path of the model.
-        metadata: metadata of the model.
-
-    Returns:
-        The settings by name.
-
-    Raises:
-        DataError: the file is not a JSON object, or has a key that is not one of `KEYS`.
     """
     beside = path.with_suffix(".json")
     inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
@@ -134,8 +124,8 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _read(path: Path) -> str:
     check_regular(path)
-    if path.stat().st_size > MOST_METADATA:
-        raise DataError(f"{path}: expected at most {MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
+    if path.stat().st_size > _MOST_METADATA:
+        raise DataError(f"{path}: expected at most {_MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -151,12 +141,12 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         raise DataError(f"{where}: expected JSON, got numbers that are too long or lists that are too deep") from None
     if not isinstance(settings, dict):
         raise DataError(f"{where}: expected an object, got {excerpt(settings)}")
-    unknown = sorted(set(settings) - set(KEYS))
+    unknown = sorted(set(settings) - set(_KEYS))
     if unknown:
-        raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
+        raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(_KEYS)}")
     for key, value in settings.items():
-        if not isinstance(value, KEYS[key]):
-            kinds = " or ".join(kind.__name__ for kind in KEYS[key])
+        if not isinstance(value, _KEYS[key]):
+            kinds = " or ".join(kind.__name__ for kind in _KEYS[key])
             raise DataError(f"{where}: {key}: expected {kinds}, got {excerpt(value)}")
     names, size = settings.get("classes", []), settings.get("input_size", 1)
     if not all(isinstance(name, str) and is_plain(name) for name in names):
@@ -190,17 +180,7 @@ def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int])
     A fully convolutional network knows its input size in two places: the shape of its input, and the shapes that its
     `Reshape` nodes ask for, which end with the rows and columns of the feature maps. Both are replaced.
 
-    Args:
-        path: the model.
-        canvas: `(width, height)` of the new input, in pixels.
-        strides: pixels per cell of each level of feature maps.
-
-    Returns:
-        The path of the model with this size; `path` itself if it has this size already.
-
-    Raises:
-        InputError: a side is not a multiple of 32 pixels.
-        DataError: the model is damaged, or the new one cannot be written.
+    Shapes: canvas `(width, height)`.
     """
     import onnx
 

@@ -21,12 +21,12 @@ def cells(canvas: tuple[int, int], stride: int) -> tuple[int, int]:
     return -(-canvas[0] // stride), -(-canvas[1] // stride)
 
 
-def cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
+def _cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
     """Total number of cells of all levels."""
     return sum(columns * rows for columns, rows in (cells(canvas, stride) for stride in strides))
 
 
-def grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, like: Tensor) -> Tensor:
+def _grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, like: Tensor) -> Tensor:
     """Column plus `offset`, row plus `offset`, and stride of every cell, `(N, 3)`, level by level and row-major."""
     levels = []
     for stride in strides:
@@ -45,16 +45,10 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
 
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
 
-    Args:
-        raw: `(B, N, 5 + K)`: t_x, t_y, t_w, t_h, then objectness and class scores in [0, 1].
-        canvas: `(width, height)` of the network's input.
-        strides: canvas pixels per cell of each level.
-
-    Returns:
-        All boxes with their scores.
-
     >>> decode_yolox(torch.zeros(1, 1, 6), (32, 32), strides=(32,)).boxes
     tensor([[[-16., -16.,  16.,  16.]]])
+
+    Shapes: raw `(B, N, 5 + K)`, canvas `(width, height)`.
     """
     check_shape(raw, "raw", None, None, None)
     grid = _grid(raw, canvas, strides, 0.0)
@@ -66,14 +60,10 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
 def decode_yolov5(rows: Tensor) -> Candidates:
     """Decode YOLOv5-style rows, whose boxes the network itself has decoded.
 
-    Args:
-        rows: `(B, N, 5 + K)`: centre and size in canvas pixels, objectness, class scores.
-
-    Returns:
-        All boxes with their scores.
-
     >>> decode_yolov5(torch.tensor([[[8.0, 8.0, 4.0, 2.0, 0.5, 1.0]]])).boxes
     tensor([[[ 6.,  7., 10.,  9.]]])
+
+    Shapes: rows `(B, N, 5 + K)`.
     """
     check_shape(rows, "rows", None, None, None)
     return Candidates(_corners(rows[..., :4]), rows[..., 5:], rows[..., 4])
@@ -82,14 +72,10 @@ def decode_yolov5(rows: Tensor) -> Candidates:
 def decode_yolov8(columns: Tensor) -> Candidates:
     """Decode YOLOv8-style columns, whose boxes the network itself has decoded.
 
-    Args:
-        columns: `(B, 4 + K, N)`: centre and size in canvas pixels, class scores; there is no objectness.
-
-    Returns:
-        All boxes with their scores.
-
     >>> decode_yolov8(torch.tensor([[[8.0], [8.0], [4.0], [2.0], [1.0]]])).boxes
     tensor([[[ 6.,  7., 10.,  9.]]])
+
+    Shapes: columns `(B, 4 + K, N)`.
     """
     check_shape(columns, "columns", None, None, None)
     rows = columns.transpose(1, 2)
@@ -136,16 +122,10 @@ def decode_distances(
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
 
-    Args:
-        logits: `(B, Q, K + 1)`; the last one, "no object", is taken as background.
-        boxes: `(B, Q, 4)`, centre and size as fractions of the canvas.
-        canvas: `(width, height)` of the network's input.
-
-    Returns:
-        All boxes with their scores and the background probability.
-
     >>> decode_detr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).background
     tensor([[0.2500]])
+
+    Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
     """
     check_shape(logits, "logits", None, None, None)
     scores = logits.softmax(-1)
@@ -155,43 +135,32 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candi
 def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
 
-    Args:
-        logits: `(B, Q, K)`.
-        boxes: `(B, Q, 4)`, centre and size as fractions of the canvas.
-        canvas: `(width, height)` of the network's input.
-
-    Returns:
-        All boxes with their scores.
-
     >>> decode_rtdetr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
+
+    Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
     """
     check_shape(logits, "logits", None, None, None)
     return Candidates(_fractions(boxes, canvas), logits.sigmoid())
 
 
-def decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
+def _decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR that returns one tensor.
-
-    Args:
-        rows: `(B, Q, 4 + K)`: centre and size as fractions of the canvas, then class scores in [0, 1].
-        canvas: `(width, height)` of the network's input.
-
-    Returns:
-        All boxes with their scores.
 
     >>> decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
+
+    Shapes: rows `(B, Q, 4 + K)`, canvas `(width, height)`.
     """
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])
 
 
 def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offset: float) -> Tensor:
-    expected = cell_count(canvas, strides)
+    expected = _cell_count(canvas, strides)
     what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
     check(tensor.shape[1] == expected, "output of the head", what, tensor.shape[1])
-    return grid_points(canvas, strides, offset, tensor)
+    return _grid_points(canvas, strides, offset, tensor)
 
 
 def _corners(boxes: Tensor) -> Tensor:
@@ -205,7 +174,7 @@ def _fractions(boxes: Tensor, canvas: tuple[int, int]) -> Tensor:
 
 
 Outputs = Mapping[str, Tensor]
-Canvas = tuple[int, int]
+_Canvas = tuple[int, int]
 
 _LETTERBOX = Preprocessing()
 _IMAGENET = Preprocessing(mean=IMAGENET_MEAN, std=IMAGENET_STD, stretch=True)
@@ -214,22 +183,14 @@ _NANODET = Preprocessing(
 )
 
 STRIDES = (8, 16, 32, 64)
-DETR_LOGITS = ("logits", "pred_logits")
+_DETR_LOGITS = ("logits", "pred_logits")
 
 
 @dataclass(frozen=True)
-class DetectionHead:
-    """The head of a family of networks.
+class _DetectionHead:
+    """The head of a family of networks; decode `(width, height)`."""
 
-    Attributes:
-        decode: function from the outputs by name, in the model's order, and the canvas `(width, height)` to all boxes.
-        preprocessing: preprocessing with which the family is trained.
-        background: background policy for its scores.
-        faint: confidence from which on its candidates are hints (`semfov.detection.Detector`).
-        least: score from which on its detections count.
-    """
-
-    decode: Callable[[Outputs, Canvas], Candidates]
+    decode: Callable[[Outputs, _Canvas], Candidates]
     preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
     faint: float = FAINT
@@ -238,35 +199,17 @@ class DetectionHead:
 
 @dataclass(frozen=True)
 class Signature:
-    """Properties of a model that are known before it runs on an image.
-
-    Attributes:
-        image: name of the image input.
-        outputs: name and shape of each output for a batch of one canvas.
-        canvas: `(width, height)` of the canvas.
-        producer: name of the exporter, as stored in the file.
-        classes: number of classes; None where it is not known.
-    """
+    """Properties of a model that are known before it runs on an image; canvas `(width, height)`."""
 
     image: str
     outputs: tuple[tuple[str, tuple[int, ...]], ...]
-    canvas: Canvas
+    canvas: _Canvas
     producer: str = ""
     classes: int | None = None
 
 
 def recognise(signature: Signature) -> str:
     """Recognise the head of a model.
-
-    Args:
-        signature: properties of the model.
-
-    Returns:
-        The name of the head in `HEADS`.
-
-    Raises:
-        InputError: no head or several heads fit (the message lists the choices), or the model returns boxes without
-            their full scores.
 
     >>> recognise(Signature("images", (("output0", (1, 84, 8400)),), (640, 640)))
     'yolov8'
@@ -287,7 +230,7 @@ def recognise(signature: Signature) -> str:
 def _fitting(signature: Signature) -> Iterator[str]:
     shapes = dict(signature.outputs)
     names = list(shapes)
-    if "pred_boxes" in shapes and any(name in shapes for name in DETR_LOGITS):
+    if "pred_boxes" in shapes and any(name in shapes for name in _DETR_LOGITS):
         yield from _detr(shapes[_logits(shapes)][-1], signature.classes)
     elif {"labels", "boxes", "scores"} <= set(shapes):
         raise InputError(
@@ -328,7 +271,7 @@ def _distances(signature: Signature) -> Iterator[str]:
 def _single(signature: Signature, name: str, rows: int, columns: int) -> Iterator[str]:
     """Heads with everything in one tensor `(1, rows, columns)`."""
     canvas, classes = signature.canvas, signature.classes
-    three, four = (cell_count(canvas, STRIDES[:count]) for count in (3, 4))
+    three, four = (_cell_count(canvas, STRIDES[:count]) for count in (3, 4))
 
     def scores(channels: int, others: int) -> bool:
         return channels > others and classes in (None, channels - others)
@@ -355,7 +298,7 @@ def _single(signature: Signature, name: str, rows: int, columns: int) -> Iterato
 
 
 def _logits(outputs: Mapping[str, object]) -> str:
-    return next(name for name in DETR_LOGITS if name in outputs)
+    return next(name for name in _DETR_LOGITS if name in outputs)
 
 
 def _classes(outputs: Mapping[str, object]) -> str:
@@ -366,13 +309,13 @@ def _first(outputs: Outputs) -> Tensor:
     return next(iter(outputs.values()))
 
 
-def _candidates(outputs: Outputs, canvas: Canvas) -> Candidates:
+def _candidates(outputs: Outputs, canvas: _Canvas) -> Candidates:
     return Candidates(
         outputs["boxes"], outputs[_classes(outputs)], outputs.get("objectness"), outputs.get("background")
     )
 
 
-def _level_maps(outputs: Outputs, canvas: Canvas) -> Candidates:
+def _level_maps(outputs: Outputs, canvas: _Canvas) -> Candidates:
     """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
     maps = list(outputs.values())
@@ -387,36 +330,36 @@ def _level_maps(outputs: Outputs, canvas: Canvas) -> Candidates:
     return decode_distances(classes, distances, canvas, strides=strides)
 
 
-def _nanodet_plus(outputs: Outputs, canvas: Canvas) -> Candidates:
+def _nanodet_plus(outputs: Outputs, canvas: _Canvas) -> Candidates:
     """Decode NanoDet-Plus: class scores, then distances with 8 bins for each side."""
     rows = _first(outputs)
     return decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
 
 
-def _rtdetr(outputs: Outputs, canvas: Canvas) -> Candidates:
+def _rtdetr(outputs: Outputs, canvas: _Canvas) -> Candidates:
     if "pred_boxes" in outputs:
         return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
-    return decode_rtdetr_rows(_first(outputs), canvas)
+    return _decode_rtdetr_rows(_first(outputs), canvas)
 
 
-HEADS: dict[str, DetectionHead] = {
-    "candidates": DetectionHead(_candidates),
-    "yolox": DetectionHead(
+HEADS: dict[str, _DetectionHead] = {
+    "candidates": _DetectionHead(_candidates),
+    "yolox": _DetectionHead(
         lambda outputs, canvas: decode_yolox(_first(outputs), canvas),
         Preprocessing(channels="bgr", scale=255.0, corner=True),
     ),
-    "yolov5": DetectionHead(lambda outputs, canvas: decode_yolov5(_first(outputs))),
-    "yolov8": DetectionHead(lambda outputs, canvas: decode_yolov8(_first(outputs))),
-    "picodet": DetectionHead(_level_maps, _IMAGENET),
-    "nanodet": DetectionHead(_level_maps, _NANODET),
+    "yolov5": _DetectionHead(lambda outputs, canvas: decode_yolov5(_first(outputs))),
+    "yolov8": _DetectionHead(lambda outputs, canvas: decode_yolov8(_first(outputs))),
+    "picodet": _DetectionHead(_level_maps, _IMAGENET),
+    "nanodet": _DetectionHead(_level_maps, _NANODET),
     # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
     # some score, which would dilute that of the best one if only their shares counted.
-    "nanodet-plus": DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
-    "detr": DetectionHead(
+    "nanodet-plus": _DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
+    "detr": _DetectionHead(
         lambda outputs, canvas: decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
         "own",
     ),
-    "rtdetr": DetectionHead(_rtdetr, Preprocessing(stretch=True)),
+    "rtdetr": _DetectionHead(_rtdetr, Preprocessing(stretch=True)),
 }
 """All known heads by name."""

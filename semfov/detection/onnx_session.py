@@ -14,7 +14,7 @@ from semfov.errors import DataError, InputError, check
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
 # Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
-EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
+_EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "orig_target_sizes": lambda canvas: _repeat(canvas, [canvas.shape[-1], canvas.shape[-2]]),
     "im_shape": lambda canvas: _repeat(canvas, [canvas.shape[-2], canvas.shape[-1]]).to(canvas.dtype),
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
@@ -30,25 +30,7 @@ class OnnxSession:
 
     Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
 
-    Args:
-        path: the model.
-        threads: number of threads of an operation; None for `torch.get_num_threads()`.
-        device: `"cpu"`, or `"cuda"` where onnxruntime has the CUDA provider.
-        providers: execution providers of onnxruntime in order, each by its name or as `(name, options)`, instead of
-            those of `device`.
-        spinning: let idle threads spin; for measurements only.
-        checked: whether the file is checked before it is opened (`semfov.detection.onnx_file`).
-
-    Attributes:
-        image: name of the image input.
-        shape: shape of the image input; None for dynamic sizes.
-        outputs: name and shape of every output; None for dynamic sizes.
-        metadata: key-value pairs in the model's metadata.
-        producer: name of the exporter, as stored in the file.
-
-    Raises:
-        DataError: the file does not exist, onnxruntime cannot load it, or the model fails on an image.
-        InputError: the model has unknown inputs, or the device is not available.
+    Shapes: providers `(name, options)`.
     """
 
     def __init__(
@@ -110,20 +92,16 @@ class OnnxSession:
         if len(images) != 1 or _sizes(images[0].shape)[1] not in (3, None):
             raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {description}")
         extra = [i.name for i in inputs if i is not images[0]]
-        if not set(extra) <= set(EXTRA_INPUTS):
+        if not set(extra) <= set(_EXTRA_INPUTS):
             raise InputError(
-                f"{self.path.name}: expected no inputs but an image and {', '.join(EXTRA_INPUTS)}, got {description}"
+                f"{self.path.name}: expected no inputs but an image and {', '.join(_EXTRA_INPUTS)}, got {description}"
             )
         return images[0].name, _sizes(images[0].shape), _FLOATS[images[0].type], extra
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients; a model with a fixed batch size runs several times if needed.
 
-        Args:
-            image: `(B, 3, H, W)`.
-
-        Returns:
-            Outputs by name, with the dtype and device of `image`.
+        Shapes: image `(B, 3, H, W)`.
         """
         batch, fixed = image.shape[0], self.shape[0]
         check(batch > 0, "image", "at least one image", batch)
@@ -136,7 +114,7 @@ class OnnxSession:
         return {name: torch.cat([run[name] for run in runs])[:batch].to(image) for name, _ in self.outputs}
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
-        feed = {self.image: image.numpy()} | {name: EXTRA_INPUTS[name](image).numpy() for name in self._extra}
+        feed = {self.image: image.numpy()} | {name: _EXTRA_INPUTS[name](image).numpy() for name in self._extra}
         names = [name for name, _ in self.outputs]
         try:
             arrays = self._session.run(names, feed)

@@ -10,28 +10,19 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
 
-ChannelOrder = Literal["rgb", "bgr"]
+_ChannelOrder = Literal["rgb", "bgr"]
 
 
 @dataclass(frozen=True)
 class Preprocessing:
     """Conversion of a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`.
 
-    Attributes:
-        channels: order of the network's channels.
-        scale: value of white before mean and std; 255 for networks that take bytes.
-        mean: mean of each channel, in the network's channel order, subtracted after `scale`.
-        std: standard deviation of each channel, in the network's channel order, by which it is divided.
-        stretch: whether the image is stretched to the canvas; False keeps its proportions and pads (letterbox).
-        corner: whether the letterboxed image is in the upper left corner of the canvas instead of its middle.
-        fill: value of the canvas's padding, in [0, 1].
-
     >>> import torch
     >>> Preprocessing(channels="bgr", scale=255.0)(torch.ones(1, 3, 1, 1)).flatten()
     tensor([255., 255., 255.])
     """
 
-    channels: ChannelOrder = "rgb"
+    channels: _ChannelOrder = "rgb"
     scale: float = 1.0
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -40,7 +31,7 @@ class Preprocessing:
     fill: float = 114 / 255
 
     def __post_init__(self) -> None:
-        lookup(str(self.channels), get_args(ChannelOrder), "channel order")
+        lookup(str(self.channels), get_args(_ChannelOrder), "channel order")
         for name in ("mean", "std"):
             values = getattr(self, name)
             three = isinstance(values, list | tuple) and len(values) == 3 and all(map(_is_number, values))
@@ -66,18 +57,11 @@ class Preprocessing:
     def of_bytes(self, canvas: Tensor) -> Tensor:
         """Convert a canvas of bytes to the input of the network: `self(canvas / 255)`, in one pass over memory.
 
-        Args:
-            canvas: `(B, 3, H, W)`, RGB, bytes.
-
-        Returns:
-            A new tensor of the same shape, of torch's default dtype.
-
-        Raises:
-            InputError: the canvas has another shape or dtype.
-
         >>> white = torch.full((1, 3, 1, 1), 255, dtype=torch.uint8)
         >>> Preprocessing(std=(0.5, 1.0, 2.0)).of_bytes(white).flatten()
         tensor([2.0000, 1.0000, 0.5000])
+
+        Shapes: canvas `(B, 3, H, W)`.
         """
         check_bytes(canvas)
         image = torch.empty(canvas.shape, device=canvas.device)

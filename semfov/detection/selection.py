@@ -43,15 +43,6 @@ def select(
     """Select the best boxes of each image, map them to the image, and compute their score vectors.
 
     Gradients flow to the selected boxes and their scores; the selection itself is not differentiable.
-
-    Args:
-        candidates: all boxes of the head.
-        placement: placement of the images on the canvas; None leaves boxes in canvas pixels.
-        selection: settings of the selection.
-        policy: background policy of the scores.
-
-    Returns:
-        The selected boxes.
     """
     count = candidates.boxes.shape[0]
     detections = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]

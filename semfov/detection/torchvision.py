@@ -20,13 +20,13 @@ from semfov.detection.selection import Selection
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import sha256
 
-Raw = list[tuple[Tensor, Tensor]]
+_Raw = list[tuple[Tensor, Tensor]]
 """For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own box, and scores `(N, C)`."""
 
 PREFIX = "torchvision:"
 
 
-class TorchvisionDetector(ModuleDetector):
+class _TorchvisionDetector(ModuleDetector):
     """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
 
     The canvas is the image, resized by the model's own transform. The model's padding, its normalisation and the
@@ -34,18 +34,6 @@ class TorchvisionDetector(ModuleDetector):
     out.
 
     Faster R-CNN predicts a separate box for every class of a proposal; the box of the best class is used.
-
-    Args:
-        model: the model.
-        classes: name of each of its outputs after the first, which is background; `"N/A"` for outputs that do not
-            stand for a class.
-        name: name of the model in tables and in fitted models.
-        first: number of outputs before the first class; 0 for models with sigmoids that were trained without
-            background.
-        background: background policy; None for the model's own background where it has one (softmax), else
-            `residual`.
-        selection: settings of the selection of boxes.
-        digest: sha256 of the weights.
     """
 
     def __init__(
@@ -59,7 +47,7 @@ class TorchvisionDetector(ModuleDetector):
         selection: Selection | None = None,
         digest: str = "",
     ) -> None:
-        head = head_of(model)
+        head = _head_of(model)
         if head is None:
             raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
         outputs, softmax = head
@@ -88,19 +76,8 @@ class TorchvisionDetector(ModuleDetector):
             return resized_images(images, size=self.input_size)
         return resized_images(images, scale=edge_scale(images, (transform.min_size[-1], transform.max_size)))
 
-    def outputs(self, canvas: Tensor) -> Raw:
-        """Compute the boxes and scores of the model before it filters them.
-
-        Args:
-            canvas: `(B, 3, H, W)`, RGB in [0, 1].
-
-        Returns:
-            For each canvas, boxes `(N, 4)` or `(N, C, 4)`, and scores `(N, C)`. C is the number of outputs of the
-            model, background first.
-
-        Raises:
-            InputError: the canvas does not have floating-point numbers.
-        """
+    def outputs(self, canvas: Tensor) -> _Raw:
+        """Compute the boxes and scores of the model before it filters them; canvas `(B, 3, H, W)` → `(N, 4)`."""
         from torchvision.models.detection.image_list import ImageList
 
         transform: Any = self.model.transform
@@ -153,36 +130,16 @@ def wrap_torchvision(
     limit: int = 100,
     per_class: bool = False,
     device: torch.device | str | None = None,
-) -> TorchvisionDetector:
-    """Make a detector of a torchvision detection model.
-
-    Args:
-        model: the model.
-        classes: names of the outputs after the first; None for a model with the 91 outputs of torchvision's own weights
-            on COCO.
-        name: name of the model in tables and in fitted models.
-        first: number of outputs before the first class, 1 or 0 (`TorchvisionDetector`).
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        device: device of the model; None leaves it where it is.
-
-    Returns:
-        The detector, in `eval` mode.
-
-    Raises:
-        InputError: it is another model, or `classes` is missing.
-    """
+) -> _TorchvisionDetector:
+    """Make a detector of a torchvision detection model."""
     if classes is None:
         from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
         names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
-        count = output_count(model)
+        count = _output_count(model)
         check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
         classes = names[first:]
-    return TorchvisionDetector(
+    return _TorchvisionDetector(
         model if device is None else model.to(device),
         classes,
         name=name,
@@ -206,31 +163,8 @@ def load_torchvision(
     per_class: bool = False,
     device: torch.device | str = "cpu",
     **model: Any,
-) -> TorchvisionDetector:
-    """Load a torchvision detection model by its name.
-
-    Args:
-        name: name of the model, such as `"torchvision:retinanet_resnet50_fpn"`, with or without the prefix; one of
-            `torchvision.models.list_models(module=torchvision.models.detection)`.
-        weights: a name or member of the model's weights enum; the path of a state dict (`.pth`, `.safetensors`); or
-            None for random weights. Files are never unpickled (`weights_only=True`).
-        classes: names of the outputs after the first, for your own state dict or random weights.
-        first: number of outputs before the first class, 1 or 0 (`TorchvisionDetector`).
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        device: device of the model.
-        **model: options of torchvision's builder, such as `min_size` and `max_size`.
-
-    Returns:
-        The detector, in `eval` mode.
-
-    Raises:
-        InputError: the model, its weights or an option is unknown, or `classes` is missing.
-        DataError: the weights are damaged, do not fit the model, or cannot be downloaded.
-    """
+) -> _TorchvisionDetector:
+    """Load a torchvision detection model by its name."""
     from torchvision import models
 
     name = name.removeprefix(PREFIX)
@@ -255,7 +189,7 @@ def load_torchvision(
     if enum is None and weights is not None:
         _load_state(network, _file(weights))
     network.requires_grad_(False).to(device)
-    return TorchvisionDetector(
+    return _TorchvisionDetector(
         network,
         classes,
         name=PREFIX + name,
@@ -324,7 +258,7 @@ def _load_state(network: nn.Module, path: Path) -> None:
         raise DataError(f"weights {str(path)!r}: do not fit the model, or are not a state dict ({error})") from error
 
 
-def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+def _roi_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     """Faster R-CNN (Ren et al. 2015): the proposals, with a softmax over classes and a box for each class."""
     features = _features(model, images)
     proposals, _ = model.rpn(images, features)
@@ -338,7 +272,7 @@ def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
     return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
 
 
-def ssd_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+def _ssd_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     """SSD (Liu et al. 2016) and SSDlite: the default boxes, with a softmax over classes."""
     outputs, anchors, _ = _dense(model, images)
     boxes = [model.box_coder.decode_single(b, a) for b, a in zip(outputs["bbox_regression"], anchors, strict=True)]
@@ -346,14 +280,14 @@ def ssd_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
     return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
 
 
-def retinanet_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+def _retinanet_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     """RetinaNet (Lin et al. 2017): the best anchors of every level, with a sigmoid for each class."""
     outputs, anchors, pixels = _dense(model, images)
     scores = outputs["cls_logits"].sigmoid()
     return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode_single)
 
 
-def fcos_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
+def _fcos_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     """FCOS (Tian et al. 2019): the best points of every level, with the scores `√(σ(class) σ(centreness))`."""
     outputs, anchors, pixels = _dense(model, images)
     scores = (outputs["cls_logits"].sigmoid() * outputs["bbox_ctrness"].sigmoid()).sqrt()
@@ -382,9 +316,9 @@ def _best_of_levels(
     scores: Tensor,
     backgrounds: int,
     decode: Callable[[Tensor, Tensor], Tensor],
-) -> Raw:
+) -> _Raw:
     """The `topk_candidates` anchors of each level with the highest class score; the model's own are among these."""
-    raw: Raw = []
+    raw: _Raw = []
     each = len(anchors[0]) // sum(pixels)
     for regression, score, anchor, size in zip(
         outputs["bbox_regression"], scores, anchors, images.image_sizes, strict=True
@@ -404,23 +338,23 @@ def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
     return clip_boxes_to_image(boxes, size)
 
 
-def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | None:
+def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool] | None:
     """The function that decodes a kind of model, and whether its scores are a softmax; None for an unknown kind."""
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.ssd import SSD
 
     for kind, function, softmax in (
-        (FasterRCNN, roi_outputs, True),
-        (SSD, ssd_outputs, True),
-        (RetinaNet, retinanet_outputs, False),
-        (FCOS, fcos_outputs, False),
+        (FasterRCNN, _roi_outputs, True),
+        (SSD, _ssd_outputs, True),
+        (RetinaNet, _retinanet_outputs, False),
+        (FCOS, _fcos_outputs, False),
     ):
         if isinstance(model, kind):
             return function, softmax
     return None
 
 
-def output_count(model: nn.Module) -> int | None:
+def _output_count(model: nn.Module) -> int | None:
     """The number of a model's outputs, background included; None where its head is not one of torchvision's."""
     for path in (
         "roi_heads.box_predictor.cls_score.out_features",

@@ -16,32 +16,18 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import DataError, InputError, check
 
-SOFTMAX = ("detr", "table-transformer", "yolos")
+_SOFTMAX = ("detr", "table-transformer", "yolos")
 """Kinds of models whose scores are a softmax over the classes and "no object"; the others have a sigmoid each."""
 _IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformable_detr", "dab-detr")
 _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
 _SQUARE = {"height": 640, "width": 640}
 
 
-class TransformersDetector(ModuleDetector):
+class _TransformersDetector(ModuleDetector):
     """An object detection model of transformers as a `Detector`; it is differentiable.
 
     The model takes `pixel_values` and returns `logits` and `pred_boxes`. Everything is taken before the thresholds and
     the top-k of transformers' `post_process_object_detection`.
-
-    Args:
-        model: the model.
-        classes: name of each score, `"N/A"` for scores that do not stand for a class; None for those of its `config`.
-        name: name of the model in tables and in fitted models; None for the kind of the model.
-        processor: settings of transformers' image processor: `size` (`height` and `width`, to which images are
-            stretched, or `shortest_edge` and `longest_edge`), `do_normalize`, `image_mean` and `image_std`. None takes
-            those with which the kind of model is trained.
-        background: background policy; None for `own` where the model has "no object", else `residual`.
-        selection: settings of the selection of boxes.
-        digest: sha256 of the weights.
-
-    Raises:
-        InputError: the model is for another task, or takes a text.
     """
 
     def __init__(
@@ -70,7 +56,7 @@ class TransformersDetector(ModuleDetector):
         settings |= processor or {}
         size = settings.get("size") or (_EDGES if normal else _SQUARE)
         self.edges = (size["shortest_edge"], size["longest_edge"]) if "shortest_edge" in size else None
-        self.softmax = config.model_type in SOFTMAX
+        self.softmax = config.model_type in _SOFTMAX
         super().__init__(
             model,
             classes,
@@ -120,29 +106,10 @@ def wrap_transformers(
     limit: int = 100,
     per_class: bool = False,
     device: torch.device | str | None = None,
-) -> TransformersDetector:
-    """Make a detector of an object detection model of transformers.
-
-    Args:
-        model: the model.
-        classes: name of each score; None for those of its `config`.
-        name: name of the model in tables and in fitted models.
-        processor: settings of the image processor (`TransformersDetector`), such as `processor.to_dict()`.
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        device: device of the model; None leaves it where it is.
-
-    Returns:
-        The detector, in `eval` mode.
-
-    Raises:
-        InputError: the model is for another task, or an option does not fit it.
-    """
+) -> _TransformersDetector:
+    """Make a detector of an object detection model of transformers."""
     selection = Selection(threshold, iou, limit, per_class)
-    detector = TransformersDetector(
+    detector = _TransformersDetector(
         model if device is None else model.to(device),
         classes,
         name=name,
@@ -154,26 +121,10 @@ def wrap_transformers(
     return detector.eval()
 
 
-def load_hub(name: str, *, revision: str | None = None, **options: Any) -> TransformersDetector:
+def load_hub(name: str, *, revision: str | None = None, **options: Any) -> _TransformersDetector:
     """Load an object detection model from Hugging Face's hub, with the settings of its image processor.
 
     Only safetensors are read, and no code of the repository is run.
-
-    Args:
-        name: `hf:owner/name`, or `hf:` and a folder that transformers' `save_pretrained` wrote.
-        revision: branch, tag or commit of the repository.
-        options: options of `wrap_transformers`.
-
-    Returns:
-        The detector, in `eval` mode and without gradients of its parameters.
-
-    Raises:
-        InputError: transformers or a package that the model needs is not installed, or the model is for another task.
-        DataError: the model cannot be downloaded, is damaged, or has no safetensors.
-
-    Example::
-
-        detector = semfov.load_detector("hf:PekingU/rtdetr_v2_r18vd")
     """
     repository = name.removeprefix("hf:")
     check(bool(repository), "detector", "hf:owner/name", repr(name))

@@ -13,23 +13,13 @@ from semfov.detection.selection import Selection
 from semfov.errors import InputError
 
 
-class UltralyticsDetector(ModuleDetector):
+class _UltralyticsDetector(ModuleDetector):
     """A detection model of Ultralytics as a `Detector`; it is differentiable.
 
     Its network returns, for every cell, a box and a sigmoid for each class: `(B, 4 + K, N)`. The package itself is not
     imported here.
 
-    Args:
-        model: an `ultralytics.YOLO` object, or the network in it.
-        classes: names of the classes; None for those of the model.
-        name: name of the model in tables and in fitted models.
-        input_size: size of the canvas in pixels, one side or `(width, height)`.
-        background: background policy of the scores.
-        selection: settings of the selection of boxes.
-        digest: sha256 of the weights.
-
-    Raises:
-        InputError: the model returns boxes without their full scores.
+    Shapes: input_size `(width, height)`.
     """
 
     def __init__(
@@ -84,26 +74,10 @@ def wrap_ultralytics(
     limit: int = 100,
     per_class: bool = False,
     device: torch.device | str | None = None,
-) -> UltralyticsDetector:
-    """Make a detector of a model of Ultralytics.
-
-    Args:
-        model: an `ultralytics.YOLO` object, or the network in it.
-        classes: names of the classes; None for those of the model.
-        name: name of the model in tables and in fitted models.
-        input_size: size of the canvas in pixels, one side or `(width, height)`.
-        background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: smallest confidence of a box (`Selection`).
-        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
-        limit: largest number of boxes of an image (`Selection`).
-        per_class: suppress only boxes of the same class (`Selection`).
-        device: device of the model; None leaves it where it is.
-
-    Returns:
-        The detector, in `eval` mode.
-    """
+) -> _UltralyticsDetector:
+    """Make a detector of a model of Ultralytics; input_size `(width, height)`."""
     network = _network(model)
-    return UltralyticsDetector(
+    return _UltralyticsDetector(
         network if device is None else network.to(device),
         classes,
         name=name,

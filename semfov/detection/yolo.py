@@ -62,17 +62,7 @@ class YoloV3(Detector):
     after loading, and in compiled, exported or transformed functions. Forward hooks of the network are not called where
     onnxruntime computes it.
 
-    Args:
-        network: the trained network.
-        classes: names of its K classes.
-        name: name of the model in tables and in fitted models.
-        input_size: `(width, height)` of the canvas; None for the size in the cfg.
-        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
-        background: background policy of the scores.
-        selection: settings of the selection of boxes.
-        digest: sha256 of the weights.
-        runtime: `"auto"`; `"torch"` in all cases; or `"onnxruntime"` in all cases, which raises an error where
-            onnxruntime cannot compute the network.
+    Shapes: input_size `(width, height)`.
     """
 
     def __init__(

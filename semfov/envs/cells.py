@@ -29,15 +29,10 @@ from semfov.viz.fixation import plot_fixation
 _FIRST = torch.tensor([0])
 
 
-class SceneLooks(Looks):
+class _SceneLooks(Looks):
     """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it.
 
     Their evidence is one table for all scenes, so that a step of episodes in many scenes is a single gather.
-
-    Args:
-        open_scene: returns the stored looks in a scene, with all targets that are searched for in it.
-        observer: weighs the looks.
-        episodes: number of episodes at a time.
     """
 
     def __init__(self, open_scene: Callable[[int], StoredLooks], observer: Observer, episodes: int) -> None:
@@ -50,13 +45,7 @@ class SceneLooks(Looks):
         self._row, self._place = torch.zeros(2, episodes, dtype=torch.int64)
 
     def enter(self, episodes: Tensor, scenes: Sequence[int], targets: Tensor | None) -> None:
-        """Move episodes to other scenes.
-
-        Args:
-            episodes: `(n,)`, their numbers.
-            scenes: scene of each.
-            targets: `(n,)`, class that each searches for; None in explorations.
-        """
+        """Move episodes to other scenes; episodes `(n,)`, targets `(n,)`."""
         for scene in scenes:
             if scene not in self._scenes:
                 self._add(scene)
@@ -94,18 +83,7 @@ class SceneLooks(Looks):
 
 
 class CellGazes(Gazes):
-    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own.
-
-    Args:
-        scenery: scenes, looks and belief.
-        count: B, number of episodes at a time.
-        together: whether learned beliefs of all episodes are computed at once.
-        options: the other arguments of `Gazes`.
-
-    Attributes:
-        memory: beliefs and visited cells.
-        cell: `(B,)`, fixated cells.
-    """
+    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own; cell `(B,)`."""
 
     coordinates = 2
     scenery: Scenery
@@ -114,7 +92,7 @@ class CellGazes(Gazes):
     def __init__(self, scenery: Scenery, count: int = 1, *, together: bool = False, **options: Any) -> None:
         super().__init__(scenery, count, **options)
         self.observer: Observer = scenery.together() if together else scenery.observer
-        self.looks = SceneLooks(scenery.open, self.observer, count)
+        self.looks = _SceneLooks(scenery.open, self.observer, count)
         self.cell = torch.zeros(count, dtype=torch.int64)
         self.size = torch.zeros(count, 2)
         self._steps: list[Step] = []
@@ -272,7 +250,7 @@ class CellGazes(Gazes):
         """Gain of the last look, and whether the task is done, each `(n,)`."""
 
 
-class SearchGazes(CellGazes):
+class _SearchGazes(CellGazes):
     """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
 
     def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
@@ -302,7 +280,7 @@ class SearchGazes(CellGazes):
         return result, result > 0
 
 
-class Explorations(CellGazes):
+class _Explorations(CellGazes):
     """Explorations: an episode is over when every cell was fixated."""
 
     def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
@@ -335,5 +313,5 @@ class Explorations(CellGazes):
         return count_right(self._all_or(rows).class_probabilities(), answers) / answers.any(-1).sum(-1)
 
 
-GAZES: dict[str, type[CellGazes]] = {"search": SearchGazes, "exploration": Explorations}
+GAZES: dict[str, type[CellGazes]] = {"search": _SearchGazes, "exploration": _Explorations}
 """Kind of gazes for each task."""

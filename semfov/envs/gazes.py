@@ -25,13 +25,7 @@ Arrays = dict[str, Any]
 
 @dataclass(frozen=True)
 class Score:
-    """Reward and end of n episodes after a gaze shift.
-
-    Attributes:
-        reward: `(n,)`, reward for what the look found, minus its price.
-        terminated: `(n,)`, whether the episode is over because the task is done.
-        truncated: `(n,)`, whether the gaze shifts are used up.
-    """
+    """Reward and end of n episodes after a gaze shift; reward `(n,)`, terminated `(n,)`, truncated `(n,)`."""
 
     reward: Tensor
     terminated: Tensor
@@ -44,20 +38,7 @@ class Gazes(ABC):
     An environment only adds Gymnasium's interface. Scenes are static, so a second look at the same place shows nothing
     new: it costs its price and changes nothing.
 
-    Args:
-        scenery: scenes, looks and belief.
-        count: B, number of episodes at a time.
-        price: cost of a look.
-        find: reward for finding the target, or for everything that is to be found.
-        belief: whether observations contain the belief (`planes`).
-        glimpse: side in pixels of the image that observations contain (`glimpses`); None leaves it out.
-        pictures: whether the looks of the first episode are kept for pictures (`draw`).
-
-    Attributes:
-        episodes: episode in each row; None before the first.
-        targets: `(B,)`, class that each episode searches for; 0 in explorations.
-        shift: `(B,)`, number of gaze shifts so far.
-        observation_space: space of the observations of one episode.
+    Shapes: targets `(B,)`, shift `(B,)`.
     """
 
     coordinates: ClassVar[int]
@@ -150,7 +131,7 @@ class Gazes(ABC):
             "scene": np.array([self.episodes[row].scene for row in rows.tolist()]),
         }
         if detections:
-            entries["detections"] = detection_arrays(self.detections(rows), self.scenery.eye.detector)
+            entries["detections"] = _detection_arrays(self.detections(rows), self.scenery.eye.detector)
         return entries
 
     @torch.inference_mode()
@@ -206,17 +187,12 @@ def glimpse_space(side: int) -> spaces.Box:
     return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
 
-def detection_arrays(detections: Detections, detector: Detector) -> Arrays:
+def _detection_arrays(detections: Detections, detector: Detector) -> Arrays:
     """Detections as arrays of one shape, padded to the largest number L that the detector gives.
 
     Gymnasium's own vectorised environments require infos of constant shape.
 
-    Args:
-        detections: detections of n looks.
-        detector: the detector, which limits their number.
-
-    Returns:
-        `boxes` `(n, L, 4)`, `scores` `(n, L, K+1)` and `mask` `(n, L)`, which is true for entries that are detections.
+    Shapes: → `(n, L, 4)`.
     """
     number, count = detections.mask.shape
     limit, components = max(detector.selection.limit, count), detections.scores.shape[-1]

@@ -43,7 +43,7 @@ def make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
     return env
 
 
-def make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
+def _make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
     """Make environments side by side; options of `GazeVectorEnv`, or of `ZoomEnv` where actions are windows."""
     if lookup(action, _KINDS, "action") == "cell":
         return GazeVectorEnv(task, num_envs, **options)

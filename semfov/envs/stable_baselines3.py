@@ -22,20 +22,7 @@ except ImportError:
 
 
 class StableVecEnv(VecEnv):
-    """A `GazeVectorEnv` for Stable-Baselines3, with the action masks that `sb3_contrib.MaskablePPO` needs.
-
-    Args:
-        envs: environments whose episodes restart in the same step (`autoreset_mode="SameStep"`).
-        key: use this entry of the observations alone, such as `belief`; None uses all.
-
-    Raises:
-        InputError: `envs` is of another kind, or restarts its episodes otherwise.
-
-    Example::
-
-        envs = StableVecEnv(GazeVectorEnv("search", 64, belief=True, autoreset_mode="SameStep"), key="belief")
-        sb3_contrib.MaskablePPO("MlpPolicy", envs).learn(100_000)
-    """
+    """A `GazeVectorEnv` for Stable-Baselines3, with the action masks that `sb3_contrib.MaskablePPO` needs."""
 
     def __init__(self, envs: GazeVectorEnv, key: str | None = None) -> None:
         check(isinstance(envs, GazeVectorEnv), "envs", "a GazeVectorEnv", type(envs).__name__)

@@ -28,12 +28,8 @@ from semfov.zoom.objects import merge
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 
 
-class WindowEpisode(NamedTuple):
+class _WindowEpisode(NamedTuple):
     """A search in a large picture, or its exploration.
-
-    Attributes:
-        scene: index of the picture.
-        target: class to search for, 1..K; 0 in an exploration.
 
     >>> WindowEpisode(scene=3, target=16).target
     16
@@ -44,21 +40,7 @@ class WindowEpisode(NamedTuple):
 
 
 class WindowGaze(Gazes):
-    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief.
-
-    Args:
-        scenery: pictures and looks.
-        task: `search` or `exploration`.
-        grid: number of columns and rows of the belief's planes.
-        options: the other arguments of `Gazes`.
-
-    Attributes:
-        looks: the looks so far, each window once.
-        done: windows that were looked at.
-        window: window of the last look.
-        glances: source of the looks at the picture.
-        belief: belief after the last look.
-    """
+    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief."""
 
     coordinates = 3
     scenery: ZoomScenery
@@ -79,17 +61,17 @@ class WindowGaze(Gazes):
         """Space of two planes over the picture."""
         return spaces.Box(0, 1, (2, *self.shape), np.float32)
 
-    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> WindowEpisode:
+    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> _WindowEpisode:
         """The episode that the options of a reset ask for, or one at random."""
         unknown = [name for name in options if name not in ("scene", "target")]
         check(not unknown, "options", "scene or target", ", ".join(unknown))
         scene, target = options.get("scene"), options.get("target")
         if scene is None or target is None:
-            return WindowEpisode(*self.scenery.draw(random, self.task, scene))
+            return _WindowEpisode(*self.scenery.draw(random, self.task, scene))
         check_whole(scene, "scene", 0, len(self.scenery.pictures) - 1)
         allowed = self.scenery.episodes(int(scene)) if self.task == "search" else [0]
         check(int(target) in allowed, "target", f"one of {allowed}", int(target))
-        return WindowEpisode(int(scene), int(target))
+        return _WindowEpisode(int(scene), int(target))
 
     def action(self, action: Any) -> Tensor:
         """Check an action; returns a batch of one."""
@@ -163,7 +145,7 @@ class WindowGaze(Gazes):
         size = [max(1, round(n * share)) for n in image.shape[-2:]]
         return render([plot_zoom_path(path, interpolate(image, size, mode="bilinear", antialias=True)[0])])[0]
 
-    def _enter(self, rows: Tensor, episodes: Sequence[WindowEpisode]) -> None:
+    def _enter(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         (episode,) = episodes
         self.targets[rows] = episode.target
         self.glances = self.scenery.glances(episode.scene)
@@ -174,7 +156,7 @@ class WindowGaze(Gazes):
         self._result = self._rate()
 
     def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        self._see(window_of(self.glances.lattice, actions[0].numpy()))
+        self._see(_window_of(self.glances.lattice, actions[0].numpy()))
         before, self._result = self._result, self._rate()
         return self._result - before, (self._result == 1) & (self.task == "search")
 
@@ -196,15 +178,8 @@ class WindowGaze(Gazes):
         return eye.glimpse(view, torch.tensor([self.window.fixation], dtype=torch.float64))[0]
 
 
-def window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
+def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
     """The window of the lattice that is nearest to an action.
-
-    Args:
-        lattice: windows of the picture.
-        action: `(x, y, magnification)`, each from 0 to 1.
-
-    Returns:
-        The window.
 
     >>> window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
     (12, 8, 20, 16)
@@ -223,16 +198,11 @@ def window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
 def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
     """The action that looks at a window.
 
-    Args:
-        lattice: windows of the picture.
-        window: window of the lattice.
-
-    Returns:
-        `(x, y, magnification)`, each from 0 to 1.
-
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> float(action_of(lattice, on_lattice(lattice, (lattice.levels - 1, 0, 0)))[2])
     1.0
+
+    Shapes: → `(x, y, magnification)`.
     """
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)

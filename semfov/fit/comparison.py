@@ -27,7 +27,7 @@ from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_searches, episodes_of, looks_of, run_episodes, search_steps, tie_noise
 from semfov.strategy import Strategy
 
-Ways = Mapping[str, Strategy]
+_Ways = Mapping[str, Strategy]
 """Strategies for a task, by their names in reports."""
 
 
@@ -40,13 +40,7 @@ class Rule(Protocol):
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between a measure with fitted models and with raw scores, paired over photographs.
-
-    Attributes:
-        mean: mean difference over photographs, fitted minus raw.
-        error: standard error of the mean; NaN for fewer than two photographs.
-        photographs: number of photographs.
-    """
+    """The difference between a measure with fitted models and with raw scores, paired over photographs."""
 
     mean: float
     error: float
@@ -65,20 +59,9 @@ class Difference:
 
 
 def search_curves(
-    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
+    run: Looking, scenes: Sequence[int], ways: _Ways, protocol: ProtocolConfig, max_area: float
 ) -> dict[str, FloatArray]:
-    """Measure the cumulative performance of search strategies on every photograph with a target.
-
-    Args:
-        run: the finished looks from every cell.
-        scenes: indices of the photographs.
-        ways: the strategies.
-        protocol: starting points, gaze shifts and seed.
-        max_area: classes that cover a larger share of the image are not searched for.
-
-    Returns:
-        For each strategy the curve of each photograph, `(P, shifts+1)`.
-    """
+    """Measure the cumulative performance of search strategies on every photograph with a target; → `(P, shifts+1)`."""
     columns, rows = run.config.belief.columns, run.config.belief.rows
     curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
     for index in track(scenes, "searching", "scene"):
@@ -100,21 +83,13 @@ def search_curves(
 
 
 def explore_curves(
-    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
+    run: Looking, scenes: Sequence[int], ways: _Ways, protocol: ProtocolConfig
 ) -> dict[str, dict[str, FloatArray]]:
     """Measure the share of cells that exploration strategies classify correctly.
 
     The answer for a cell may be background, which is correct if the cell contains no object.
 
-    Args:
-        run: the finished looks from every cell.
-        scenes: indices of the photographs.
-        ways: the strategies.
-        protocol: starting points, gaze shifts and seed.
-
-    Returns:
-        Curves `(P, shifts+1)` of each strategy: under `objects` over the cells with objects (the published success
-        rate), and under `all` over all cells.
+    Shapes: → `(P, shifts+1)`.
     """
     curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
     for index in track(scenes, "exploring", "scene"):
@@ -148,16 +123,8 @@ def explore_curves(
 
 
 @dataclass(frozen=True)
-class DecisionRates:
-    """The decisions of searches for present and for absent classes.
-
-    Attributes:
-        found: share of the present classes that were reported as found.
-        false_alarms: share of the absent classes that were reported as found.
-        undecided: share of all searches without a decision.
-        looks: mean number of looks.
-        searches: number of searches.
-    """
+class _DecisionRates:
+    """The decisions of searches for present and for absent classes."""
 
     found: float
     false_alarms: float
@@ -173,20 +140,8 @@ def decisions(
     protocol: ProtocolConfig,
     classes: int,
     max_area: float,
-) -> dict[str, DecisionRates]:
-    """Evaluate the decisions of search strategies.
-
-    Args:
-        run: the finished looks from every cell.
-        scenes: indices of the photographs.
-        ways: the strategies, with their decision rules.
-        protocol: gaze shifts and seed.
-        classes: maximum number of present classes, and of absent classes, to search for in each photograph.
-        max_area: classes that cover a larger share of the image are left out.
-
-    Returns:
-        The decisions of each strategy.
-    """
+) -> dict[str, _DecisionRates]:
+    """Evaluate the decisions of search strategies."""
     results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
     for index in track(scenes, "deciding", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
@@ -211,12 +166,12 @@ def by_detection(step: Step, target: int, grid: Grid) -> Tensor:
     return confirms(step.detections, grid, step.cell, target, 0.5).long()
 
 
-def _rates(searches: Sequence[tuple[bool, str, int]]) -> DecisionRates:
+def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
     def share(outcome: str, which: Sequence[bool]) -> float:
         chosen = [each[1] == outcome for each in searches if each[0] in which]
         return sum(chosen) / len(chosen) if chosen else math.nan
 
-    return DecisionRates(
+    return _DecisionRates(
         share("found", [True]),
         share("found", [False]),
         share("undecided", [True, False]),

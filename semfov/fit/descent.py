@@ -19,17 +19,7 @@ def descend(
     decay: float = 1e-2,
     title: str = "training",
 ) -> None:
-    """Train with AdamW and one cycle of the learning rate (Smith and Topin, 2019).
-
-    Args:
-        parameters: the parameters to train.
-        loss_of: computes the loss of a step from the number of the step.
-        steps: number of steps.
-        rate: highest learning rate.
-        clip: maximum norm of the gradient; larger gradients are scaled down (None: no limit).
-        decay: AdamW's weight decay.
-        title: label of the progress bar.
-    """
+    """Train with AdamW and one cycle of the learning rate (Smith and Topin, 2019)."""
     trained = list(parameters)
     optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)

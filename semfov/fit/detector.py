@@ -26,7 +26,7 @@ from semfov.runs.workers import available_cores
 
 _log = logging.getLogger(__name__)
 
-SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
+_SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
 """Settings that the manifest of a model folder records."""
 
 
@@ -106,13 +106,13 @@ def fit_folder(config: FitDetectorConfig) -> None:
     config = folder.config
     missing = class_counts(run, range(len(run.scenes)))
     _tell(missing)
-    with WholeBar("fitting", {"looking": {"looking": seconds_of_looks(run)}, **folder.stages}) as whole:
+    with WholeBar("fitting", {"looking": {"looking": _seconds_of_looks(run)}, **folder.stages}) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
         for part in PARTS:
             with whole.stage(part):
                 folder.fit(part)
-    path = manifest_of(config, run, folder).write(config.out)
+    path = _manifest_of(config, run, folder).write(config.out)
     text = detector_report(config, run, folder.results, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
@@ -123,7 +123,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     print(f"\nnext:\n{next_commands(config, run)}")
 
 
-def seconds_of_looks(run: Looking) -> float:
+def _seconds_of_looks(run: Looking) -> float:
     """Estimate the seconds that the remaining looks will take, from the time of one look."""
     cells = len(run.grid(0))
     left = [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
@@ -153,7 +153,7 @@ def _tell(counts: dict[str, int]) -> None:
         )
 
 
-def manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> Manifest:
+def _manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> Manifest:
     """Build the manifest of the model folder."""
     detector = run.eye.detector
     options = plain(detector_options(config.detector))
@@ -176,6 +176,6 @@ def manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> M
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),
             "held_out": len(folder.inputs.held_out),
-            "settings": {name: getattr(config, name) for name in SETTINGS},
+            "settings": {name: getattr(config, name) for name in _SETTINGS},
         },
     )

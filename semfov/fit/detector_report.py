@@ -51,7 +51,7 @@ def curves_figure(curves: dict[str, FloatArray], task: Task) -> Any:
     return plot(means, errors, title=title)
 
 
-TITLES = {
+_TITLES = {
     "observation": "Observation model",
     "tempering": "Tempering",
     "evidence": "Target evidence (searches)",
@@ -61,7 +61,7 @@ TITLES = {
 }
 """Titles of the parts in reports."""
 
-UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
+_UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
 """What the agent does without a part that it does not use, other than to use raw scores."""
 
 
@@ -81,7 +81,7 @@ def detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, 
     counts = class_counts(run, (index for index in range(photographs) if index % holdout))
     rows = [["part", "used", "result on held-out photographs"]]
     rows += [
-        [TITLES[name], "yes" if each.part.used else UNUSED.get(name, "no, raw"), each.part.why]
+        [_TITLES[name], "yes" if each.part.used else _UNUSED.get(name, "no, raw"), each.part.why]
         for name, each in results.items()
     ]
     lines = [
@@ -97,18 +97,18 @@ def detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, 
         "",
         *table(rows),
         "",
-        *thin_classes(counts, config.thin),
+        *_thin_classes(counts, config.thin),
     ]
     if len(held_out) < 10:
         number = "only 1 photograph" if len(held_out) == 1 else f"only {len(held_out)} photographs"
         lines += [f"The figures are rough, because {number} could be held out.", ""]
     for name, fitted in results.items():
-        lines += [f"## {TITLES[name]}", "", fitted.report, ""]
+        lines += [f"## {_TITLES[name]}", "", fitted.report, ""]
         lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
     return "\n".join(lines)
 
 
-def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
+def _thin_classes(counts: dict[str, int], thin: int) -> list[str]:
     """Write warnings, as lines of Markdown, about classes with fewer than `thin` objects to learn from."""
     none = [name for name, count in counts.items() if count == 0]
     few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]

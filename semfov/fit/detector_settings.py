@@ -9,7 +9,7 @@ from semfov.fit.settings import FitConfig
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Positive, Range, Side, Whole
 
-MANY = 100
+_MANY = 100
 """With at least this many photographs, one in five is held out and training takes all its steps."""
 
 
@@ -55,14 +55,7 @@ class FitDetectorConfig(FitConfig):
     out: Path = Path("mymodels")
 
     def named(self) -> "FitDetectorConfig":
-        """Return these settings with `model` as the detector's name, and with targets of all sizes in the photographs.
-
-        Returns:
-            The settings.
-
-        Raises:
-            InputError: no model is given, or `detector.name` names another one.
-        """
+        """These settings with `model` as the detector's name, and with targets of all sizes in the photographs."""
         default = DetectorConfig().name
         if self.model is None:
             raise InputError("model: expected the name or the file of a detector, got none")
@@ -77,8 +70,8 @@ class FitDetectorConfig(FitConfig):
 
     def sized(self, photographs: int) -> "FitDetectorConfig":
         """Return these settings, with each None replaced by a default that suits the number of photographs."""
-        few = photographs < MANY
-        share = min(photographs / MANY, 1)
+        few = photographs < _MANY
+        share = min(photographs / _MANY, 1)
         return replace(
             self,
             holdout=self.holdout or (3 if few else 5),

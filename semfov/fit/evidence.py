@@ -40,7 +40,7 @@ from semfov.runs.tables import table
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
-JUDGED = (1, 5, 15)
+_JUDGED = (1, 5, 15)
 """Numbers of looks after which a belief is evaluated."""
 _ABSENT = 1000
 """Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
@@ -82,14 +82,10 @@ class FitSearchConfig(FitOnLooksConfig):
 
 
 @dataclass(frozen=True)
-class TargetExamples(Examples):
+class _TargetExamples(Examples):
     """One example for each pair of photograph and class to search for. The class may be absent.
 
-    Attributes:
-        features: `(E, X·Y, X·Y, F)`, `look_features` of the looks from every cell, in half precision.
-        score: `(E, X·Y)`, highest score of the class in the look from each cell.
-        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; all False if the class is absent.
-        target: `(E,)`, the class.
+    Shapes: features `(E, X·Y, X·Y, F)`, score `(E, X·Y)`, goal `(E, X·Y)`, target `(E,)`.
     """
 
     goal: Tensor
@@ -107,7 +103,7 @@ class TargetExamples(Examples):
         )
 
 
-def make_examples(
+def _make_examples(
     run: Looking,
     classes: int,
     max_area: float,
@@ -115,23 +111,8 @@ def make_examples(
     *,
     absent: int | None = None,
     scenes: Sequence[int] | None = None,
-) -> TargetExamples:
-    """Make examples from photographs for present and for absent classes.
-
-    Args:
-        run: the finished looks from every cell.
-        classes: maximum number of present classes in a photograph.
-        max_area: classes that cover a larger share of the image are left out.
-        seed: seed of the random choice of classes.
-        absent: maximum number of absent classes in a photograph (None: as many as present ones).
-        scenes: indices of the photographs (None: all).
-
-    Returns:
-        The examples.
-
-    Raises:
-        DataError: no photograph has a class that may be searched for.
-    """
+) -> _TargetExamples:
+    """Make examples from photographs for present and for absent classes."""
     rows = []
     those, title = (range(len(run.scenes)), "describing looks") if scenes is None else (scenes, "describing others")
     for index in track(those, title, "scene"):
@@ -151,41 +132,30 @@ def make_examples(
             rows.append(row)
     if not rows:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
-    return TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
+    return _TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
 def fit_search(config: FitSearchConfig) -> None:
     """Look from every cell, train, evaluate on held-out photographs, and write all results."""
-    fit_and_write(config, fit_evidence)
+    fit_and_write(config, _fit_evidence)
 
 
-def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
+def _fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds."""
-    examples = make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
+    examples = _make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
-    model = train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
-    judged, model.thresholds = judge_evidence(config, model, examples[held_out], grid)
+    model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
+    judged, model.thresholds = _judge_evidence(config, model, examples[held_out], grid)
     counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, evidence_report(judged, model.thresholds, *counts))
+    return Fit(model, judged, *counts, _evidence_report(judged, model.thresholds, *counts))
 
 
-def train_evidence(
-    config: FitSearchConfig, examples: TargetExamples, grid: Grid, metadata: dict[str, object], components: int
+def _train_evidence(
+    config: FitSearchConfig, examples: _TargetExamples, grid: Grid, metadata: dict[str, object], components: int
 ) -> TargetEvidence:
-    """Train the model on searches that it makes itself. Some of their fixations are random.
-
-    Args:
-        config: the settings.
-        examples: the training examples.
-        grid: the grid of cells.
-        metadata: metadata of the model.
-        components: number of classes with background, K+1.
-
-    Returns:
-        The trained model.
-    """
+    """Train the model on searches that it makes itself. Some of their fixations are random."""
     generator = torch.Generator().manual_seed(config.seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
@@ -207,7 +177,7 @@ def train_evidence(
 
 
 def searches(
-    model: TargetEvidence, examples: TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+    model: TargetEvidence, examples: _TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
     """Search every example; see `example_episodes`."""
     return example_episodes(examples, Target(model, together=True), TargetPosterior(1), grid, looks, astray, generator)
@@ -255,12 +225,12 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
 
 
 @torch.no_grad()
-def judge_evidence(
-    config: FitSearchConfig, model: TargetEvidence, examples: TargetExamples, grid: Grid
+def _judge_evidence(
+    config: FitSearchConfig, model: TargetEvidence, examples: _TargetExamples, grid: Grid
 ) -> tuple[list[dict[str, float]], Thresholds]:
-    """Evaluate the model on held-out searches, after each number of looks in `JUDGED`, and choose its thresholds."""
+    """Evaluate the model on held-out searches, after each number of looks in `_JUDGED`, and choose its thresholds."""
     generator = torch.Generator().manual_seed(config.seed)
-    looks = max(*JUDGED, config.looks)
+    looks = max(*_JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []
     for step in searches(model, examples, grid, looks, 0.0, generator):
         assert isinstance(step.belief, TargetBelief)
@@ -270,7 +240,7 @@ def judge_evidence(
         visited.append(step.visited)
     there = goal.any(-1)
     judged = []
-    for number in (each for each in JUDGED if each <= len(present)):
+    for number in (each for each in _JUDGED if each <= len(present)):
         cells, image, fixated = present[number - 1], anywhere[number - 1], visited[number - 1]
         judged.append(
             {
@@ -314,15 +284,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
     false alarms. Of these pairs, the one with the highest `place` is taken that misses few enough of the targets found
     without a `place` threshold. Then the highest `give_up` is taken that misses few enough of the targets still found.
 
-    Args:
-        config: the limits on wrong decisions.
-        anywhere: `(n, E)`, probability of presence after each look of each search.
-        place: `(n, E)`, highest probability of a fixated cell; 0 if another cell is much more probable.
-        left: `(n, E)`, highest probability of a cell that was not fixated.
-        there: `(E,)` boolean, whether the target is present.
-
-    Returns:
-        The thresholds.
+    Shapes: anywhere `(n, E)`, place `(n, E)`, left `(n, E)`, there `(E,)`.
     """
     number = torch.arange(len(anywhere))[:, None]
 
@@ -354,7 +316,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
     return chosen
 
 
-def evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
+def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
     """Report the evaluation and the thresholds as Markdown."""
     head = [
         "looks",
@@ -430,15 +392,15 @@ class EvidenceFit(PartFit):
         # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
         each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
         area, scenes = config.max_target_area, inputs.held_out
-        wide = make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        wide = _make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
         expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
         surest = SUREST_OF_FEW if expected < 10 else SUREST
-        return judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
+        return _judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
 
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
         config, run, inputs = self.settings, self.run, self.inputs
-        fit = fit_evidence(config, run)
+        fit = _fit_evidence(config, run)
         fit.model.thresholds = thresholds = self.choose_thresholds(fit.model)
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {
@@ -485,7 +447,7 @@ class EvidenceFit(PartFit):
                     "search gives up.",
                     outcomes,
                 ),
-                evidence_report(fit.judged, thresholds, fit.trained, fit.held_out),
+                _evidence_report(fit.judged, thresholds, fit.trained, fit.held_out),
             ]
         )
         save_figure(curves_figure(curves, "search"), self.config.out / "search.png")

@@ -23,11 +23,7 @@ from semfov.gaze.choice import Exploratory
 class Examples(ABC):
     """Base of training examples; the fields are tensors with a row for each example.
 
-    Attributes:
-        features: `(E, X·Y, …, X·Y, F)`, features of the looks from every cell, in half precision.
-        score: `(E, X·Y, …)`, highest score of a class in the look from each cell.
-        distance: `(E, X·Y, X·Y)`, distance from every cell to every cell, in units of the image's longer side.
-        scene: `(E,)`, index of the photograph.
+    Shapes: features `(E, X·Y, …, X·Y, F)`, score `(E, X·Y, …)`, distance `(E, X·Y, X·Y)`, scene `(E,)`.
     """
 
     features: Tensor
@@ -44,26 +40,11 @@ class Examples(ABC):
 
     @abstractmethod
     def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> Look:
-        """Process stored looks with the model in training.
-
-        Args:
-            observer: the observer with the model.
-            episodes: `(A,)`, the examples.
-            cell: `(A,)`, the fixated cell of each.
-            columns: number of columns of the grid.
-
-        Returns:
-            Their evidence.
-        """
+        """Process stored looks with the model in training; episodes `(A,)`, cell `(A,)`."""
 
 
-class ExampleLooks(Looks):
-    """Looks at many photographs at once, with one episode for each example.
-
-    Args:
-        examples: the examples, one for each episode.
-        grid: the grid of cells, of the examples' size.
-    """
+class _ExampleLooks(Looks):
+    """Looks at many photographs at once, with one episode for each example."""
 
     def __init__(self, examples: Examples, grid: Grid) -> None:
         self.examples, self.grid = examples, grid
@@ -87,20 +68,7 @@ def example_episodes(
     astray: float,
     generator: torch.Generator,
 ) -> Iterator[Step]:
-    """Make one episode over every example, from a random start. Searches continue after they reach their target.
-
-    Args:
-        examples: the examples.
-        observer: the observer with the model.
-        acquisition: chooses the fixations.
-        grid: the grid of cells.
-        looks: number of looks in an episode.
-        astray: share of the fixations that are drawn at random.
-        generator: source of random numbers.
-
-    Returns:
-        The steps of all episodes together.
-    """
+    """Make one episode over every example, from a random start. Searches continue after they reach their target."""
     start = torch.randint(len(grid), (len(examples),), generator=generator)
     choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
-    return rollout(ExampleLooks(examples, grid), observer, acquisition, start, choice, most=looks)
+    return rollout(_ExampleLooks(examples, grid), observer, acquisition, start, choice, most=looks)

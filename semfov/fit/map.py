@@ -62,16 +62,11 @@ class FitMapConfig(FitOnLooksConfig):
 
 
 @dataclass(frozen=True)
-class MapExamples(Examples):
+class _MapExamples(Examples):
     """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
 
-    Attributes:
-        features: `(E, X·Y, T, X·Y, F)`, `class_features` of the looks from every cell, in half precision.
-        score: `(E, X·Y, T)`, highest score of each class in the look from each cell.
-        answers: `(E, X·Y, T+1)` boolean, whether a cell is background (first), and whether an object of each class
-            overlaps it.
-        targets: `(E, T)`, the classes.
-        stands_for: `(E, T)`, number of classes that each class represents.
+    Shapes: features `(E, X·Y, T, X·Y, F)`, score `(E, X·Y, T)`, answers `(E, X·Y, T+1)`, targets `(E, T)`, stands_for
+    `(E, T)`.
     """
 
     answers: Tensor
@@ -91,22 +86,8 @@ class MapExamples(Examples):
         )
 
 
-def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> MapExamples:
-    """Make examples from all photographs with objects.
-
-    Args:
-        run: the finished looks from every cell.
-        classes: number of classes in each example: the present ones, then those with the highest scores, then random
-            ones.
-        others: number of random classes. Together they represent all classes that are not in the example.
-        seed: seed of the random choice.
-
-    Returns:
-        The examples.
-
-    Raises:
-        DataError: no photograph has an object.
-    """
+def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _MapExamples:
+    """Make examples from all photographs with objects."""
     rows = []
     components = len(run.scenes.classes) + 1
     for index in track(range(len(run.scenes)), "describing looks", "scene"):
@@ -136,18 +117,18 @@ def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> Map
         rows.append(row)
     if not rows:
         raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")
-    return MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
+    return _MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
 def fit_map(config: FitMapConfig) -> None:
     """Look from every cell, train, evaluate on held-out photographs, and write all results."""
     check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
-    fit_and_write(config, fit_map_evidence)
+    fit_and_write(config, _fit_map_evidence)
 
 
-def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
+def _fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model."""
-    examples = make_map_examples(run, config.classes, config.others, config.seed)
+    examples = _make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
@@ -156,23 +137,15 @@ def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
         model = MapEvidence(components=len(run.scenes.classes) + 1, metadata=metadata)
     with torch.no_grad():
         model.prior.copy_(frequencies(run, config.holdout))
-    train_map(config, model, examples[~held_out], grid)
-    train_gain(config, model, examples[~held_out], grid)
-    judged = judge_map(config, model.eval(), examples[held_out], grid)
+    _train_map(config, model, examples[~held_out], grid)
+    _train_gain(config, model, examples[~held_out], grid)
+    judged = _judge_map(config, model.eval(), examples[held_out], grid)
     counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, map_report(judged, *counts))
+    return Fit(model, judged, *counts, _map_report(judged, *counts))
 
 
 def frequencies(run: Looking, holdout: int) -> Tensor:
-    """Count how often a cell contains each class in the training photographs.
-
-    Args:
-        run: the run over the photographs.
-        holdout: one in every n photographs is left out, as it is held out.
-
-    Returns:
-        `ℓ / 4 + 1` with the log-odds ℓ of each class, `(K+1,)`; the values are of the order of 1.
-    """
+    """Count how often a cell contains each class in the training photographs; → `(K+1,)`."""
     components, cells = len(run.scenes.classes) + 1, 0
     count = torch.zeros(components)
     for index in range(len(run.scenes)):
@@ -183,7 +156,7 @@ def frequencies(run: Looking, holdout: int) -> Tensor:
     return ((count + 1) / (cells + 2)).logit() / 4 + 1
 
 
-def train_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+def _train_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples, grid: Grid) -> None:
     """Train on explorations that follow the model. Some of their fixations are random."""
     generator = torch.Generator().manual_seed(config.seed)
 
@@ -200,7 +173,7 @@ def train_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, g
 
 
 def explorations(
-    model: MapEvidence, examples: MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+    model: MapEvidence, examples: _MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
     """Explore every example; see `example_episodes`."""
     return example_episodes(
@@ -208,17 +181,10 @@ def explorations(
     )
 
 
-def map_objective(step: Step, examples: MapExamples) -> Tensor:
+def map_objective(step: Step, examples: _MapExamples) -> Tensor:
     """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
 
     A class that was drawn at random counts as often as the number of classes that it represents.
-
-    Args:
-        step: the step after a look.
-        examples: the examples, with the true classes of the cells.
-
-    Returns:
-        The loss, a scalar.
     """
     belief = step.belief
     assert isinstance(belief, MapBelief)
@@ -228,7 +194,7 @@ def map_objective(step: Step, examples: MapExamples) -> Tensor:
     return (each.mean(1) * weight).sum(-1).mean()
 
 
-def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+def _train_gain(config: FitMapConfig, model: MapEvidence, examples: _MapExamples, grid: Grid) -> None:
     """Train the prediction of a look's gain by least squares.
 
     The gain of a look in a cell is the change of the cell's answer from wrong to right (1) or from right to wrong (-1).
@@ -265,7 +231,7 @@ def right(step: Step, answers: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def judge_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
+def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples, grid: Grid) -> list[dict[str, float]]:
     """Evaluate the model on held-out explorations, after each number of looks in `_JUDGED`."""
     generator = torch.Generator().manual_seed(config.seed)
     judged = []
@@ -301,7 +267,7 @@ def judge_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, g
     return judged
 
 
-def map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
+def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
     """Report the evaluation as Markdown."""
     head = [
         "looks",
@@ -365,7 +331,7 @@ class MapFit(PartFit):
         inputs, run = self.inputs, self.run
         if inputs.components < 3:
             raise InputError("detector: a map of all classes needs at least 2 classes, got a detector with 1 class")
-        fit = fit_map_evidence(self.settings, run)
+        fit = _fit_map_evidence(self.settings, run)
         fovea = self.config.sensor.fovea
         ways = {
             "fitted": strategy(LearnedMap(fit.model), Closer(fovea)),

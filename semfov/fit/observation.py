@@ -106,11 +106,11 @@ def fit_fom(config: FitObservationConfig) -> None:
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
-    statistics = statistics_of(config, sampler, training)
-    model = fit_model(config, sampler, statistics, samples[~held_out])
+    statistics = _statistics_of(config, sampler, training)
+    model = _fit_model(config, sampler, statistics, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     counts = (
-        count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
+        _count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
     )
     misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
     model.miss_rate = misses.rates().to(model.edges)
@@ -118,13 +118,13 @@ def fit_fom(config: FitObservationConfig) -> None:
         model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
-    written = write_report(config, model, fit_all(config, sampler, statistics, model), samples[held_out])
+    written = _write_report(config, model, _fit_all(config, sampler, statistics, model), samples[held_out])
     print("written:")
     for file in [path, *written]:
         print(f"  {file}")
 
 
-class Looker(Protocol):
+class _Looker(Protocol):
     """The source of the detections: a `Sampler`, or a run with looks from every cell."""
 
     @property
@@ -135,29 +135,19 @@ class Looker(Protocol):
     scenes: Scenes
 
 
-def fit_model(
-    config: FitObservationConfig, sampler: Looker, statistics: DirichletStatistics, samples: Samples
+def _fit_model(
+    config: FitObservationConfig, sampler: _Looker, statistics: DirichletStatistics, samples: Samples
 ) -> FovealObservationModel:
-    """Fit the model with the method in the settings.
-
-    Args:
-        config: the settings.
-        sampler: the source of the detections.
-        statistics: sufficient statistics of the labelled detections to fit on (`statistics_of`).
-        samples: the detections themselves, or some of them, for the discriminative fit.
-
-    Returns:
-        The model.
-    """
+    """Fit the model with the method in the settings."""
     if config.method != "discriminative":
-        return fit_published(config, sampler, statistics, config.method)
-    start = fit_published(config, sampler, statistics, "newton", expected="empirical")
+        return _fit_published(config, sampler, statistics, config.method)
+    start = _fit_published(config, sampler, statistics, "newton", expected="empirical")
     return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
-def fit_published(
+def _fit_published(
     config: FitObservationConfig,
-    sampler: Looker,
+    sampler: _Looker,
     statistics: DirichletStatistics,
     method: Method,
     **options: Any,
@@ -165,16 +155,6 @@ def fit_published(
     """Fit Dirichlet distributions to the scores of each class and level.
 
     A pair of class and level with enough detections is fitted by maximum likelihood, as published. Others are shrunk.
-
-    Args:
-        config: the settings.
-        sampler: the source of the detections.
-        statistics: sufficient statistics of the detections to fit on (`statistics_of`).
-        method: method of the maximum-likelihood fit.
-        options: further options of `FovealObservationModel.fit`.
-
-    Returns:
-        The model.
     """
     classes = sampler.eye.detector.classes
     model = FovealObservationModel.identity(classes, config.edges)
@@ -196,17 +176,8 @@ def fit_published(
         ).eval()
 
 
-def statistics_of(config: FitObservationConfig, sampler: Looker, shards: Iterable[Samples]) -> DirichletStatistics:
-    """Sum the sufficient statistics of detections by class and level, shard by shard.
-
-    Args:
-        config: the settings.
-        sampler: the source of the detections.
-        shards: the labelled detections.
-
-    Returns:
-        The statistics, which do not depend on how the detections are divided into shards.
-    """
+def _statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Iterable[Samples]) -> DirichletStatistics:
+    """Sum the sufficient statistics of detections by class and level, shard by shard."""
     model = FovealObservationModel.identity(sampler.eye.detector.classes, config.edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
@@ -215,37 +186,26 @@ def statistics_of(config: FitObservationConfig, sampler: Looker, shards: Iterabl
     return statistics
 
 
-def fit_all(
-    config: FitObservationConfig, sampler: Looker, statistics: DirichletStatistics, model: FovealObservationModel
+def _fit_all(
+    config: FitObservationConfig, sampler: _Looker, statistics: DirichletStatistics, model: FovealObservationModel
 ) -> dict[str, FovealObservationModel]:
     """Fit the models that the report compares: raw scores, the published estimators, and the requested model."""
     edges, classes = config.edges, sampler.eye.detector.classes
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
-        models[f"Dirichlet, {method}"] = fit_published(config, sampler, statistics, method)
-    models["Dirichlet with class prior"] = fit_published(config, sampler, statistics, "newton", prior=True)
-    models["the same, tempered 0.1"] = fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
+        models[f"Dirichlet, {method}"] = _fit_published(config, sampler, statistics, method)
+    models["Dirichlet with class prior"] = _fit_published(config, sampler, statistics, "newton", prior=True)
+    models["the same, tempered 0.1"] = _fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
     if config.method == "discriminative":
         models["discriminative"] = model
     return models
 
 
-def count_misses(
+def _count_misses(
     photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: CellsOfLook
 ) -> MissCounts:
-    """Count cells without any detection over all looks at some photographs.
-
-    Args:
-        photographs: the photographs.
-        samples: the labelled detections of the looks.
-        scenes: indices of the photographs to count.
-        edges: `(N-1,)`, borders between levels of distance, or of magnification.
-        cells: gives the cells of each look in which misses are counted.
-
-    Returns:
-        The counts by class and level.
-    """
+    """Count cells without any detection over all looks at some photographs; edges `(N-1,)`."""
     counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
     misses = MissCounts(samples.scores.shape[-1], len(edges) + 1)
     for look, boxes in enumerate(samples.boxes.split(counts)):
@@ -263,7 +223,7 @@ def count_misses(
 _Models = dict[str, FovealObservationModel]
 
 
-def write_report(
+def _write_report(
     config: FitObservationConfig,
     model: FovealObservationModel,
     models: _Models,
@@ -277,20 +237,20 @@ def write_report(
             for name, m in models.items()
         }
     figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
-    by_level = figures_by_level(model, predictions, judged)
-    text = report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
+    by_level = _figures_by_level(model, predictions, judged)
+    text = _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
-    write_text(config.out / "manifest.json", json.dumps(fit_manifest(model, figures), indent=2) + "\n")
+    write_text(config.out / "manifest.json", json.dumps(_fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
-    write_text(config.out / "counts.csv", counts_csv(model))
+    write_text(config.out / "counts.csv", _counts_csv(model))
     figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
     names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
 
 
-def report_markdown(
+def _report_markdown(
     config: FitObservationConfig,
     model: FovealObservationModel,
     figures: dict[str, Calibration],
@@ -298,19 +258,7 @@ def report_markdown(
     by_level: list[list[str]],
     fitted: int,
 ) -> str:
-    """Write the report as Markdown: the measures of each model, then counts and measures by level.
-
-    Args:
-        config: the settings.
-        model: the fitted model.
-        figures: calibration of each model on the held-out samples.
-        likelihood: mean log likelihood of the held-out scores under each model.
-        by_level: cells of the table by level (`figures_by_level`).
-        fitted: number of samples to fit on.
-
-    Returns:
-        The text.
-    """
+    """Write the report as Markdown: the measures of each model, then counts and measures by level."""
     judged = next(iter(figures.values())).count
     head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
     rows = [
@@ -356,17 +304,10 @@ def report_markdown(
     )
 
 
-def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples) -> list[list[str]]:
-    """Compute NLL and ECE of raw scores and of the fitted model at each level.
-
-    Args:
-        model: the fitted model.
-        predictions: class probabilities `(M, K+1)` of each model, raw scores first and the fitted model last.
-        judged: the held-out samples.
-
-    Returns:
-        Cells of a table, one row for each level.
-    """
+def _figures_by_level(
+    model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples
+) -> list[list[str]]:
+    """Compute NLL and ECE of raw scores and of the fitted model at each level; predictions `(M, K+1)`."""
     first, *_, last = predictions.values()
     level = model.level(judged.distance)
     rows = []
@@ -380,14 +321,14 @@ def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tenso
     return rows
 
 
-def counts_csv(model: FovealObservationModel) -> str:
+def _counts_csv(model: FovealObservationModel) -> str:
     """Write the number of detections of each true class at each level in the fit as CSV."""
     names = ("background", *model.classes)
     rows = ([name, *counts] for name, counts in zip(names, model.metadata["counts"], strict=True))
     return csv_text([["class", *(f"level {n}" for n in range(len(model.edges) + 1))], *rows])
 
 
-def fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
+def _fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
     """Record the command, the commit, the versions and the model that the measures come from."""
     metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
     return {
@@ -420,10 +361,10 @@ class ObservationFit(PartFit):
         config, run, samples = self.settings, self.run, self.inputs.samples
         held_out = split(samples.scene, config.holdout)
         judged = samples[held_out]
-        model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
+        model = _fit_model(config, run, _statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = whole_photograph(self.config.columns, self.config.rows)
-        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        misses = _count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
         with torch.inference_mode():

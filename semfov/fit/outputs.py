@@ -24,14 +24,6 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
     """Build the metadata of a model about its training: the photographs, and the settings that the model depends on.
 
     The settings of detector and sensor are left out, because `Eye.settings()` provides them. Paths are left out too.
-
-    Args:
-        config: dataclass of the settings.
-        scenes: the photographs.
-        besides: further settings to leave out, because the model does not depend on them.
-
-    Returns:
-        The metadata.
     """
     left_out = {*WHERE, "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in config.plain().items() if name not in left_out}
@@ -44,14 +36,7 @@ def model_path(config: Any, detector: str) -> Path:
 
 
 def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
-    """Print the report, write it with the settings and the measures to `config.out`, and list the written files.
-
-    Args:
-        config: dataclass of the settings.
-        report: the report in Markdown.
-        figures: name and content of a JSON file with the measures.
-        model: file of the model, already written, to include in the list.
-    """
+    """Print the report, write it with the settings and the measures to `config.out`, and list the written files."""
     files = {
         "report.md": report,
         "config.yaml": config.yaml(),
@@ -66,15 +51,7 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
 
 @dataclass(frozen=True)
 class Fit(Generic[Model]):
-    """The result of a fit.
-
-    Attributes:
-        model: the model, fitted to the photographs that are not held out.
-        judged: measures on the held-out photographs after some looks.
-        trained: number of training examples.
-        held_out: number of held-out examples.
-        report: the measures as Markdown.
-    """
+    """The result of a fit."""
 
     model: Model
     judged: list[dict[str, float]]
@@ -84,18 +61,7 @@ class Fit(Generic[Model]):
 
 
 def split(scene: Tensor, holdout: int) -> Tensor:
-    """Select the examples to hold out.
-
-    Args:
-        scene: `(E,)`, index of the photograph of each example.
-        holdout: one in every n photographs is held out, beginning with the first.
-
-    Returns:
-        Whether each example is held out, `(E,)` boolean.
-
-    Raises:
-        DataError: all examples are held out, or none is.
-    """
+    """Select the examples to hold out; scene `(E,)` → `(E,)`."""
     held_out = scene % holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(
@@ -106,12 +72,7 @@ def split(scene: Tensor, holdout: int) -> Tensor:
 
 
 def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
-    """Look from every cell, fit, and write the model, the report, the settings and the measures.
-
-    Args:
-        config: settings of the fit.
-        fit: makes the model from the settings and the finished looks.
-    """
+    """Look from every cell, fit, and write the model, the report, the settings and the measures."""
     run = looking_of(config)
     finish(run, "looking")
     fitted = fit(config, run)

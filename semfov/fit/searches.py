@@ -35,16 +35,6 @@ class TargetSearch(ABC, Generic[LookType]):
     """Base of the searches for a class in a picture, with all their looks but the closer ones.
 
     Decisions do not move the gaze, so all of them can be made along the same looks.
-
-    Args:
-        picture: number of the picture.
-        target: the class, 1..K.
-        present: whether the picture holds it.
-        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
-        passes: maximum number of looks of both kinds.
-
-    Attributes:
-        after: numbers of looks after which places are examined for the fit.
     """
 
     after: ClassVar[tuple[int, ...]]
@@ -88,29 +78,14 @@ class TargetSearch(ABC, Generic[LookType]):
 
 
 @dataclass(frozen=True)
-class SearchTarget(DrawnSearch):
-    """A class to search for in a photograph.
-
-    Attributes:
-        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
-    """
+class _SearchTarget(DrawnSearch):
+    """A class to search for in a photograph."""
 
     spare: bool = False
 
 
 class SearchedPhotograph:
-    """A photograph with the classes to search for, and all looks at it so far.
-
-    Args:
-        eye: sensor and detector.
-        scenes: the photographs.
-        index: index of the photograph.
-        number: number of the photograph among those that are searched.
-        grid: the cells.
-        targets: the classes to search for.
-        store: store of all looks; None keeps them in memory.
-        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
-    """
+    """A photograph with the classes to search for, and all looks at it so far."""
 
     def __init__(
         self,
@@ -119,7 +94,7 @@ class SearchedPhotograph:
         index: int,
         number: int,
         grid: Grid,
-        targets: tuple[SearchTarget, ...],
+        targets: tuple[_SearchTarget, ...],
         store: DetectionStore | None = None,
         everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
@@ -169,24 +144,7 @@ def open_photographs(
     spare: int = 0,
     everywhere: Callable[[int], Detections] | None = None,
 ) -> list[SearchedPhotograph]:
-    """Draw classes to search for in photographs.
-
-    Args:
-        eye: sensor and detector.
-        scenes: the photographs.
-        chosen: indices of those to search.
-        cells: `(columns, rows)` of the grid.
-        classes: maximum number of present classes in a photograph.
-        absent: maximum number of absent classes (None: as many as present ones).
-        max_area: classes that cover a larger share of the image are left out.
-        seed: seed of the classes and of the first fixations.
-        store: store of all looks; None keeps them in memory.
-        spare: maximum number of further absent classes, which only serve to choose thresholds (`SearchTarget.spare`).
-        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
-
-    Returns:
-        The photographs with classes to search for.
-    """
+    """Draw classes to search for in photographs; cells `(columns, rows)`."""
     photographs, protocol = list[SearchedPhotograph](), ProtocolConfig(seed=seed)
     for index in chosen:
         annotation = scenes.annotation(index)
@@ -197,7 +155,7 @@ def open_photographs(
         # The same draw with a larger number begins with the same classes.
         wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
         search_targets = tuple(
-            SearchTarget(**vars(search), spare=number >= len(targets)) for number, search in enumerate(wide)
+            _SearchTarget(**vars(search), spare=number >= len(targets)) for number, search in enumerate(wide)
         )
         if targets:
             photographs.append(
@@ -206,9 +164,9 @@ def open_photographs(
     return photographs
 
 
-def search_photograph(
+def _search_photograph(
     photograph: SearchedPhotograph,
-    target: SearchTarget,
+    target: _SearchTarget,
     observer: Observer,
     looks: int,
 ) -> Iterator[Step]:
@@ -218,24 +176,17 @@ def search_photograph(
     return rollout(source, observer, TargetPosterior(target.target), target.start, choice, most=looks)
 
 
-class PhotographSearch(TargetSearch[Step]):
-    """A search of a photograph, where the class is most probable.
-
-    Args:
-        photograph: the photograph.
-        target: the class.
-        evidence: the target evidence.
-        looks: number of looks.
-    """
+class _PhotographSearch(TargetSearch[Step]):
+    """A search of a photograph, where the class is most probable."""
 
     after = (1, 3, 5, 8, 12)
 
     def __init__(
-        self, photograph: SearchedPhotograph, target: SearchTarget, evidence: TargetEvidence, looks: int
+        self, photograph: SearchedPhotograph, target: _SearchTarget, evidence: TargetEvidence, looks: int
     ) -> None:
         super().__init__(photograph.number, target.target, present=target.present, spare=target.spare)
         self.photograph, self.goal = photograph, target.goal
-        self._search = lambda: search_photograph(photograph, target, Target(evidence), looks)
+        self._search = lambda: _search_photograph(photograph, target, Target(evidence), looks)
 
     @cached_property
     def steps(self) -> list[Step]:
@@ -278,9 +229,9 @@ class PhotographSearch(TargetSearch[Step]):
 
 def photograph_searches(
     photographs: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
-) -> Iterator[PhotographSearch]:
+) -> Iterator[_PhotographSearch]:
     """Search photographs for all their classes; after the searches of one, its looks are stored and freed."""
     for photograph in track(photographs, title, "photograph"):
         for target in photograph.targets:
-            yield PhotographSearch(photograph, target, evidence, looks)
+            yield _PhotographSearch(photograph, target, evidence, looks)
         photograph.close()

@@ -76,7 +76,7 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     samples = sampler.all()
     model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
-    text = tempering_report(hits)
+    text = _tempering_report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
@@ -87,35 +87,13 @@ def measure(
     model: FovealObservationModel | None,
     tempering: float,
 ) -> dict[str, float]:
-    """Measure one exponent: the share of next fixations that hit the target, as means over photographs.
-
-    Args:
-        config: the settings.
-        sampler: the sampler that looked.
-        samples: the labelled detections of the looks.
-        model: observation model, or None for raw scores.
-        tempering: the exponent.
-
-    Returns:
-        The means over the photographs to choose by (`fitted`) and over the `held_out` ones.
-    """
+    """Measure one exponent: the share of next fixations that hit the target, as means over photographs."""
     observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
-    return means_of(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
+    return _means_of(config, _hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
 
 
-def means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
-    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones.
-
-    Args:
-        config: the settings.
-        rates: hit rates by the index of the photograph (`hit_rates`).
-
-    Returns:
-        The two means.
-
-    Raises:
-        DataError: one of the two groups has no photograph.
-    """
+def _means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
+    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones."""
     means: dict[str, list[float]] = {"fitted": [], "held_out": []}
     for index, share in rates.items():
         means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
@@ -127,21 +105,10 @@ def means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, f
     return {name: sum(values) / len(values) for name, values in means.items()}
 
 
-def hit_rates(
+def _hit_rates(
     config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
 ) -> dict[int, float]:
-    """Compute the share of next fixations that hit the target in each photograph.
-
-    Args:
-        config: the settings, which select photographs and targets.
-        scenes: the photographs.
-        samples: labelled detections of the looks, `config.fixations` for each photograph, in order.
-        observer: the observer that fuses the looks.
-        title: label of the progress bar.
-
-    Returns:
-        The hit rates by the index of the photograph.
-    """
+    """Compute the share of next fixations that hit the target in each photograph."""
     rates = {}
     number = min(config.photographs or len(scenes), len(scenes))
     for index in track(range(number), title, "scene"):
@@ -170,16 +137,7 @@ def hit_rate(
     target are left out, as they would have ended the search. If several cells are equally probable, the share of them
     that contain the target counts.
 
-    Args:
-        observer: the observer that fuses the looks.
-        detections: detections of R looks at the photograph.
-        fixations: `(R, 2)`, fixations of the looks, `(x, y)` in pixels.
-        grid: the grid of cells.
-        targets: `(T,)`, classes to search for.
-        goal: `(T, X·Y)` boolean, cells that contain them.
-
-    Returns:
-        The share, or None if every look fixates every target.
+    Shapes: fixations `(R, 2)`, targets `(T,)`, goal `(T, X·Y)`.
     """
     evidence = observer.weigh(detections, fixations, grid)
     belief = observer.start(len(targets), grid, detections.scores)
@@ -197,7 +155,7 @@ def hit_rate(
     return float(share.mean()) if len(share) else None
 
 
-def tempering_report(hits: dict[float, dict[str, float]]) -> str:
+def _tempering_report(hits: dict[float, dict[str, float]]) -> str:
     """Report the hit rates of every exponent and the best exponent as Markdown."""
     best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
     rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
@@ -239,15 +197,15 @@ class TemperingFit(PartFit):
         config, run, inputs = self.settings, self.run, self.inputs
         ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
         baseline = Semantic(inputs.components)
-        raw = hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
+        raw = _hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
         rates = {
-            (scores, exponent): hit_rates(
+            (scores, exponent): _hit_rates(
                 config, run.scenes, inputs.samples, inputs.fusing(scores, exponent), f"{scores} {exponent:g}"
             )
             for scores in ways
             for exponent in config.exponents
         }
-        means = {way: means_of(config, each) for way, each in rates.items()}
+        means = {way: _means_of(config, each) for way, each in rates.items()}
         scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
         held_out = [index for index in raw if index % config.holdout == 0]
         chosen = rates[best]
@@ -255,7 +213,7 @@ class TemperingFit(PartFit):
             torch.tensor([chosen[index] for index in held_out]).numpy(),
             torch.tensor([raw[index] for index in held_out]).numpy(),
         )
-        before = means_of(config, raw)["held_out"]
+        before = _means_of(config, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
             f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"

@@ -41,7 +41,7 @@ LEVELS = tuple(number / 100 for number in range(50, 100))
 SHIPPED = ("yolox-nano", "yolov3-tiny")
 """Shipped models whose mean is the centre of the prior for other detectors."""
 
-STRENGTH = 10.0
+_STRENGTH = 10.0
 """Strength of this prior, chosen on photographs that no result is reported on (docs/decisions/closer_looks.md)."""
 
 _EACH = 3  # places examined after some looks
@@ -51,9 +51,9 @@ _RIDGE = 1e-4
 _THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
 """Values of the threshold `confirm` in the table, besides the chosen one."""
 
-SearchEnd = tuple[bool | None, int]
+_SearchEnd = tuple[bool | None, int]
 """End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
-ABSENT = 200
+_ABSENT = 200
 """The threshold is chosen on about this many searches for absent classes, at most 20 in a photograph."""
 
 
@@ -99,19 +99,8 @@ class FitVerificationConfig(FitConfig):
 
 
 @dataclass(frozen=True)
-class VerifiedSearch:
-    """A search in which all closer looks were made, whatever they showed.
-
-    Attributes:
-        picture: number of the picture.
-        present: whether the picture holds the target.
-        spare: whether the search only serves to choose thresholds.
-        places: for each closer look, the probability that the target is there, and whether it is.
-        ends: for each closer look, the number of looks of both kinds that were made up to it.
-        presence: probability that the image holds the target, at the end.
-        looks: number of looks of both kinds.
-        unverified: end of the same search without closer looks, by the thresholds of the target evidence.
-    """
+class _VerifiedSearch:
+    """A search in which all closer looks were made, whatever they showed."""
 
     picture: int
     present: bool
@@ -120,9 +109,9 @@ class VerifiedSearch:
     ends: tuple[int, ...]
     presence: float
     looks: int
-    unverified: SearchEnd
+    unverified: _SearchEnd
 
-    def found(self, confirm: float) -> SearchEnd:
+    def found(self, confirm: float) -> _SearchEnd:
         """Return the end of the search at a threshold."""
         chances = [chance for chance, _ in self.places]
         for number, end in enumerate(self.ends, 1):
@@ -134,14 +123,10 @@ class VerifiedSearch:
 
 
 @dataclass(frozen=True)
-class CloserLooks:
+class _CloserLooks:
     """Closer looks at places that seemed to hold a target.
 
-    Attributes:
-        features: `(N, 7)`, features of the closer looks.
-        right: `(N,)` boolean, whether the target is at the place.
-        present: `(N,)` boolean, whether the picture holds it.
-        fold: `(N,)`, part of the pictures.
+    Shapes: features `(N, 7)`, right `(N,)`, present `(N,)`, fold `(N,)`.
     """
 
     features: Tensor
@@ -152,19 +137,12 @@ class CloserLooks:
 
 @dataclass(frozen=True)
 class VerificationResult:
-    """A fitted model and its evaluation in folds.
-
-    Attributes:
-        model: the model, fitted to all closer looks, with thresholds.
-        folds: for each fold, the model fitted to the others.
-        closer: the closer looks.
-        searches: the searches, each with the model of its fold.
-    """
+    """A fitted model and its evaluation in folds."""
 
     model: Verification
     folds: list[Verification]
-    closer: CloserLooks
-    searches: list[VerifiedSearch]
+    closer: _CloserLooks
+    searches: list[_VerifiedSearch]
 
 
 def fit_verification(config: FitVerificationConfig) -> None:
@@ -209,21 +187,7 @@ def fit_in_folds(
     prior: Verification | None = None,
     surest: float = LEVELS[-1],
 ) -> VerificationResult:
-    """Fit the model to closer looks at photographs, repeat the searches in folds, and choose the threshold `confirm`.
-
-    Args:
-        photographs: the photographs.
-        evidence: the target evidence.
-        config: the settings.
-        prior: model towards which to fit (`fit`).
-        surest: upper limit of the threshold.
-
-    Returns:
-        The model with its evaluation.
-
-    Raises:
-        DataError: there is no candidate, or none of them is right, or none wrong.
-    """
+    """Fit the model to closer looks at photographs, search again in folds, and choose the threshold `confirm`."""
     closer = examine(photograph_searches(photographs, evidence, config.looks, "looking"), config.folds)
     if closer is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
@@ -238,7 +202,7 @@ def fit_in_folds(
 
 
 @torch.inference_mode()
-def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLooks | None:
+def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> _CloserLooks | None:
     """Look closely at the most evident places of every search; None if no place is right, or none is wrong."""
     rows: list[tuple[Tensor, bool, bool, int]] = []
     for search in searches:
@@ -257,7 +221,7 @@ def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLook
     if len({right for _, right, _, _ in rows}) < 2:
         return None
     columns = list(zip(*rows, strict=True))
-    return CloserLooks(torch.stack(columns[0]), *(torch.tensor(column) for column in columns[1:]))
+    return _CloserLooks(torch.stack(columns[0]), *(torch.tensor(column) for column in columns[1:]))
 
 
 @torch.inference_mode()
@@ -266,18 +230,8 @@ def verify(
     folds: Sequence[Verification],
     limits: Thresholds,
     thresholds: Thresholds | None,
-) -> Iterator[VerifiedSearch]:
-    """Make all closer looks of searches, with the model that was not fitted to their picture.
-
-    Args:
-        searches: the searches.
-        folds: for each fold, the model fitted to the others.
-        limits: thresholds of closer looks; `confirm` is 1, so that no search ends at a place.
-        thresholds: thresholds of the evidence, which decide without closer looks (`unverified`).
-
-    Yields:
-        The searches.
-    """
+) -> Iterator[_VerifiedSearch]:
+    """Make all closer looks of searches, with the model that was not fitted to their picture."""
     for search in searches:
         model = folds[search.picture % len(folds)]
         verifier, count, ends = Verifier(model, search.candidates(), search.close_up, limits), 0, list[int]()
@@ -290,7 +244,7 @@ def verify(
             count += closer
             if verifier.outcome() or count >= search.passes:
                 break
-        yield VerifiedSearch(
+        yield _VerifiedSearch(
             picture=search.picture,
             present=search.present,
             spare=search.spare,
@@ -302,7 +256,7 @@ def verify(
         )
 
 
-def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> SearchEnd:
+def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _SearchEnd:
     """Decide along the looks of a search without closer looks; nothing is found without thresholds."""
     if thresholds is None:
         return None, len(search)
@@ -313,7 +267,7 @@ def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> Sear
     return None, len(search)
 
 
-def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, surest: float = LEVELS[-1]) -> float:
+def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, surest: float = LEVELS[-1]) -> float:
     """Choose from `LEVELS` the least threshold, at most `surest`, at which few enough absent targets are found."""
     absent = [each for each in searches if not each.present]
     for confirm in LEVELS:
@@ -322,7 +276,7 @@ def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, sure
     return surest
 
 
-def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
+def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
     r"""Fit both logistic regressions by penalised maximum likelihood.
 
     .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \qquad
@@ -357,7 +311,7 @@ def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) 
     if prior is not None:
         prior_weight = prior.linear.weight.detach().double()
         centre, level = prior_weight * scale, prior.linear.bias.detach().double() + prior_weight @ mean
-        weights = biases = STRENGTH / len(phi)
+        weights = biases = _STRENGTH / len(phi)
     weight, bias = centre.clone().requires_grad_(True), level.clone().requires_grad_(True)
     optimiser = torch.optim.LBFGS([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
 
@@ -377,7 +331,7 @@ def fit(closer: CloserLooks, chosen: Tensor, prior: Verification | None = None) 
     return model.eval().requires_grad_(False)
 
 
-def shipped_mean() -> Verification:
+def _shipped_mean() -> Verification:
     """Return the mean of two shipped models (`SHIPPED`), without thresholds: the centre of the prior."""
     return mean_of([Verification.from_pretrained(name) for name in SHIPPED])
 
@@ -396,17 +350,7 @@ def verification_report(
     pictures: str,
     how: str = "Each photograph is evaluated with a model fitted to other folds.",
 ) -> tuple[str, dict[str, float | None]]:
-    """Evaluate the models in folds.
-
-    Args:
-        fitted: the models with their closer looks and searches.
-        pictures: number and kind of the pictures.
-        how: sentence on which pictures a model is evaluated.
-
-    Returns:
-        The report as Markdown, and its measures by name; None for an area that only one kind of searches leaves
-        undefined.
-    """
+    """Evaluate the models in folds."""
     closer, searches = fitted.closer, fitted.searches
     odds = torch.stack([fold(closer.features) for fold in fitted.folds])
     odds = odds[closer.fold, torch.arange(len(closer.fold))]
@@ -465,7 +409,7 @@ def _figure_text(figure: float | None) -> str:
     return "-" if figure is None else f"{figure:.3f}"
 
 
-def _row(present: Sequence[bool], ended: Sequence[SearchEnd]) -> list[str]:
+def _row(present: Sequence[bool], ended: Sequence[_SearchEnd]) -> list[str]:
     """Hits, false alarms, right places and looks of decisions."""
     shares, places, looks = [], [], []
     for kind in (True, False):
@@ -480,7 +424,7 @@ def _row(present: Sequence[bool], ended: Sequence[SearchEnd]) -> list[str]:
 class VerificationFit(PartFit):
     """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
 
-    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`shipped_mean`).
+    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`_shipped_mean`).
     """
 
     name: ClassVar[str] = "verification"
@@ -513,7 +457,7 @@ class VerificationFit(PartFit):
             absent=config.absent,
             max_area=config.max_target_area,
             seed=config.seed,
-            spare=min(20, ABSENT // len(judged)),
+            spare=min(20, _ABSENT // len(judged)),
             everywhere=run.detections,
         )
         if len(photographs) < 2:
@@ -525,7 +469,7 @@ class VerificationFit(PartFit):
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
-        fitted = fit_in_folds(photographs, evidence, config, shipped_mean(), SUREST_OF_FEW)
+        fitted = fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
@@ -548,15 +492,10 @@ class VerificationFit(PartFit):
         )
 
 
-def scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> FloatArray:
+def scores(searches: Sequence[_VerifiedSearch], ends: Sequence[_SearchEnd]) -> FloatArray:
     """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
 
-    Args:
-        searches: the searches.
-        ends: their ends. A right place scores 1, a wrong place -1, and a search that finds nothing 0.
-
-    Returns:
-        `(P,)`, the mean score of each photograph.
+    Shapes: → `(P,)`.
     """
     by_picture: dict[int, dict[bool, list[int]]] = {}
     for each, (right, _) in zip(searches, ends, strict=True):

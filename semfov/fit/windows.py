@@ -50,7 +50,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
 
-RefitPart = Literal["presence", "decision", "survey", "verification", "certainty"]
+_RefitPart = Literal["presence", "decision", "survey", "verification", "certainty"]
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class FitZoomConfig(FitConfig):
     lost: Share = 0.02
     place: Share = 0.2
     evidence: Path | None = None
-    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
+    refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300
@@ -127,22 +127,22 @@ class FitZoomConfig(FitConfig):
 _OTHER = ("kinds", "each", "judged_each", "tile", "seed")
 """Settings of the pictures that are no mosaics."""
 
-PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
+_PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
 """Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
 
-DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
+_DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
 """Settings that the thresholds and the probability of presence depend on."""
 
-VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", *_OTHER)
+_VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", *_OTHER)
 """Settings that the verification depends on."""
 
-COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
+_COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
 """Settings that the certainty depends on."""
 
-FURTHER = 1e-3
+_FURTHER = 1e-3
 """Highest learning rate of a prediction that is fitted further."""
 
-SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
+_SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
 
 _JUDGED = ("judged", "judged far", "judged crowded")
@@ -151,22 +151,13 @@ _JUDGED = ("judged", "judged far", "judged crowded")
 _log = logging.getLogger(__name__)
 
 
-def make_window_eye(config: FitZoomConfig) -> WindowEye:
+def _make_window_eye(config: FitZoomConfig) -> WindowEye:
     """Make the eye that looks at the mosaics."""
     return WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
 
 
 def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
-    """Compose the mosaics to fit on, and those of held-out photographs.
-
-    Args:
-        config: the settings.
-        classes: names of the detector's classes.
-
-    Returns:
-        The mosaics: `near`, `far`, `small` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of
-        held-out photographs, and `searched` to fit decisions on.
-    """
+    """Compose the mosaics to fit on, and those of held-out photographs."""
     training, held_out = split_photographs(config.data, classes, config.holdout)
     tile = config.tile, config.tile * 3 // 4
     return {
@@ -181,16 +172,8 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
     }
 
 
-def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
-    """Compose the pictures of other kinds.
-
-    Args:
-        config: the settings.
-        classes: names of the detector's classes.
-
-    Returns:
-        By kind, pictures to fit on; and as `judged` with the kind, pictures of held-out photographs.
-    """
+def _make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
+    """Compose the pictures of other kinds."""
     training, held_out = split_photographs(config.data, classes, config.holdout)
     pictures: dict[str, Scenes] = {}
     for kind in PICTURE_KINDS:
@@ -207,12 +190,12 @@ def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
 _process: dict[str, Any] = {}
 
 
-def prepare_fit_process(config: FitZoomConfig) -> None:
+def _prepare_fit_process(config: FitZoomConfig) -> None:
     """Build the eye, the mosaics and the store once in this process."""
     prepare_worker()
-    eye = make_window_eye(config)
+    eye = _make_window_eye(config)
     classes = eye.detector.classes
-    pictures = {**make_mosaics(config, classes), **make_kinds(config, classes)}
+    pictures = {**make_mosaics(config, classes), **_make_kinds(config, classes)}
     _process.update(eye=eye, pictures=pictures, store=make_store(config, eye))
 
 
@@ -226,7 +209,7 @@ def look(task: tuple[str, int]) -> bytes:
     return pack_tensors(_process["store"].read(pictures.digest(index)))
 
 
-def read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
+def _read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
     """Read the results of the looks at all pictures in which looks can be closer than an overview."""
     opened = {n: StoredGlances(eye, pictures, n, store) for n in range(len(pictures))}
     least = eye.detector.least
@@ -235,14 +218,14 @@ def read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list[
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    eye = make_window_eye(config)
+    eye = _make_window_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
-    pictures = {**mosaics, **make_kinds(config, eye.detector.classes)}
+    pictures = {**mosaics, **_make_kinds(config, eye.detector.classes)}
     store = make_store(config, eye)
     lines: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
+    refit: set[_RefitPart] = set(config.refit) if config.evidence else {*get_args(_RefitPart)}
     looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
     looked += ["crowded", "judged crowded"] * ("survey" in refit)
     looked += [*config.kinds] * ("presence" in refit)
@@ -257,13 +240,13 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
         if "presence" in refit:
-            lines += fit_further(config, model, examples)
+            lines += _fit_further(config, model, examples)
     if "survey" in refit:
         measured = survey_again(config, model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
         tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        lines += [*figures_of(measured), "", chosen, "", *table(tried), ""]
+        lines += [*_figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
         lines += fit_decision(config, model, eye, pictures, store)
         # A verification belongs to the probability that it was fitted with.
@@ -293,7 +276,7 @@ def look_at_all(
         look,
         todo,
         where=config.where,
-        setup=prepare_fit_process,
+        setup=_prepare_fit_process,
         settings=(config,),
         title="looking",
         unit="picture",
@@ -304,7 +287,7 @@ def look_at_all(
             if store.read(digest) is None:
                 store.write(digest, unpack_tensors(looks))
     prepare_worker()
-    return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
+    return {kind: _read_examples(some, store, eye) for kind, some in looked.items()}
 
 
 def fit_looks(
@@ -315,43 +298,36 @@ def fit_looks(
     random.seed(config.seed)
     metadata = {**eye.settings(), **training_of(config, near, "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
-    looks = training_looks(config, examples)
+    looks = _training_looks(config, examples)
     fit_presence(model, pair_windows(looks), config.steps)
     fit_rates(model, looks, config.steps)
     return model.eval().requires_grad_(False)
 
 
-def training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
+def _training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
     """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
     return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
 
 
-def fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
-    """Fit the prediction whether a closer look shows a class further from where it is, more slowly.
-
-    Args:
-        config: the settings.
-        model: the model; the prediction is replaced.
-        examples: the looks to learn from, and `judged` looks by kind.
-
-    Returns:
-        Lines of the report in Markdown: the cross-entropy before and after, by kind.
-    """
+def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+    """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
     torch.manual_seed(config.seed)
     judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
-    before = {kind: cross_entropies(model, windows) for kind, windows in judged.items()}
-    fit_presence(model.requires_grad_(True), pair_windows(training_looks(config, examples)), config.steps, rate=FURTHER)
+    before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
+    fit_presence(
+        model.requires_grad_(True), pair_windows(_training_looks(config, examples)), config.steps, rate=_FURTHER
+    )
     model.requires_grad_(False)
-    model.metadata["presence"] = {name: getattr(config, name) for name in PREDICTING}
+    model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]
     for kind, windows in judged.items():
-        pairs = zip(before[kind], cross_entropies(model, windows), strict=True)
+        pairs = zip(before[kind], _cross_entropies(model, windows), strict=True)
         rows.append([kind, *(f"{each:.4f}" for pair in pairs for each in pair)])
     return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
 
 
 @torch.no_grad()
-def cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
+def _cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
     """The cross-entropy of whether a closer look shows a class, by overviews and by closer looks (NaN without any)."""
     rows = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
     first, later = (float(presence_loss(model, windows, some)) if len(some) else float("nan") for some in rows)
@@ -372,12 +348,12 @@ def survey_again(
     }
     fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
     model.survey = survey.eval().requires_grad_(False)
-    model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
+    model.metadata["survey"] = {name: getattr(config, name) for name in _SURVEYING}
     crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
     return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
 
 
-def searched_kinds(config: FitZoomConfig) -> dict[str, tuple[str, ...]]:
+def _searched_kinds(config: FitZoomConfig) -> dict[str, tuple[str, ...]]:
     """Kinds of pictures to fit decisions on, and to choose thresholds on."""
     return {"searched": ("searched", *config.kinds), "judged": ("judged", *(f"judged {kind}" for kind in config.kinds))}
 
@@ -385,18 +361,7 @@ def searched_kinds(config: FitZoomConfig) -> dict[str, tuple[str, ...]]:
 def fit_decision(
     config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, pictures: Mapping[str, Scenes], store: GlanceStore
 ) -> list[str]:
-    """Fit the decisions of searches: the probability of presence, and the thresholds.
-
-    Args:
-        config: the settings.
-        model: the model to complete.
-        eye: the eye that looks.
-        pictures: the pictures (`make_mosaics`, `make_kinds`).
-        store: store of the looks.
-
-    Returns:
-        Lines of the report in Markdown.
-    """
+    """Fit the decisions of searches: the probability of presence, and the thresholds."""
     prepare_worker()
     torch.manual_seed(config.seed)
     searches = {
@@ -414,12 +379,12 @@ def fit_decision(
                 for kind in kinds
             ]
         )
-        for use, kinds in searched_kinds(config).items()
+        for use, kinds in _searched_kinds(config).items()
     }
     fit_judge(model, searches["searched"], config.judging)
     rows = judge_searches(model, searches["judged"], config)
     assert model.thresholds is not None
-    model.metadata["decision"] = {name: getattr(config, name) for name in DECIDING}
+    model.metadata["decision"] = {name: getattr(config, name) for name in _DECIDING}
     fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
     return [
         f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them for "
@@ -445,11 +410,11 @@ def fit_closer_looks(
     prepare_worker()
     searched = {
         use: [(pictures[kind], open_all(eye, pictures[kind], store)) for kind in kinds]
-        for use, kinds in searched_kinds(config).items()
+        for use, kinds in _searched_kinds(config).items()
     }
     text = fit_closer(model, searched, config, prior)
     if model.verification is not None:
-        model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
+        model.metadata["verification"] = {name: getattr(config, name) for name in _VERIFYING}
     return ["Closer looks:", "", text]
 
 
@@ -458,7 +423,7 @@ def fit_counts(
 ) -> list[str]:
     """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
     prepare_worker()
-    fitted, judged = searched_kinds(config).values()
+    fitted, judged = _searched_kinds(config).values()
     some = some_explored(config.searched)
     names = dict.fromkeys((*fitted, *some)), dict.fromkeys(judged)
     training, held_out = (
@@ -466,7 +431,7 @@ def fit_counts(
         for kinds in names
     )
     lines = certainty_again(model, training, held_out, passes=config.passes)
-    model.metadata["certainty"] = {name: getattr(config, name) for name in COUNTING}
+    model.metadata["certainty"] = {name: getattr(config, name) for name in _COUNTING}
     return lines
 
 
@@ -477,15 +442,7 @@ def some_explored(searched: int) -> dict[str, int]:
 
 @torch.no_grad()
 def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
-    """Evaluate the model on held-out mosaics.
-
-    Args:
-        model: the model.
-        examples: the held-out examples.
-
-    Returns:
-        The measures as Markdown and as JSON.
-    """
+    """Evaluate the model on held-out mosaics."""
     windows = pair_windows(examples)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
     figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
@@ -507,10 +464,10 @@ def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[
     losses = torch.stack([rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
     lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
-    lines += [*figures_of(figures), ""]
+    lines += [*_figures_of(figures), ""]
     return "\n".join(lines), json.dumps(figures, indent=1)
 
 
-def figures_of(figures: Mapping[str, float]) -> list[str]:
+def _figures_of(figures: Mapping[str, float]) -> list[str]:
     """Write measures as a table in Markdown."""
     return ["| measure | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items())]

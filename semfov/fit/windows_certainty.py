@@ -33,18 +33,8 @@ _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True)
-class MosaicExploration:
-    """An exploration of a mosaic.
-
-    Attributes:
-        looks: the stored looks at the mosaic.
-        target: class 1..K whose objects were looked for; None for all classes.
-        glances: the looks.
-        remaining: after each look, the numbers of objects that further looks are expected to find.
-        promised: after each look, the number of objects that the looks after the first were expected to find.
-        facts: facts about the objects after some of the looks, `(n, 14)`.
-        right: which of them are right, `(n,)` boolean.
-    """
+class _MosaicExploration:
+    """An exploration of a mosaic; facts `(n, 14)`, right `(n,)`."""
 
     looks: StoredGlances
     target: int | None
@@ -64,22 +54,10 @@ class MosaicExploration:
 
 
 @torch.inference_mode()
-def mosaic_explorations(
+def _mosaic_explorations(
     model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> Iterator[MosaicExploration]:
-    """Explore pictures, for objects of all classes and for those of the most frequent class of each.
-
-    Args:
-        model: the evidence that guides the explorations.
-        pictures: the pictures.
-        opened: the stored looks at each.
-        passes: number of passes of the detector after which objects are taken. As many follow, which only tell how
-            many more objects they show.
-        title: label of the progress bar.
-
-    Yields:
-        Each exploration.
-    """
+) -> Iterator[_MosaicExploration]:
+    """Explore pictures, for objects of all classes and for those of the most frequent class of each."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
         for target in (None, int(annotation.labels.bincount().argmax())):
@@ -95,24 +73,17 @@ def mosaic_explorations(
                 hits = right_boxes(objects, annotation)
                 facts.append(object_facts[hits >= 0])
                 right.append(hits[hits >= 0] > 0)
-            yield MosaicExploration(looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right))
+            yield _MosaicExploration(
+                looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right)
+            )
         looks.save()
 
 
-def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> Certainty:
+def _fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> Certainty:
     """Fit the probability of objects by maximum likelihood, with Newton's method in float64.
 
-    A weak prior (half an object for and against without any facts, and small weights) keeps the result finite where
-    all objects are right or all wrong.
-
-    Args:
-        facts: `(n, 14)`, facts about objects.
-        right: `(n,)` boolean, whether box and class of each are right.
-        ridge: strength of the prior of the weights.
-        steps: largest number of Newton steps.
-
-    Returns:
-        The certainty; it expects no objects that no look has shown.
+    A weak prior (half an object for and against without any facts, and small weights) keeps the result finite where all
+    objects are right or all wrong.
 
     >>> torch.manual_seed(0)
     <torch._C.Generator object at ...>
@@ -120,6 +91,8 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
     >>> fitted = fit_certainty(facts, torch.rand(20_000) < truth.probability(facts))
     >>> round(fitted.offset, 1), {round(weight, 1) for weight in fitted.weights}
     (-1.0, {0.5})
+
+    Shapes: facts `(n, 14)`, right `(n,)`.
     """
     none = torch.zeros(2, len(FACTS), dtype=torch.float64)
     inputs = torch.cat([facts.double(), none])
@@ -142,19 +115,12 @@ def fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: in
     return Certainty(offset, tuple(weights))
 
 
-def fit_unseen(certainty: Certainty, explored: Sequence[MosaicExploration]) -> Certainty:
+def _fit_unseen(certainty: Certainty, explored: Sequence[_MosaicExploration]) -> Certainty:
     """Fit the number of objects that further looks show, by least squares over a grid.
 
     The error is that of the logarithm of one more than the number of objects in all, so that pictures with few objects
     count as much as those with many. Only explorations for objects of all classes are taken: of a single class some
     pictures hold hundreds of a few pixels.
-
-    Args:
-        certainty: the probability of objects.
-        explored: explorations.
-
-    Returns:
-        The certainty with scale, strength, and the shares of faint cells and of promises that count.
     """
     cases = []
     for each in explored:
@@ -187,28 +153,19 @@ def certainty_again(
     """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
 
     Pictures differ in how far the evidence can be believed, so several kinds are needed.
-
-    Args:
-        model: the model; its certainty is replaced.
-        fitted: pictures of each kind to fit on, and the stored looks at the first of them.
-        judged: likewise pictures of held-out photographs.
-        passes: number of passes of the detector in each picture.
-
-    Returns:
-        Lines of the report in Markdown.
     """
     training, held_out = (
         [
             each
             for kind, (pictures, opened) in some.items()
-            for each in mosaic_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")
+            for each in _mosaic_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")
         ]
         for some in (fitted, judged)
     )
-    regression = fit_certainty(
+    regression = _fit_certainty(
         torch.cat([each.facts for each in training]), torch.cat([each.right for each in training])
     )
-    model.certainty = fit_unseen(regression, training)
+    model.certainty = _fit_unseen(regression, training)
     facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
     chances = model.certainty.probability(facts)
     sure, error = chances >= 0.5, BinarySums.of(chances, right).ece

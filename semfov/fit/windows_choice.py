@@ -15,8 +15,8 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, Window, around
 
-FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
-PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
+_FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
+_PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 
 @torch.inference_mode()
@@ -25,26 +25,17 @@ def choose_foresight(
 ) -> list[list[str]]:
     """Set the `foresight` of the survey to the one with which most objects are found.
 
-    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of
-    mosaics differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
-
-    Args:
-        model: the model; the foresight of its survey is chosen.
-        eye: the eye that looks.
-        kinds: mosaics of each kind, by its name.
-        store: store of the looks.
-
-    Returns:
-        A table of the values that were tried.
+    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of mosaics
+    differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
     """
     opened = [open_all(eye, mosaics, store) for mosaics in kinds.values()]
     objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds.values()]
     rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
     recalls: dict[float, list[float]] = {}
-    for value in track(FORESIGHTS, "choosing foresight", "value"):
+    for value in track(_FORESIGHTS, "choosing foresight", "value"):
         model.survey.foresight = value
         recalls[value] = [
-            mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
+            _mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
             for looks, annotations, mosaics in zip(opened, objects, kinds.values(), strict=True)
         ]
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
@@ -61,22 +52,13 @@ def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store
     """Set `patience` to the value with which a class is found soonest.
 
     The measure is the mean number of passes until a look at a photograph that shows the class.
-
-    Args:
-        model: the model; its patience is chosen.
-        eye: the eye that looks.
-        near: mosaics of few photographs.
-        store: store of the looks.
-
-    Returns:
-        A table of the values that were tried.
     """
     opened = open_all(eye, near, store)
     slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
-    for value in track(PATIENCES, "choosing patience", "value"):
+    for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value
-        passes[value] = mean_passes(model, opened, slots, eye.detector.least)
+        passes[value] = _mean_passes(model, opened, slots, eye.detector.least)
         for glances in opened:
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)
@@ -88,20 +70,10 @@ def open_all(eye: WindowEye, pictures: Scenes, store: GlanceStore) -> list[Store
     return [StoredGlances(eye, pictures, index, store) for index in range(len(pictures))]
 
 
-def mean_recall(
+def _mean_recall(
     model: GlimpseEvidence, glances: Sequence[Glances], objects: Sequence[Annotation], passes: int
 ) -> float:
-    """Compute the mean recall over passes of an exploration that looks for all objects.
-
-    Args:
-        model: the evidence that guides the exploration.
-        glances: looks at each mosaic.
-        objects: the objects of each mosaic.
-        passes: number of passes.
-
-    Returns:
-        The share of the objects of all mosaics that were found, as a mean over the passes.
-    """
+    """Compute the mean recall over passes of an exploration that looks for all objects."""
     total = 0
     for looks, annotation in zip(glances, objects, strict=True):
         history: list[Glance] = []
@@ -117,20 +89,10 @@ def mean_recall(
     return total / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
 
 
-def mean_passes(
+def _mean_passes(
     model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]], least: float
 ) -> float:
-    """Compute the mean number of passes until a look at a photograph that shows the target.
-
-    Args:
-        model: the evidence that guides the search.
-        glances: looks at each mosaic.
-        slots: windows of the photographs of each mosaic.
-        least: score with which a look shows a class.
-
-    Returns:
-        The mean over mosaics and over the classes that any of their photographs shows.
-    """
+    """Compute the mean number of passes until a look at a photograph that shows the target."""
     counts = []
     for looks, photographs in zip(glances, slots, strict=True):
         presence = torch.stack([glance.show for glance in looks.see(photographs)]) >= least

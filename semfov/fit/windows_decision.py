@@ -32,12 +32,7 @@ _JUDGED = (1, 4, 8, 16)
 class Searches:
     """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
 
-    Attributes:
-        best: `(E, n)`, highest score of the target so far, after each look.
-        case: `(E, n, 10)`, features of the search so far (`SearchFacts.case`).
-        looked: `(E, n)`, whether a detection has shown the target (`SearchFacts.detected`).
-        left: `(E, n)`, value of the best remaining look.
-        there: `(E,)`, whether the target is in the picture.
+    Shapes: best `(E, n)`, case `(E, n, 10)`, looked `(E, n)`, left `(E, n)`, there `(E,)`.
     """
 
     best: Tensor
@@ -63,21 +58,7 @@ def searches_of(
     seed: int,
     title: str,
 ) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
-    """Search every picture for some present classes and for as many absent ones, without decisions.
-
-    Args:
-        model: the evidence that guides the search.
-        pictures: the pictures.
-        opened: the stored looks at each.
-        classes: maximum number of present classes to search for in a picture.
-        passes: maximum number of passes of the detector in a search.
-        seed: seed of the choice of classes.
-        title: label of the progress bar.
-
-    Yields:
-        For each search the number and the objects of the picture, the class, and the turns with the facts after each.
-        Looks that are made before the next search are stored.
-    """
+    """Search every picture for some present classes and for as many absent ones, without decisions."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
         for target in choose_classes(pictures, index, annotation, classes, 1.0, seed):
@@ -106,11 +87,7 @@ def picture_searches(
     seed: int,
     title: str,
 ) -> Searches:
-    """Run all searches of `searches_of`, with the same arguments, and collect them.
-
-    Returns:
-        The searches.
-    """
+    """Run all searches of `searches_of`, with the same arguments, and collect them."""
     rows: list[list[Tensor]] = []
     searches = searches_of(model, pictures, opened, classes=classes, passes=passes, seed=seed, title=title)
     for _, annotation, target, turns in searches:
@@ -138,16 +115,7 @@ def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int
 
 @torch.no_grad()
 def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -> list[str]:
-    """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them.
-
-    Args:
-        model: the model, whose thresholds are set.
-        searches: the held-out searches.
-        bounds: limits on wrong decisions.
-
-    Returns:
-        Lines of a table in Markdown.
-    """
+    """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them."""
     anywhere = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
     chosen = choose_thresholds(bounds, anywhere.mT, searches.looked.mT.to(anywhere), searches.left.mT, there)

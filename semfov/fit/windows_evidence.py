@@ -25,14 +25,7 @@ from semfov.zoom.networks import STEPS
 
 @dataclass(frozen=True)
 class WindowResult:
-    """A look at a window and its results.
-
-    Attributes:
-        window: the window.
-        gist: summary of the look, for windows that can be looked at closer; None for others.
-        show: `(K,)`, highest score of each class.
-        found: `(M,)` boolean, the objects of the scene that it found.
-    """
+    """A look at a window and its results; show `(K,)`, found `(M,)`."""
 
     window: Window
     gist: Gist | None
@@ -42,14 +35,7 @@ class WindowResult:
 
 @dataclass(frozen=True)
 class ZoomExample:
-    """A mosaic with looks at many windows.
-
-    Attributes:
-        lattice: the lattice of windows over the mosaic.
-        labels: `(M,)`, classes of its objects.
-        looks: the looks, the overview first.
-        least: score with which a look shows a class.
-    """
+    """A mosaic with looks at many windows; labels `(M,)`."""
 
     lattice: Lattice
     labels: Tensor
@@ -60,15 +46,7 @@ class ZoomExample:
 def closer_windows(
     example: ZoomExample, looked_at: WindowResult
 ) -> Iterator[tuple[WindowResult, int, tuple[int, ...]]]:
-    """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them.
-
-    Args:
-        example: the mosaic.
-        looked_at: the look. Windows inside an overview may reach beyond the picture.
-
-    Yields:
-        The closer look, its octaves from the look, and its window `(x1, y1, x2, y2)` in cells of the gist.
-    """
+    """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them."""
     look = looked_at.gist
     assert look is not None
     high, wide = look.scores.shape[:2]
@@ -82,17 +60,7 @@ def closer_windows(
 
 
 def found_by(glance: Glance, annotation: Annotation, score: float = DETECTION_SCORE, iou: float = 0.5) -> Tensor:
-    """Find the objects that a look shows with a detection of their class.
-
-    Args:
-        glance: the look.
-        annotation: the M objects of the scene.
-        score: least score of the detection.
-        iou: least overlap of the detection with the object.
-
-    Returns:
-        Whether each object is found, `(M,)` boolean.
-    """
+    """Find the objects that a look shows with a detection of their class; → `(M,)`."""
     detections = glance.detections
     sure = detections.confidence[0] >= score
     boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
@@ -121,14 +89,8 @@ def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LE
 class Windows:
     """N pairs of a look and a closer window inside it, as one table.
 
-    Attributes:
-        scores: `(N, K)`, highest score of each class that the look shows inside the window.
-        summary: `(N, 3)`, further features of the window in the look (`semfov.zoom.evidence.pool`).
-        steps: `(N,)`, number of octaves by which the window is looked at closer.
-        presence: `(N, K)`, whether the closer look showed the class.
-        before: `(N,)`, row of the overview for the same window; -1 for rows of the overview itself.
-        slot: `(N,)`, whether the window is a photograph of the mosaic.
-        mosaic: `(N,)`, number of the mosaic.
+    Shapes: scores `(N, K)`, summary `(N, 3)`, steps `(N,)`, presence `(N, K)`, before `(N,)`, slot `(N,)`, mosaic
+    `(N,)`.
     """
 
     scores: Tensor
@@ -172,15 +134,7 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
 
 
 def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
-    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes.
-
-    Args:
-        model: the model to fit.
-        windows: the training windows.
-        steps: number of steps.
-        batch: rows of the overview in a step; there are half as many rows of later looks.
-        rate: highest learning rate.
-    """
+    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes."""
     own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
     optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=1.0)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
@@ -204,16 +158,7 @@ def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Ten
 
 
 def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the log-odds that closer looks show each class.
-
-    Args:
-        model: the model.
-        windows: the windows.
-        rows: rows to compute, either all of overviews or all of later looks.
-
-    Returns:
-        Log-odds, one row for each window and one column for each class.
-    """
+    """Compute the log-odds that closer looks show each class."""
     before = None
     if bool((windows.before[rows] >= 0).all()):
         training = model.training
@@ -230,14 +175,7 @@ _log = logging.getLogger(__name__)
 
 
 def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
-    """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window.
-
-    Args:
-        model: the model to fit.
-        examples: the training examples.
-        steps: number of steps.
-        batch: examples in a step.
-    """
+    """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window."""
     own = [*model.rate.parameters(), model.prior, model.border]
     descend_examples(
         own, lambda example: rate_loss(model, example), examples, steps, batch, "expected number of objects"
@@ -253,17 +191,7 @@ def descend_examples(
     title: str,
     rate: float = 6e-3,
 ) -> None:
-    """Minimise the mean loss of random examples.
-
-    Args:
-        parameters: the parameters to fit.
-        loss_of: loss of an example, a scalar.
-        examples: the training examples.
-        steps: number of steps.
-        batch: examples in a step.
-        title: name of the fit in the log.
-        rate: highest learning rate.
-    """
+    """Minimise the mean loss of random examples."""
     own = [*parameters]
     optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=0.1)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
@@ -283,13 +211,6 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic.
 
     Only a few classes enter: random samples of the clearly and of the faintly visible ones.
-
-    Args:
-        model: the model.
-        example: the mosaic.
-
-    Returns:
-        The mean over looks, a scalar.
     """
     strongest = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (
@@ -320,13 +241,7 @@ def _some(values: Tensor, most: int) -> Tensor:
 def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
     """Convert the rates of the overview to the cells of a closer look, for windows one octave closer than that look.
 
-    Args:
-        first: gist of the overview.
-        logs: `(T, 3, rows, columns)`, logarithms of its rates.
-        look: gist of the closer look.
-
-    Returns:
-        Logarithms `(T, rows, columns)`, as the prediction before the closer look.
+    Shapes: logs `(T, 3, rows, columns)` → `(T, rows, columns)`.
     """
     cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     rows, columns = (n * look.scale for n in look.scores.shape[:2])

@@ -14,18 +14,7 @@ PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)
 
 
 def compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
-    """Compose pictures of a kind.
-
-    Args:
-        kind: the kind.
-        scenes: the photographs with their boxes.
-        count: number of pictures.
-        seed: seed of the compositions.
-        tile: width in pixels of the slot of a photograph in a mosaic of large ones.
-
-    Returns:
-        The pictures.
-    """
+    """Compose pictures of a kind."""
     seed += 10 + PICTURE_KINDS.index(kind)
     half, ground = (tile // 2, tile * 3 // 8), (8 * tile, 9 * tile // 2)
     match kind:

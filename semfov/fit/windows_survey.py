@@ -13,35 +13,20 @@ from semfov.fit.windows_evidence import WindowResult, ZoomExample, closer_window
 from semfov.zoom.hints import Gist
 from semfov.zoom.networks import Survey
 
-LATER = 2
+_LATER = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
 
 
 @dataclass(frozen=True)
-class LookCounts:
-    """A look, and how many new objects each of the closer looks inside it found.
-
-    Attributes:
-        gist: the look.
-        counts: by octaves and cells along a side of a window: rows and columns of the windows' first cells in the gist,
-            `(N,)` each, and the numbers of new objects, `(N,)`.
-    """
+class _LookCounts:
+    """A look, and how many new objects each of the closer looks inside it found; counts `(N,)`."""
 
     gist: Gist
     counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
 
     @classmethod
-    def of(cls, example: ZoomExample, looked: WindowResult, earlier: Tensor) -> "LookCounts":
-        """Compare a look with all closer looks inside it.
-
-        Args:
-            example: the mosaic.
-            looked: the look.
-            earlier: `(M,)`, objects of the mosaic that were found before.
-
-        Returns:
-            The look with the numbers of new objects.
-        """
+    def of(cls, example: ZoomExample, looked: WindowResult, earlier: Tensor) -> "_LookCounts":
+        """Compare a look with all closer looks inside it; earlier `(M,)`."""
         by_size = defaultdict(list)
         for closer, steps, (x1, y1, x2, _) in closer_windows(example, looked):
             by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
@@ -50,15 +35,7 @@ class LookCounts:
         return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
 
     def loss(self, survey: Survey, logs: Tensor) -> Tensor:
-        """Mean Poisson negative log likelihood of the numbers, up to a constant.
-
-        Args:
-            survey: predicts them.
-            logs: `(3, rows, columns)`, its predictions for the cells of the gist.
-
-        Returns:
-            The mean over the windows, a scalar.
-        """
+        """Mean Poisson negative log likelihood of the numbers, up to a constant; logs `(3, rows, columns)`."""
         rates = logs.exp()
         terms = []
         for (steps, span), (rows, columns, new) in self.counts.items():
@@ -77,25 +54,20 @@ class LookCounts:
 
 @dataclass(frozen=True)
 class SurveyExample:
-    """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found.
+    """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found."""
 
-    Attributes:
-        overview: the first look.
-        closer: looks that were closer, and can be followed by closer ones.
-    """
-
-    overview: LookCounts
-    closer: tuple[LookCounts, ...]
+    overview: _LookCounts
+    closer: tuple[_LookCounts, ...]
 
     @classmethod
     def of(cls, example: ZoomExample) -> "SurveyExample":
         """Prepare a mosaic for the fit."""
         overview, *others = (look for look in example.looks if look.gist is not None)
         first = overview.found
-        closer = (LookCounts.of(example, look, first | look.found) for look in others)
-        return cls(LookCounts.of(example, overview, first), tuple(closer))
+        closer = (_LookCounts.of(example, look, first | look.found) for look in others)
+        return cls(_LookCounts.of(example, overview, first), tuple(closer))
 
-    def losses(self, survey: Survey, closer: Sequence[LookCounts]) -> list[Tensor]:
+    def losses(self, survey: Survey, closer: Sequence[_LookCounts]) -> list[Tensor]:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
         first = self.overview.gist
         logs = survey.rates(first)
@@ -107,17 +79,10 @@ class SurveyExample:
 
 
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:
-    """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood.
-
-    Args:
-        survey: to fit.
-        examples: mosaics.
-        steps: of the fit.
-        batch: mosaics in each step.
-    """
+    """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood."""
 
     def loss_of(example: SurveyExample) -> Tensor:
-        closer = random.sample(example.closer, min(LATER, len(example.closer)))
+        closer = random.sample(example.closer, min(_LATER, len(example.closer)))
         return torch.stack(example.losses(survey, closer)).mean()
 
     descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey", rate=2e-3)

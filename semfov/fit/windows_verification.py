@@ -31,7 +31,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
 
 
-class Limits(Protocol):
+class _Limits(Protocol):
     """Settings of the fit (see `FitZoomConfig`)."""
 
     @property
@@ -65,21 +65,8 @@ class Limits(Protocol):
         ...
 
 
-class MosaicSearch(TargetSearch[WindowLook]):
-    """A search of a mosaic.
-
-    Args:
-        mosaic: number of the mosaic.
-        looks: the stored looks at it.
-        target: the class, 1..K.
-        objects: `(M, 4)`, annotated boxes of the class; none if it is absent.
-        passes: maximum number of passes of the detector.
-        likely: probability from which on a place is examined at once.
-        glances: the looks of the search.
-        states: the search after each look.
-        boxes: after each look, `(4,)`, box of the detection with the highest score of the target; None as long as no
-            detection shows it.
-    """
+class _MosaicSearch(TargetSearch[WindowLook]):
+    """A search of a mosaic; objects `(M, 4)`, boxes `(4,)`."""
 
     after = (1, 3, 5, 8, 12, 16, 24)
 
@@ -136,21 +123,10 @@ class MosaicSearch(TargetSearch[WindowLook]):
 
 
 @torch.inference_mode()
-def mosaic_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: Limits, title: str
-) -> Iterator[MosaicSearch]:
-    """Search every picture, without closer looks (`semfov.fit.windows_decision.searches_of`).
-
-    Args:
-        model: the evidence that guides the search, with thresholds.
-        pictures: the pictures.
-        opened: the stored looks at each.
-        config: the settings.
-        title: label of the progress bar.
-
-    Yields:
-        Each search with all its looks.
-    """
+def _mosaic_searches(
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: _Limits, title: str
+) -> Iterator[_MosaicSearch]:
+    """Search every picture, without closer looks (`semfov.fit.windows_decision.searches_of`)."""
     assert model.thresholds is not None
     searches = searches_of(
         model, pictures, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
@@ -166,7 +142,7 @@ def mosaic_searches(
             boxes.append(facts.box if facts.detected else None)
         objects = annotation.boxes[annotation.labels == target]
         likely = model.thresholds.confirm
-        yield MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
+        yield _MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
 
 
 def shipped_verification() -> Verification:
@@ -179,26 +155,15 @@ def shipped_verification() -> Verification:
 def fit_closer(
     model: GlimpseEvidence,
     pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
-    config: Limits,
+    config: _Limits,
     prior: Verification | None = None,
 ) -> str:
-    """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model.
-
-    Args:
-        model: the evidence, with thresholds.
-        pictures: the pictures `searched`, to fit to, and `judged`, of held-out photographs: each kind with the stored
-            looks at each.
-        config: the settings.
-        prior: verification that the fitted one keeps close to, the more so the fewer the closer looks; None: none.
-
-    Returns:
-        The report in Markdown, which says so if there are too few places to fit to.
-    """
+    """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model."""
     searches = {
         use: [
             search
             for scenes, opened in pictures[use]
-            for search in mosaic_searches(model, scenes, opened, config, title)
+            for search in _mosaic_searches(model, scenes, opened, config, title)
         ]
         for use, title in (("searched", "looking closely"), ("judged", "looking closely at held-out pictures"))
     }

@@ -31,16 +31,7 @@ class Choice(ABC):
     ) -> tuple[Tensor, Tensor]:
         """Choose the next fixation of each episode.
 
-        Args:
-            shift: number of gaze shifts made so far.
-            episodes: `(A,)`, numbers of the episodes that are not over.
-            values: `(A, X·Y)`, acquisition values.
-            visited: `(A, X·Y)` boolean, cells that were fixated and may not be chosen.
-            centres: `(X·Y, 2)`, centres of the cells in pixels.
-
-        Returns:
-            The fixations `(A, 2)` in pixels, and their cells `(A,)`. Where all cells were visited, the cell is
-            arbitrary.
+        Shapes: episodes `(A,)`, values `(A, X·Y)`, visited `(A, X·Y)`, centres `(X·Y, 2)` → `(A, 2)`.
         """
 
 
@@ -68,12 +59,7 @@ class Greedy(Choice):
 
 
 class Exploratory(Greedy):
-    """`Greedy`, with some fixations drawn at random so that training sees all cells.
-
-    Args:
-        noise: random numbers that break ties and draw; it must give new numbers at every call.
-        astray: probability of a fixation at random.
-    """
+    """`Greedy`, with some fixations drawn at random so that training sees all cells."""
 
     def __init__(self, noise: Noise, astray: float) -> None:
         super().__init__(noise)
@@ -258,17 +244,6 @@ def soft_fixation(
 
 def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
     """The first cell of an episode, and the generator that breaks its ties.
-
-    Args:
-        start: the cell; None draws one.
-        seed: of the generator.
-        cells: number of cells.
-
-    Returns:
-        The cell and the generator, which has drawn the cell where `start` is None.
-
-    Raises:
-        InputError: `start` is not a cell, or `seed` is not a whole number of 0 or more.
 
     >>> first_cell(3, 0, 100)[0]
     3

@@ -178,15 +178,11 @@ class Habitual(Choice):
 def standardised(values: Tensor) -> Tensor:
     """Scale values to mean 0 and variance 1 over the cells; 0 everywhere where all are equal.
 
-    Args:
-        values: `(..., X·Y)`.
-
-    Returns:
-        The same shape.
-
     >>> standardised(torch.tensor([[1.0, 3.0], [2.0, 2.0]]))
     tensor([[-1.,  1.],
             [ 0.,  0.]])
+
+    Shapes: values `(..., X·Y)`.
     """
     apart = values - values.mean(-1, keepdim=True)
     spread = apart.square().mean(-1, keepdim=True).sqrt()

@@ -60,20 +60,10 @@ def fit_log_linear(features: Tensor, chosen: Tensor, *, ridge: float = 1.0, chun
 def log_probability(features: Tensor, chosen: Tensor, weights: Tensor, *, chunk: int = 2048) -> Tensor:
     """Log probability of each choice under a log-linear model.
 
-    Args:
-        features: `(n, A, F)`, features of the alternatives.
-        chosen: `(n,)`, index of the alternative chosen.
-        weights: `(F,)`, as `fit_log_linear` returns them.
-        chunk: number of choices to compute at a time.
-
-    Returns:
-        `(n,)`, in nats, float64.
-
-    Raises:
-        InputError: the number of weights differs from the number of features.
-
     >>> log_probability(torch.eye(2)[None], torch.tensor([0]), torch.zeros(2).double()).exp()
     tensor([0.5000], dtype=torch.float64)
+
+    Shapes: features `(n, A, F)`, chosen `(n,)`, weights `(F,)` → `(n,)`.
     """
     if features.shape[-1] != len(weights):
         raise InputError(f"weights: expected {features.shape[-1]} numbers, one a feature, got {len(weights)}")

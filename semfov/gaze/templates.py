@@ -111,17 +111,7 @@ def unit(features: Tensor) -> Tensor:
 def at_points(maps: Tensor, points: Tensor, placement: Placement, canvas: tuple[int, int]) -> Tensor:
     """Read maps that cover a canvas at points of the image, by bilinear interpolation.
 
-    Args:
-        maps: `(B, K, h, w)`, over the whole canvas, padding included.
-        points: `(P, 2)`, in pixels of the image.
-        placement: where the image lies on the canvas.
-        canvas: `(width, height)` of the canvas in pixels.
-
-    Returns:
-        `(B, K, P)`, values of the maps.
-
-    Raises:
-        InputError: the canvas is empty.
+    Shapes: maps `(B, K, h, w)`, points `(P, 2)`, canvas `(width, height)` → `(B, K, P)`.
     """
     check(min(canvas) > 0, "canvas", "a positive width and height", canvas)
     share = (placement.points_to_canvas(points.to(maps)) + 0.5) / maps.new_tensor(canvas)

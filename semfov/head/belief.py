@@ -16,25 +16,19 @@ from semfov.head.views import Views
 
 
 @dataclass(frozen=True)
-class SceneLook(Look):
-    """The evidence of a look about the cells of a view.
-
-    Attributes:
-        pose: number of the head's pose.
-        inner: evidence about the cells of the view.
-        gaze: `(1,)`, the fixated cell of the scene.
-    """
+class _SceneLook(Look):
+    """The evidence of a look about the cells of a view; gaze `(1,)`."""
 
     pose: int
     inner: Look
     gaze: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> "SceneLook":
+    def __getitem__(self, index: Tensor | slice) -> "_SceneLook":
         """The look itself, as there is only one."""
         return self
 
     @classmethod
-    def join(cls, looks: object) -> "SceneLook":
+    def join(cls, looks: object) -> "_SceneLook":
         """Raise an error, because looks from several poses cannot be joined."""
         raise InputError("looks: expected a single look; looks of a head cannot be joined, as their poses may differ")
 
@@ -126,16 +120,16 @@ class SceneObserver(Observer):
         never = tuple(None for _ in self.views.poses)
         return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), never)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SceneLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
         """Evidence of a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
         pose, point = self.views.action_of(fixation[0])
         inner = self.inner.weigh(detections, point[None], self.views.view_grid, target)
         action = self.views.grid.cell_of(fixation)
-        return SceneLook(pose, inner, self.views.gaze_cell[action])
+        return _SceneLook(pose, inner, self.views.gaze_cell[action])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         """The belief after one more look."""
-        belief, look = own(belief, SceneBelief, "belief"), own(look, SceneLook, "look")
+        belief, look = own(belief, SceneBelief, "belief"), own(look, _SceneLook, "look")
         views, grid, pose = self.views, self.views.view_grid, look.pose
         values = belief.values
         if not bool(belief.looks):
@@ -156,7 +150,7 @@ class SceneObserver(Observer):
         after = (*belief.views[:pose], view, *belief.views[pose + 1 :])
         return SceneBelief(values, closest, owner, examined, belief.looks + 1, after)
 
-    def _distance(self, pose: int, look: SceneLook) -> Tensor:
+    def _distance(self, pose: int, look: _SceneLook) -> Tensor:
         """Distances from the gaze to the cells that its view shows, `(V,)`."""
         inner = look.inner
         assert isinstance(inner, TargetLook | MapLook)

@@ -17,7 +17,7 @@ from semfov.head.sphere import AROUND, Sphere
 from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, panorama_directions
 
-TRIES = 25
+_TRIES = 25
 """Largest number of frames that are asked for until one is from the right direction."""
 
 _WIDEST = 8192  # pixels of the panorama in which objects are located
@@ -131,7 +131,7 @@ class CameraScene(Sphere):
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Turn the camera and take a frame; a frame that is off by more than a tenth of its field is taken again."""
         pan, tilt, field = pose.tolist()
-        for _ in range(TRIES):
+        for _ in range(_TRIES):
             frame = self.camera.look_at((pan, tilt), field)
             if not isinstance(frame, CameraFrame):
                 return self._image_of(frame, pose, pose)
@@ -139,7 +139,7 @@ class CameraScene(Sphere):
             off = max(float(Sphere.turn(self, at, pose)), abs(float(at[2]) - field))
             if off <= field / 10:
                 return self._image_of(frame.image, at, pose)
-        expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {TRIES} attempts"
+        expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {_TRIES} attempts"
         got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*at.tolist())
         raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
 

@@ -22,14 +22,8 @@ Detect = Callable[[int], Detections]
 """Maps an action to its detections, a batch of one with boxes in pixels of the view."""
 
 
-class HeadLooks(Looks):
-    """Looks of an eye in a head.
-
-    Args:
-        views: the possible views and fixations.
-        detect: maps an action to its detections.
-        target: class that is searched for.
-    """
+class _HeadLooks(Looks):
+    """Looks of an eye in a head."""
 
     def __init__(self, views: Views, detect: Detect, target: int | None = None) -> None:
         self.views, self.detect, self.target = views, detect, target
@@ -51,13 +45,6 @@ def live(eye: Eye, views: Views) -> Detect:
     The view of the last pose is kept for the next look at a picture; a camera takes a new frame for each look. If a
     frame was taken from a pose beside the one that was asked for, the eye fixates the same point of the scene, and the
     boxes are moved to where the view from the right pose would show them.
-
-    Args:
-        eye: sensor and detector.
-        views: the possible views and fixations.
-
-    Returns:
-        A function that maps an action to its detections.
     """
     world = views.world
     opened: tuple[int, View] | None = None
@@ -73,27 +60,20 @@ def live(eye: Eye, views: Views) -> Detect:
         if at is pose:
             return eye.look(opened[1], views.view_grid.centres[cell][None]).to(pose.device)
         detections = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0]).to(pose.device)
-        return replace(detections, boxes=boxes_from(world, detections.boxes, at, pose))
+        return replace(detections, boxes=_boxes_from(world, detections.boxes, at, pose))
 
     return detect
 
 
-def boxes_from(world: World, boxes: Tensor, at: Tensor, pose: Tensor) -> Tensor:
+def _boxes_from(world: World, boxes: Tensor, at: Tensor, pose: Tensor) -> Tensor:
     """Smallest boxes in the view from one pose around boxes in the view from another pose nearby.
-
-    Args:
-        world: the scene.
-        boxes: `(..., 4)`, in pixels of the view from `at`.
-        at: `(3,)`, pose in which the boxes were seen.
-        pose: `(3,)`, pose in whose view they are wanted.
-
-    Returns:
-        `(..., 4)`, in pixels of the view from `pose`.
 
     >>> from semfov.head import Panorama
     >>> world, box = Panorama((360, 180), (100, 100)), torch.tensor([[40.0, 40, 60, 60]])
     >>> boxes_from(world, box, torch.tensor([10.0, 0, 60]), torch.tensor([0.0, 0, 60])).round()
     tensor([[55., 40., 76., 60.]])
+
+    Shapes: boxes `(..., 4)`, at `(3,)`, pose `(3,)` → `(..., 4)`.
     """
     corners = boxes[..., [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2) - 0.5
     moved = world.to_view(world.to_scene(corners, at), pose)[0].view(*boxes.shape[:-1], 4, 2) + 0.5
@@ -102,16 +82,7 @@ def boxes_from(world: World, boxes: Tensor, at: Tensor, pose: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class HeadStep:
-    """One step of an episode: a look, the time it ends, its detections, and the belief after it.
-
-    Attributes:
-        action: number of the pose and cell (`Views`).
-        seconds: time since the start, this look included.
-        belief: after the look.
-        detections: a batch of one, with boxes in pixels of the view.
-        gain: expected gain per second for which the look was chosen; infinite for the first look.
-        ahead: seconds that the next look would take.
-    """
+    """One step of an episode: a look, the time it ends, its detections, and the belief after it."""
 
     action: int
     seconds: float
@@ -134,27 +105,11 @@ def look_around(
     worth: float = 0.0,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
-    """Run an episode and yield its looks one by one; the caller may stop at any time.
-
-    Args:
-        views: the possible views and fixations.
-        detect: maps an action to its detections.
-        observer: keeps the belief about the scene.
-        acquire: makes the acquisition function that chooses the action after a given one.
-        start: first action.
-        target: class that is searched for.
-        passes: largest number of looks.
-        duration: time limit of the scene, in seconds of its `speeds`; a look that would end later is not taken.
-        worth: least gain for which a look is taken, in the unit of the acquisition function times seconds.
-        seed: of the generator that breaks ties.
-
-    Yields:
-        Each look, with the belief after it.
-    """
+    """Run an episode and yield its looks one by one; the caller may stop at any time."""
     speeds = views.world.speeds
     numbers = [seed] if isinstance(seed, int) else [*seed]
-    generator = torch.Generator().manual_seed(hash_of(numbers))
-    looks = HeadLooks(views, detect, target)
+    generator = torch.Generator().manual_seed(_hash_of(numbers))
+    looks = _HeadLooks(views, detect, target)
     spent, ahead, gain = speeds.look, 0.0, math.inf
 
     def ends(step: Step) -> Tensor:
@@ -177,7 +132,7 @@ def look_around(
         yield HeadStep(action, spent, step.belief, step.detections, chosen, ahead)
 
 
-def hash_of(numbers: Sequence[int]) -> int:
+def _hash_of(numbers: Sequence[int]) -> int:
     """Combine several numbers into one seed of 63 bits."""
     import hashlib
 

@@ -30,11 +30,7 @@ OUT = -1e6
 
 
 class LookGain(nn.Module, ABC):
-    """Base of the expected gains of a look.
-
-    Args:
-        views: the possible views and fixations.
-    """
+    """Base of the expected gains of a look."""
 
     def __init__(self, views: Views) -> None:
         super().__init__()

@@ -19,19 +19,13 @@ _VERSION = 1  # increase it whenever the same seed would give another picture
 _SLOT = (640, 480)
 """Size in pixels of the plane that holds a photograph; its middle touches the sphere."""
 
-RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))
+_RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))
 """For each ring, its latitude in degrees and its number of photographs."""
 
 
 @dataclass(frozen=True)
-class Patch:
-    """The position of a photograph on the sphere.
-
-    Attributes:
-        index: number of the photograph among its scenes.
-        pose: yaw and pitch of its middle, and the width of its slot, in degrees.
-        box: `(x1, y1, x2, y2)`, the part of its slot of 640 × 480 px that it fills, in the middle of the slot.
-    """
+class _Patch:
+    """The position of a photograph on the sphere."""
 
     index: int
     pose: tuple[float, float, float]
@@ -67,7 +61,7 @@ class Panoramas:
     def __init__(
         self,
         scenes: Scenes,
-        rings: tuple[tuple[float, int], ...] = RINGS,
+        rings: tuple[tuple[float, int], ...] = _RINGS,
         *,
         slot: float = 56.0,
         width: int = 2560,
@@ -95,7 +89,7 @@ class Panoramas:
         """Number of panoramas."""
         return len(self.ids)
 
-    def patches(self, index: int) -> list[Patch]:
+    def patches(self, index: int) -> list[_Patch]:
         """The photographs of a panorama, ring by ring.
 
         Args:
@@ -114,11 +108,11 @@ class Panoramas:
             places += [((turn + 360 * n / number) % 360 - 180, latitude) for n in range(number)]
         return [self._patch(scene, *place) for scene, place in zip(order, places, strict=True)]
 
-    def _patch(self, scene: int, yaw: float, pitch: float) -> Patch:
+    def _patch(self, scene: int, yaw: float, pitch: float) -> _Patch:
         (wide, high), (width, height) = _SLOT, self.scenes.annotation(scene).size
         scale = min(wide / width, high / height)
         x, y = (wide - width * scale) / 2, (high - height * scale) / 2
-        return Patch(scene, (yaw, pitch, self.slot), (x, y, wide - x, high - y))
+        return _Patch(scene, (yaw, pitch, self.slot), (x, y, wide - x, high - y))
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a panorama."""
@@ -129,7 +123,7 @@ class Panoramas:
         name = f"panorama {self.ids[index]}, seed {self._seed}"
         return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
 
-    def _put(self, canvas: Tensor, patch: Patch) -> None:
+    def _put(self, canvas: Tensor, patch: _Patch) -> None:
         """Project a photograph onto the panorama."""
         camera = Camera(torch.tensor(patch.pose), _SLOT)
         x1, y1, x2, y2 = patch.box
@@ -169,7 +163,7 @@ class Panoramas:
         boxes = [self._moved(own, patch) for patch, own in pairs]
         return Regions(Camera(torch.cat(poses), _SLOT), torch.cat(boxes))
 
-    def _moved(self, boxes: Tensor, patch: Patch) -> Tensor:
+    def _moved(self, boxes: Tensor, patch: _Patch) -> Tensor:
         """Boxes of a photograph `(M, 4)` in pixels of its slot."""
         x1, y1, x2, y2 = patch.box
         width, height = self.scenes.annotation(patch.index).size

@@ -16,10 +16,10 @@ from semfov.head.sphere import BLANK, Sphere
 from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.perspective import even_rows, go_around, sample
 
-VIEW = (416, 312)
+_VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
 
-DEGREE = 640 / 60
+_DEGREE = 640 / 60
 """Default number of pixels of a flat picture per degree."""
 
 
@@ -50,7 +50,7 @@ class Panorama(Sphere):
     def __init__(
         self,
         image: ImageLike | tuple[int, int],
-        size: tuple[int, int] = VIEW,
+        size: tuple[int, int] = _VIEW,
         *,
         fields: tuple[float, ...] = FIELDS,
         speeds: Speeds | None = None,
@@ -168,7 +168,7 @@ class Flat(World):
     def __init__(
         self,
         picture: LargePicture | ImageLike | tuple[int, int],
-        size: tuple[int, int] = VIEW,
+        size: tuple[int, int] = _VIEW,
         *,
         fields: tuple[float, ...] = FIELDS,
         speeds: Speeds | None = None,
@@ -183,7 +183,7 @@ class Flat(World):
             picture = self.opened.size
         self.picture = width, height = picture
         if degree is None:
-            degree = min(DEGREE, min(width, height * size[0] / size[1]) / max(fields))
+            degree = min(_DEGREE, min(width, height * size[0] / size[1]) / max(fields))
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
         self.size, self.cell, self.degree = size, cell, degree

@@ -18,13 +18,8 @@ CELL_POINTS = 10
 
 
 @dataclass(frozen=True)
-class VisibleCells:
-    """Cells of the scene that a view shows.
-
-    Attributes:
-        cells: `(V,)`, their numbers.
-        points: `(V, 2)`, their centres in pixels of the view.
-    """
+class _VisibleCells:
+    """Cells of the scene that a view shows; cells `(V,)`, points `(V, 2)`."""
 
     cells: Tensor
     points: Tensor
@@ -84,9 +79,9 @@ class Views:
         """Number of poses."""
         return len(self.poses)
 
-    def _visible(self, pose: Tensor) -> VisibleCells:
+    def _visible(self, pose: Tensor) -> _VisibleCells:
         points, inside = self.world.to_view(self.world.centres, pose)
-        return VisibleCells(inside.nonzero()[:, 0], points[inside])
+        return _VisibleCells(inside.nonzero()[:, 0], points[inside])
 
     @property
     def cells(self) -> int:

@@ -34,12 +34,6 @@ class Places(Protocol):
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
     """Raise `InputError` unless fields of view are ascending angles below 180 degrees.
 
-    Args:
-        fields: fields of view in degrees.
-
-    Returns:
-        The fields of view.
-
     >>> check_fields([30, 60])
     (30.0, 60.0)
     """

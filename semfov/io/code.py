@@ -22,9 +22,6 @@ _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib
 def package_digest() -> str:
     """Compute a sha256 over all modules of the package; comments and docstrings do not count.
 
-    Returns:
-        64 hexadecimal digits.
-
     >>> len(package_digest())
     64
     """
@@ -34,12 +31,6 @@ def package_digest() -> str:
 @cache
 def modules_digest(*modules: str) -> str:
     """Compute a sha256 over modules of the package and every module of it that they import, directly or not.
-
-    Args:
-        modules: dotted names.
-
-    Returns:
-        64 hexadecimal digits.
 
     >>> modules_digest("semfov.errors") == modules_digest("semfov.io.files")
     False
@@ -52,12 +43,6 @@ def class_digest(kind: type) -> str:
 
     Installed libraries do not count, and this package does not either: it has `package_digest`. A class that was typed
     into an interpreter has no file, so its digest is valid in this process only.
-
-    Args:
-        kind: the class.
-
-    Returns:
-        64 hexadecimal digits, or the name of the class and of this process where the class has no file.
     """
     modules = [base.__module__ for base in kind.__mro__ if not _of_others(base.__module__) or base is kind]
     if any(_file(module) is None for module in modules):
@@ -68,15 +53,7 @@ def class_digest(kind: type) -> str:
 
 
 def closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]:
-    """Find the files of modules and of every module that they import, directly or not.
-
-    Args:
-        modules: dotted names.
-        belongs: tells by its dotted name whether an imported module is followed.
-
-    Returns:
-        The source files.
-    """
+    """Find the files of modules and of every module that they import, directly or not."""
     files: dict[Path, None] = {}
     todo = list(modules)
     while todo:

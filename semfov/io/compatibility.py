@@ -18,9 +18,9 @@ Files listed under one name are conversions of one checkpoint. YOLOX-nano's were
 NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 """
 
-SHIPPED_SIGMA = 100.0
+_SHIPPED_SIGMA = 100.0
 """Width σ of the fovea that learned models are shipped for, in pixels of an image whose longer side is 640."""
-SHIPPED_GROWTHS = (1.0, 2.0)
+_SHIPPED_GROWTHS = (1.0, 2.0)
 """Growths of the fovea that learned models are shipped for."""
 
 _FIT = "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
@@ -103,13 +103,7 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
     coarser grids. It has learned from cells of one size how often a cell holds an object and how far the influence of
     its neighbours reaches.
 
-    Args:
-        fitted: settings of the training; a model without `columns` and `rows` accepts any grid.
-        grid: `(columns, rows)`.
-        what: title of the model, for the message.
-
-    Raises:
-        InputError: the grid has fewer than half or more than twice as many columns or rows.
+    Shapes: grid `(columns, rows)`.
     """
     cells = fitted.get("columns"), fitted.get("rows")
     if None not in cells and not all(n / 2 <= side <= 2 * n for n, side in zip(cells, grid, strict=True)):  # type: ignore[operator]
@@ -122,12 +116,12 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
 
 def check_shipped_sensor(sigma: float, growth: float) -> None:
     """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
-    if growth not in SHIPPED_GROWTHS:
-        growths = " and ".join(f"{value:g}" for value in SHIPPED_GROWTHS)
+    if growth not in _SHIPPED_GROWTHS:
+        growths = " and ".join(f"{value:g}" for value in _SHIPPED_GROWTHS)
         raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
-    if sigma != SHIPPED_SIGMA:
+    if sigma != _SHIPPED_SIGMA:
         raise InputError(
-            f"sigma: models are shipped for {SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
+            f"sigma: models are shipped for {_SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
         )
 
 

@@ -28,15 +28,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Readers see the old file or the new one, never a part of it. A writer that fails or is killed leaves `path` as it
     was.
-
-    Args:
-        path: the file to write or replace; its folder is created where it is missing.
-
-    Yields:
-        A temporary path in the same folder, to write to.
-
-    Raises:
-        DataError: the folder cannot be written to or the disk is full (the message names the file).
     """
     path = Path(path)
     temporary = None
@@ -61,18 +52,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def inside(folder: str | Path, name: str) -> Path:
-    """Join a folder and a file name that comes from elsewhere, and refuse names that lead out of the folder.
-
-    Args:
-        folder: the folder.
-        name: path of a file, relative to the folder.
-
-    Returns:
-        The path of the file, in the folder or below it.
-
-    Raises:
-        DataError: the name leads out of the folder, directly or through a link.
-    """
+    """Join a folder and a file name that comes from elsewhere, and refuse names that lead out of the folder."""
     folder = Path(folder)
     try:
         path = folder / name
@@ -87,12 +67,6 @@ def inside(folder: str | Path, name: str) -> Path:
 def clean(text: str) -> str:
     """Turn text into a part of a file name: at most 60 letters, digits, `_`, `.` and `-`, without a leading dot.
 
-    Args:
-        text: any text.
-
-    Returns:
-        The part of a file name; `none` where nothing of the text is left.
-
     >>> clean("dining table"), clean("/../../x/evil"), clean("")
     ('dining-table', 'x-evil', 'none')
     """
@@ -101,13 +75,6 @@ def clean(text: str) -> str:
 
 def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None:
     """Check that a path that exists is a regular file, because reading a pipe or a device might never end.
-
-    Args:
-        path: the file; a missing one passes.
-        name: its name in messages; None for its path.
-
-    Raises:
-        DataError: the path is a folder, a pipe, a socket or a device, or cannot be the name of a file.
 
     >>> check_regular(__file__)
     """

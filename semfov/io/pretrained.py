@@ -19,16 +19,7 @@ _ENVELOPE = Schema({}, {"version": Text(), "metadata": METADATA})
 
 
 class Pretrained(nn.Module):
-    """Base of modules that are saved to a file: tensors, and JSON values that describe them.
-
-    Attributes:
-        kind: kind of file, as its record tells it.
-        title: name of the kind of model in messages.
-        shipped: folder of the models that come with the package.
-        schema: names, shapes, types and ranges of the tensors and of the JSON values of `_record`; a file that does
-            not fit is refused.
-        metadata: JSON values that are saved with the model.
-    """
+    """Base of modules that are saved to a file: tensors, and JSON values that describe them."""
 
     kind: ClassVar[str]
     title: ClassVar[str]
@@ -128,13 +119,6 @@ class PretrainedForEye(Pretrained):
 
 def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
     """Write the command that fits all models to a detector.
-
-    Args:
-        model: name or file of the detector.
-        out: folder for the models.
-
-    Returns:
-        The command line.
 
     >>> fit_command("mine.onnx")
     'semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from semfov.errors import check, check_number, check_shape
 
-Values = dict[str, Any]
+_Values = dict[str, Any]
 Message = TypeVar("Message")
 
 _CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 _BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 
 
-class DetectionTensors(Protocol):
+class _DetectionTensors(Protocol):
     """The tensors of `semfov.Detections`."""
 
     @property
@@ -36,7 +36,7 @@ class DetectionTensors(Protocol):
         """Which rows hold a detection, `(..., L)` boolean."""
 
 
-class DecisionValues(Protocol):
+class _DecisionValues(Protocol):
     """The decision of a search (`semfov.decision.Decision`)."""
 
     @property
@@ -52,15 +52,8 @@ class DecisionValues(Protocol):
         """Probability that the target is at this place, after a closer look."""
 
 
-def header(stamp: Any, frame: str) -> Values:
+def header(stamp: Any, frame: str) -> _Values:
     """Make a `std_msgs/Header`.
-
-    Args:
-        stamp: time in seconds, or another message's `header.stamp`.
-        frame: name of the frame of reference.
-
-    Returns:
-        The fields of the message.
 
     >>> header(1.5, "camera")
     {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'camera'}
@@ -73,24 +66,9 @@ def header(stamp: Any, frame: str) -> Values:
 
 
 def detection_array(
-    detections: DetectionTensors, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
-) -> Values:
-    """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes.
-
-    Args:
-        detections: `semfov.Detections` of one image, with or without a batch dimension.
-        classes: names of the K classes, without background.
-        stamp: time of the image, as for `header`.
-        frame: frame of reference of the image.
-        least: hypotheses with a lower score are left out, and detections without any other hypothesis.
-        most: largest number of hypotheses for a detection.
-
-    Returns:
-        The fields of the message.
-
-    Raises:
-        InputError: the detections belong to several images, or have another number of classes.
-    """
+    detections: _DetectionTensors, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
+) -> _Values:
+    """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes."""
     boxes, scores, mask = detections.boxes, detections.scores, detections.mask
     check(mask.ndim == 1 or len(mask) == 1, "detections", "detections of one image", f"a batch of {len(mask)}")
     check_shape(scores, "detections.scores", None, len(classes) + 1)
@@ -109,18 +87,8 @@ def detection_array(
     return {"header": head, "detections": entries}
 
 
-def found_array(decision: DecisionValues | None, name: str, *, stamp: Any, frame: str) -> Values:
+def found_array(decision: _DecisionValues | None, name: str, *, stamp: Any, frame: str) -> _Values:
     """Make a `vision_msgs/Detection2DArray` of a decision: the box of the target if it was found, otherwise none.
-
-    Args:
-        decision: `semfov.paths.Moment.decision`, or the decision of a search; None counts as not found.
-        name: name of the target's class.
-        stamp: time of the image, as for `header`.
-        frame: frame of reference of the image.
-
-    Returns:
-        The fields of the message. The score is the probability that the target is at this place; for a decision
-        without closer looks, that the image holds it.
 
     >>> found_array(None, "cup", stamp=0, frame="camera")["detections"]
     []
@@ -133,7 +101,7 @@ def found_array(decision: DecisionValues | None, name: str, *, stamp: Any, frame
     return {"header": head, "detections": entries}
 
 
-def _bounds(box: Sequence[float]) -> Values:
+def _bounds(box: Sequence[float]) -> _Values:
     """A `vision_msgs/BoundingBox2D`; like the box, its centre is in pixels from the image's left and upper edge."""
     x1, y1, x2, y2 = box
     position = {"x": (x1 + x2) / 2, "y": (y1 + y2) / 2}
@@ -146,7 +114,7 @@ def gaze_point(
     stamp: Any,
     frame: str,
     camera: tuple[float, float, float, float] | None = None,
-) -> Values:
+) -> _Values:
     r"""Make a `geometry_msgs/PointStamped` of a fixation.
 
     For a pinhole camera the point is
@@ -182,20 +150,7 @@ def gaze_point(
 
 
 def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
-    """Fill a message from a dictionary, field by field.
-
-    Args:
-        message: an instance of a message class of ROS 2. Its method `get_fields_and_field_types` tells which message
-            class the elements of a list must have.
-        values: values by field; fields that are not named stay as they are.
-        kinds: message classes of the elements of lists, such as `Detection2D` and `ObjectHypothesisWithPose`.
-
-    Returns:
-        The same message.
-
-    Raises:
-        InputError: the message has no such field, or `kinds` lacks the class of a list's elements.
-    """
+    """Fill a message from a dictionary, field by field."""
     fields: Mapping[str, str] = message.get_fields_and_field_types()  # type: ignore[attr-defined]
     for name, value in values.items():
         check(name in fields, "values", f"fields of {type(message).__name__} ({', '.join(fields)})", repr(name))
@@ -218,17 +173,7 @@ def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
 
 
 def picture(message: Any) -> NDArray[np.uint8]:
-    """Read the pixels of a `sensor_msgs/Image`.
-
-    Args:
-        message: the message, with `encoding` rgb8, bgr8, rgba8, bgra8 or mono8; rows may be padded.
-
-    Returns:
-        RGB `(h, w, 3)` bytes, which `semfov.as_image` accepts.
-
-    Raises:
-        InputError: the message has another encoding, or fewer bytes than its size needs.
-    """
+    """Read the pixels of a `sensor_msgs/Image`; → `(h, w, 3)`."""
     encoding, step = str(message.encoding), int(message.step)
     height, width = int(message.height), int(message.width)
     check(

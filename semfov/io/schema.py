@@ -17,7 +17,7 @@ from semfov.errors import check
 
 Size = int | str
 """A number, a name such as `K` that stands for the same number in the whole file, or a sum such as `K+1` or `N-1`."""
-Sizes = dict[str, int]
+_Sizes = dict[str, int]
 """The numbers that names of sizes stand for, as far as they are known."""
 
 _FLOATS = (torch.float32, torch.float64)
@@ -25,20 +25,7 @@ _FLOATS = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class Field:
-    """Requirements of a tensor in a file.
-
-    Attributes:
-        shape: size of each dimension.
-        dtype: its type; None stands for float32 or float64, the same for all such tensors of a file.
-        low: smallest value allowed.
-        high: largest value allowed.
-        above: every value must be larger than this.
-        ascending: whether values must increase along the last dimension.
-        simplex: whether values must sum to 1 along the last dimension.
-        optional: whether the tensor may be missing.
-        finite: whether infinite values and NaN are refused.
-        mixed: where `dtype` is None, whether its type may differ from the type of the other tensors.
-    """
+    """Requirements of a tensor in a file."""
 
     shape: tuple[Size, ...]
     dtype: torch.dtype | None = None
@@ -51,7 +38,7 @@ class Field:
     finite: bool = True
     mixed: bool = False
 
-    def check(self, name: str, tensor: Tensor, sizes: Sizes) -> None:
+    def check(self, name: str, tensor: Tensor, sizes: _Sizes) -> None:
         """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
         fits = tensor.ndim == len(self.shape) and all(map(_fits, self.shape, tensor.shape, [sizes] * tensor.ndim))
         shape = ", ".join(str(size) for size in self.shape)
@@ -77,21 +64,13 @@ class Json(ABC):
     """Base of the requirements of a JSON value."""
 
     @abstractmethod
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Raise `InputError` unless a value meets the requirements; add the sizes that it determines to `sizes`."""
 
 
 @dataclass(frozen=True)
 class Number(Json):
-    """Requirement of a JSON value: a finite number.
-
-    Attributes:
-        low: smallest value allowed.
-        high: largest value allowed.
-        above: the value must be larger than this.
-        size: name of a size that the value determines; the value must then be a whole number of at least 1.
-        whole: whether the value must be a whole number.
-    """
+    """Requirement of a JSON value: a finite number."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -99,7 +78,7 @@ class Number(Json):
     size: Size | None = None
     whole: bool = False
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         whole = self.whole or self.size is not None
         check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", excerpt(value))
@@ -112,22 +91,14 @@ class Number(Json):
 class Flag(Json):
     """Requirement of a JSON value: true or false."""
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         check(isinstance(value, bool), name, "true or false", excerpt(value))
 
 
 @dataclass(frozen=True)
 class Array(Json):
-    """Requirement of a JSON value: a list.
-
-    Attributes:
-        of: requirements of every item.
-        size: number of items; None for any number.
-        least: smallest number of items allowed.
-        ascending: whether the items must increase.
-        distinct: whether all items must differ.
-    """
+    """Requirement of a JSON value: a list."""
 
     of: Json
     size: Size | None = None
@@ -135,7 +106,7 @@ class Array(Json):
     ascending: bool = False
     distinct: bool = False
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
         fits = self.size is None or _fits(self.size, len(value), sizes)
@@ -150,15 +121,11 @@ class Array(Json):
 
 @dataclass(frozen=True)
 class Pair(Json):
-    """Requirement of a JSON value: a list of a fixed number of items.
-
-    Attributes:
-        items: requirements of each item.
-    """
+    """Requirement of a JSON value: a list of a fixed number of items."""
 
     items: tuple[Json, ...]
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         fits = isinstance(value, list | tuple) and len(value) == len(self.items)
         check(fits, name, f"a list of {len(self.items)} items", excerpt(value))
@@ -168,15 +135,11 @@ class Pair(Json):
 
 @dataclass(frozen=True)
 class Text(Json):
-    """Requirement of a JSON value: a string without control characters.
-
-    Attributes:
-        options: the strings allowed; None allows any string.
-    """
+    """Requirement of a JSON value: a string without control characters."""
 
     options: tuple[str, ...] | None = None
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         fits = isinstance(value, str) and (self.options is None or value in self.options)
         named = f"one of {', '.join(self.options)}" if self.options else "no text"
@@ -186,19 +149,13 @@ class Text(Json):
 
 @dataclass(frozen=True)
 class Object(Json):
-    """Requirement of a JSON value: an object.
-
-    Attributes:
-        keys: requirements of the values under these keys.
-        others: requirements of the values under all other keys; None allows no other keys.
-        required: keys that must be present.
-    """
+    """Requirement of a JSON value: an object."""
 
     keys: Mapping[str, Json] = field(default_factory=dict)
     others: Json | None = None
     required: tuple[str, ...] = ()
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         check(isinstance(value, Mapping), name, "an object", excerpt(value))
         for key in self.required:
@@ -212,15 +169,11 @@ class Object(Json):
 
 @dataclass(frozen=True)
 class Maybe(Json):
-    """Requirement of a JSON value: null, or a value that meets another requirement.
-
-    Attributes:
-        of: requirements of a value that is not null.
-    """
+    """Requirement of a JSON value: null, or a value that meets another requirement."""
 
     of: Json
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
         if value is not None:
             self.of.check(name, value, sizes)
@@ -229,7 +182,7 @@ class Maybe(Json):
 class Anything(Json):
     """Requirement that any JSON value meets."""
 
-    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Check a value, see `Json.check`."""
 
 
@@ -244,10 +197,6 @@ METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(other
 class Schema:
     """Requirements of a whole file.
 
-    Attributes:
-        tensors: requirements of the tensors, by name.
-        record: requirements of the JSON values, by name; values that determine sizes come first.
-
     >>> schema = Schema({"weight": Field(("K", 2), low=0)}, {"classes": Array(Text(), "K")})
     >>> schema.check({"weight": torch.ones(3, 2)}, {"classes": ["cat", "cup", "tv"]})
     """
@@ -257,7 +206,7 @@ class Schema:
 
     def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> None:
         """Raise `InputError` unless tensors and record meet the requirements."""
-        sizes: Sizes = {}
+        sizes: _Sizes = {}
         values = record or {}
         for name, kind in self.record.items():
             check(name in values or isinstance(kind, Maybe), name, "a value", "nothing")
@@ -286,14 +235,6 @@ def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, larges
 def interval(low: float, high: float, above: float = -math.inf) -> str:
     """Write a range in words.
 
-    Args:
-        low: smallest value allowed.
-        high: largest value allowed.
-        above: values must be larger than this.
-
-    Returns:
-        The words.
-
     >>> interval(0, 1), interval(-math.inf, 5, above=0)
     ('numbers from 0 to 1', 'numbers above 0, up to 5')
     """
@@ -318,12 +259,6 @@ def is_number(value: object, *, whole: bool = False) -> bool:
 def is_plain(text: str) -> bool:
     """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs.
 
-    Args:
-        text: any text.
-
-    Returns:
-        Whether it is safe.
-
     >>> is_plain("dining table"), is_plain("a" + chr(0)), is_plain(chr(0xD800))
     (True, False, False)
     """
@@ -339,7 +274,7 @@ def excerpt(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _fits(size: Size, number: int, sizes: Sizes) -> bool:
+def _fits(size: Size, number: int, sizes: _Sizes) -> bool:
     """Whether a number agrees with a size; a size that was unknown is known from then on."""
     if isinstance(size, int):
         return size == number

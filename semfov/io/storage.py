@@ -20,16 +20,7 @@ _CHECKSUM = "sha256"
 
 
 def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
-    """Write tensors and a record of JSON values to a file atomically; the same content gives the same bytes.
-
-    Args:
-        path: the file.
-        tensors: tensors by name.
-        record: JSON values by name.
-
-    Raises:
-        DataError: the file cannot be written.
-    """
+    """Write tensors and a record of JSON values to a file atomically; the same content gives the same bytes."""
     from safetensors.torch import save
 
     whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
@@ -41,18 +32,7 @@ def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record:
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed.
-
-    Args:
-        path: the file.
-        kind: value that the record must have under `kind`.
-
-    Returns:
-        The tensors by name, and the record.
-
-    Raises:
-        DataError: the file is missing, damaged, or of another kind.
-    """
+    """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed."""
     from safetensors import SafetensorError, safe_open
 
     check_regular(path)
@@ -114,14 +94,6 @@ def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str
 
     A file that was written under another key or another file name (for another scene, for instance) counts as missing.
     So does a file that does not fit the schema.
-
-    Args:
-        path: the file.
-        key: key of the inputs that the tensors depend on.
-        schema: what the file must hold; None accepts anything.
-
-    Returns:
-        The tensors by name, or None where they are missing or damaged.
     """
     try:
         tensors, record = read(path, _KIND)
@@ -135,12 +107,6 @@ def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str
 def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
     """Convert tensors to bytes in the safetensors format.
 
-    Args:
-        tensors: tensors by name, of any shape and type.
-
-    Returns:
-        The bytes.
-
     >>> import torch
     >>> unpack_tensors(pack_tensors({"a": torch.tensor([1.5])}))
     {'a': tensor([1.5000])}
@@ -152,14 +118,7 @@ def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
 
 
 def unpack_tensors(data: bytes) -> dict[str, Tensor]:
-    """Convert the bytes of `pack_tensors` back to tensors.
-
-    Args:
-        data: the bytes.
-
-    Returns:
-        The tensors by name.
-    """
+    """Convert the bytes of `pack_tensors` back to tensors."""
     from safetensors.torch import load
 
     return load(data)

@@ -39,20 +39,7 @@ class Bootstrap:
     def of(
         cls, measure: Callable[[Tensor], Tensor], groups: Sequence[Hashable], *, samples: int = 1000, seed: int = 0
     ) -> Self:
-        """Measure all cases, and samples of them.
-
-        Args:
-            measure: maps the indices of cases `(M,)`, some of them repeated, to figures `(...)`.
-            groups: the group of each case, such as its photograph.
-            samples: number of samples B.
-            seed: random seed of the samples.
-
-        Returns:
-            The figures.
-
-        Raises:
-            InputError: there are no cases, or fewer than two samples.
-        """
+        """Measure all cases, and samples of them; measure `(M,)`."""
         check(len(groups) > 0, "groups", "the group of at least one case", "none")
         check(samples >= 2, "samples", "2 or more", samples)
         members: dict[Hashable, list[int]] = {}
@@ -72,24 +59,10 @@ class Bootstrap:
         return (apart.square().sum(0) / (there.sum(0) - 1)).sqrt()
 
     def interval(self, level: float = 0.95) -> Tensor:
-        """Interval that contains a share of the samples, with as many below as above it.
-
-        Args:
-            level: the share, from 0 to 1.
-
-        Returns:
-            `(2, ...)`, its lower and its upper end.
-        """
+        """Interval that contains a share of the samples, with as many below as above it; → `(2, ...)`."""
         ends = self.samples.new_tensor([(1 - level) / 2, (1 + level) / 2])
         return self.samples.nanquantile(ends, 0)
 
     def less(self, other: int) -> Self:
-        """Differences to one of the figures, paired over the samples.
-
-        Args:
-            other: its index along the first dimension of the figures.
-
-        Returns:
-            The differences, in the shape of the figures.
-        """
+        """Differences to one of the figures, paired over the samples."""
         return type(self)(self.value - self.value[other], self.samples - self.samples[:, other, None])

@@ -14,14 +14,6 @@ from semfov.errors import check, check_shape
 class Calibration:
     """Scoring rules and calibration errors of a set of predictions.
 
-    Attributes:
-        count: number of predictions.
-        nll: mean negative log likelihood of the true class, in nats.
-        brier: mean squared distance between prediction and truth, summed over classes, from 0 to 2.
-        ece: expected calibration error of the most probable class.
-        classwise_ece: calibration error of the probability of each class, averaged over the classes.
-        accuracy: fraction of predictions whose most probable class is the true one.
-
     >>> calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0])).count
     2
     """
@@ -37,20 +29,11 @@ class Calibration:
 def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Calibration:
     """Compute all measures of `Calibration` for predictions over K + 1 classes.
 
-    Args:
-        probabilities: `(M, K+1)`, one predicted distribution in each row.
-        labels: `(M,)`, int64, true classes from 0 to K.
-        bins: number of equally wide bins for the calibration errors.
-
-    Returns:
-        The measures; all but the count are NaN where there are no predictions.
-
-    Raises:
-        InputError: the shapes do not fit together, or `bins` is less than 1.
-
     >>> figures = calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0]))
     >>> figures.accuracy, round(figures.brier, 3)
     (0.5, 0.37)
+
+    Shapes: probabilities `(M, K+1)`, labels `(M,)`.
     """
     check_shape(probabilities, "probabilities", None, None)
     check_shape(labels, "labels", probabilities.shape[0])
@@ -77,12 +60,6 @@ def surprisal(probability: Tensor) -> Tensor:
 
     A probability that has underflowed to 0 counts as the smallest positive float32, so that the result stays finite.
 
-    Args:
-        probability: any shape.
-
-    Returns:
-        The same shape.
-
     >>> surprisal(torch.tensor([1.0, 0.5]))
     tensor([-0.0000, 0.6931])
     """
@@ -105,7 +82,7 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
     >>> calibration_error(torch.tensor([0.9, 0.9]), torch.tensor([True, False])).round(decimals=4)
     tensor(0.4000, dtype=torch.float64)
     """
-    return error_of(reliability(confidence, correct, bins))
+    return _error_of(reliability(confidence, correct, bins))
 
 
 def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000, seed: int = 0) -> Tensor:
@@ -133,17 +110,13 @@ def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000,
     return torch.stack([calibration_error(p, outcome, bins) for outcome in drawn])
 
 
-def error_of(bins: Tensor) -> Tensor:
+def _error_of(bins: Tensor) -> Tensor:
     """Expected calibration error from the sums of `reliability`.
-
-    Args:
-        bins: `(3, bins)`, sums of `reliability`.
-
-    Returns:
-        The error, a scalar from 0 to 1.
 
     >>> error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
     tensor(0.1500)
+
+    Shapes: bins `(3, bins)`.
     """
     count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)
@@ -152,19 +125,12 @@ def error_of(bins: Tensor) -> Tensor:
 def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
     """Sums for a reliability diagram: what was predicted and what came true, by bin of confidence.
 
-    Args:
-        confidence: `(M,)`, predicted probabilities.
-        correct: `(M,)` boolean, whether the prediction came true.
-        bins: number of equally wide bins, or the ascending edges between bins. A bin contains its upper edge and not
-            its lower one.
-
-    Returns:
-        `(3, bins)`, float64 on the CPU: number of predictions, sum of their confidence, and number that came true.
-
     >>> reliability(torch.tensor([0.2, 0.9, 0.8]), torch.tensor([False, True, True]), 2)
     tensor([[1.0000, 2.0000],
             [0.2000, 1.7000],
             [0.0000, 2.0000]], dtype=torch.float64)
+
+    Shapes: confidence `(M,)`, correct `(M,)` → `(3, bins)`.
     """
     edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
     p = confidence.detach().to("cpu", torch.float64).contiguous()
@@ -209,15 +175,7 @@ class BinarySums:
 
     @classmethod
     def of(cls, probability: Tensor, outcome: Tensor) -> Self:
-        """Sum over predictions.
-
-        Args:
-            probability: `(M,)`, predicted probabilities.
-            outcome: `(M,)` boolean, whether the prediction came true.
-
-        Returns:
-            The sums.
-        """
+        """Sum over predictions; probability `(M,)`, outcome `(M,)`."""
         check_shape(probability, "probability", None)
         check_shape(outcome, "outcome", len(probability))
         p = probability.detach().double()
@@ -227,11 +185,7 @@ class BinarySums:
 
     @classmethod
     def nothing(cls) -> Self:
-        """The sums over no predictions, to which others are added.
-
-        Returns:
-            Sums of 0.
-        """
+        """The sums over no predictions, to which others are added."""
         return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
 
     def __add__(self, other: Self) -> Self:
@@ -267,32 +221,21 @@ class BinarySums:
     def ece(self) -> float:
         """Expected calibration error over 15 equally wide bins (`calibration_error`)."""
         first = self.bins[:, : len(_RARE) + 1].sum(1, keepdim=True)
-        error = float(error_of(torch.cat([first, self.bins[:, len(_RARE) + 1 :]], 1)))
+        error = float(_error_of(torch.cat([first, self.bins[:, len(_RARE) + 1 :]], 1)))
         return error if self.count else float("nan")
 
     def _mean(self, total: float) -> float:
         return total / self.count if self.count else float("nan")
 
     def record(self) -> dict[str, Any]:
-        """The sums as JSON values, without empty bins; `from_record` reads them.
-
-        Returns:
-            `bins` (each bin's number and its three sums), `surprisal` and `square`.
-        """
+        """The sums as JSON values, without empty bins; `from_record` reads them."""
         filled = self.bins[0].nonzero()[:, 0].tolist()
         bins = {str(number): self.bins[:, number].tolist() for number in filled}
         return {"bins": bins, "surprisal": self.surprisal, "square": self.square}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Read the sums from JSON values.
-
-        Args:
-            record: the values that `record` returned.
-
-        Returns:
-            The same sums.
-        """
+        """Read the sums from JSON values."""
         sums = cls.nothing()
         for number, column in record["bins"].items():
             sums.bins[:, int(number)] = torch.tensor(column, dtype=torch.float64)

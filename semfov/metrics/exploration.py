@@ -16,19 +16,13 @@ _Array = NDArray[np.float64]
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
     """The classes that are correct for each cell: those of the objects whose boxes overlap it.
 
-    Args:
-        annotation: boxes and classes of the objects, in pixels of the image.
-        grid: cells of the image.
-        components: number of classes, background included (K + 1).
-
-    Returns:
-        `(X·Y, K+1)`, boolean.
-
     >>> import torch
     >>> objects = Annotation(torch.tensor([[0.0, 0, 8, 8]]), torch.tensor([1]), torch.tensor([False]), (20, 10))
     >>> answers_of(objects, Grid(2, 1, (20, 10)), components=3).int()
     tensor([[0, 1, 0],
             [0, 0, 0]], dtype=torch.int32)
+
+    Shapes: → `(X·Y, K+1)`.
     """
     overlap = grid.footprint(annotation.boxes)
     classes = F.one_hot(annotation.labels, components)
@@ -40,17 +34,12 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
 
     A cell where several classes are tied for the most probable one counts as wrong, so a cell without information does.
 
-    Args:
-        beta: `(B, X·Y, C)`, Dirichlet parameters of all classes or of a subset.
-        answers: `(X·Y, C)` boolean, correct classes of each cell (`answers_of`).
-
-    Returns:
-        `(B,)`, int64.
-
     >>> import torch
     >>> beta = torch.tensor([[[0.5, 0.7], [0.9, 0.1], [0.5, 0.5]]])
     >>> count_right(beta, torch.tensor([[False, True]] * 3))
     tensor([1])
+
+    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B,)`.
     """
     return right_cells(beta, answers).sum(-1)
 
@@ -58,16 +47,11 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
     """The cells whose most probable class is that of an overlapping object; `count_right` counts them.
 
-    Args:
-        beta: `(B, X·Y, C)`, Dirichlet parameters of all classes or of a subset.
-        answers: `(X·Y, C)` boolean, correct classes of each cell (`answers_of`).
-
-    Returns:
-        `(B, X·Y)`, boolean.
-
     >>> import torch
     >>> right_cells(torch.tensor([[[0.5, 0.7], [0.5, 0.5]]]), torch.tensor([[False, True]] * 2))
     tensor([[ True, False]])
+
+    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B, X·Y)`.
     """
     best = beta == beta.amax(-1, keepdim=True)
     # Sums of a short dimension take a seventh of the time of `any`.
@@ -76,13 +60,6 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
 
 def success_rate(right: Sequence[int], cells: int) -> _Array:
     """Fraction of the cells with objects whose most probable class is correct, after each gaze shift.
-
-    Args:
-        right: number of correct cells after each gaze shift (`count_right`).
-        cells: number of cells with objects.
-
-    Returns:
-        One value from 0 to 1 for each entry of `right`.
 
     >>> success_rate([1, 3, 4], 4)
     array([0.25, 0.75, 1.  ])

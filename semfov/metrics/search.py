@@ -11,15 +11,10 @@ _Array = NDArray[np.float64]
 def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> _Array:
     """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
 
-    Args:
-        found_at: `(..., episodes)`, gaze shift at which each search found its target, -1 where it did not.
-        shifts: last gaze shift.
-
-    Returns:
-        `(..., shifts+1)`, ascending.
-
     >>> cumulative_performance(np.array([1, 3, -1, 1]), 3)
     array([0.  , 0.5 , 0.5 , 0.75])
+
+    Shapes: found_at `(..., episodes)` → `(..., shifts+1)`.
     """
     steps = np.arange(shifts + 1)
     found = (found_at[..., None] >= 0) & (found_at[..., None] <= steps)

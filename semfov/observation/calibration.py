@@ -138,11 +138,8 @@ def fit_discriminative(
 def _curvatures(groups: list[tuple[Tensor, Tensor]], alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Diagonal of the Hessian of the cross-entropy at the start.
 
-    Scaling the variables by it conditions the problem for L-BFGS: some directions are supported by many samples,
-    others by few.
-
-    Returns:
-        The diagonals for u, v, the common part of c and its part for each level.
+    Scaling the variables by it conditions the problem for L-BFGS: some directions are supported by many samples, others
+    by few.
     """
     weights, constants = [], []
     for rows, _ in groups:

@@ -12,20 +12,16 @@ from semfov.observation.mle import Method, mle, shrink, vacuous
 from semfov.observation.statistics import DirichletStatistics
 
 # Beyond this precision A, single-precision scores cannot be told from a single point.
-MAX_PRECISION = 1e6
+_MAX_PRECISION = 1e6
 # Pseudo-counts that draw each class to the uniform density.
-UNIFORM = 1.0
+_UNIFORM = 1.0
 
 
 @dataclass(frozen=True)
-class FittedTables:
+class _FittedTables:
     """Everything that an observation model takes from the statistics of a training set.
 
-    Attributes:
-        alpha: `(K+1, N, K+1)` in float64, Dirichlet parameters (`fit_table`).
-        log_prior: `(K+1, N)` in float64, log frequencies of the classes (`estimate_prior`).
-        expected: `(K+1, N, K+1)` in float64, mean scores (`expected_table`).
-        record: JSON values that say how they were fitted: the counts, the levels that fell back, and the settings.
+    Shapes: alpha `(K+1, N, K+1)`, log_prior `(K+1, N)`, expected `(K+1, N, K+1)`.
     """
 
     alpha: Tensor
@@ -36,15 +32,15 @@ class FittedTables:
 
 def fit_tables(
     statistics: DirichletStatistics, *, method: Method, shrinkage: float, minimum: int, enough: int | None
-) -> FittedTables:
-    """Fit all tables of an observation model, and warn of levels that fell back; arguments as for `fit_table`."""
-    alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
+) -> _FittedTables:
+    """Fit all tables of an observation model, and warn of levels that fell back; arguments as for `_fit_table`."""
+    alpha, fallback = _fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
     if fallback:
         text = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
         text += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
         warnings.warn(f"levels with fewer than {minimum} objects fall back: {text}", stacklevel=4)
-    prior, expected = estimate_prior(statistics.count, shrinkage), expected_table(statistics, fallback, shrinkage)
+    prior, expected = _estimate_prior(statistics.count, shrinkage), _expected_table(statistics, fallback, shrinkage)
     record = {
         "counts": statistics.count.tolist(),
         "fallback": {str(level): source for level, source in fallback.items()},
@@ -53,10 +49,10 @@ def fit_tables(
         "minimum": minimum,
         "enough": enough,
     }
-    return FittedTables(alpha, prior, expected, record)
+    return _FittedTables(alpha, prior, expected, record)
 
 
-def fit_table(
+def _fit_table(
     statistics: DirichletStatistics,
     *,
     method: Method = "newton",
@@ -98,12 +94,12 @@ def fit_table(
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
     classes = statistics.sum(1)
     uniform = vacuous(statistics.components).to(statistics.count.device)
-    parent = shrink(classes.mean_log, classes.count, uniform, UNIFORM)
+    parent = shrink(classes.mean_log, classes.count, uniform, _UNIFORM)
     mean_log = shrink(statistics.mean_log, statistics.count, parent[:, None], shrinkage)
     if enough is not None:
         check(enough >= 2, "enough", "2 or more", enough)
         mean_log = torch.where((statistics.count >= enough)[..., None], statistics.mean_log, mean_log)
-    alpha = mle(mean_log, method=method, max_precision=MAX_PRECISION)
+    alpha = mle(mean_log, method=method, max_precision=_MAX_PRECISION)
     fallback: dict[int, int] = {}
     for level, objects in enumerate(statistics.count[1:].sum(0).tolist()):
         if objects < minimum:
@@ -112,18 +108,18 @@ def fit_table(
     return alpha, fallback
 
 
-def expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
-    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage and fallback as in `fit_table`."""
+def _expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
+    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage and fallback as in `_fit_table`."""
     classes = statistics.sum(1)
     uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
-    parent = shrink(classes.mean, classes.count, uniform, UNIFORM)
+    parent = shrink(classes.mean, classes.count, uniform, _UNIFORM)
     table = shrink(statistics.mean, statistics.count, parent[:, None], shrinkage)
     for level, source in fallback.items():
         table[:, level] = table[:, source]
     return table / table.sum(-1, keepdim=True)
 
 
-def estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
+def _estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
     r"""Logarithms of the class frequencies at each level, shrunk towards those over all levels.
 
     .. math:: \pi_{k,d} = \frac{n_{k,d} + w \pi_k}{n_d + w}, \qquad \pi_k = \frac{n_k + 1}{n + K + 1}

@@ -167,8 +167,7 @@ def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
     The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
     exceeds A Σ exp(g) + K/2.
 
-    Returns:
-        `(rows,)` boolean.
+    Shapes: → `(rows,)`.
     """
     reaches = 1 - total <= rows.shape[-1] / (2 * precision)
     level = total.new_tensor(precision).digamma()
@@ -214,9 +213,6 @@ def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Te
     """Solve `(diag ψ'(α) - ψ'(A)) x = change`: the change of the maximum for a change of the mean log scores.
 
     For rows that are `capped` the solution is under the constraint Σ x = 0.
-
-    Returns:
-        x, in the shape of `alpha`.
     """
     rates = _trigamma(alpha).reciprocal()
     total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
@@ -308,9 +304,6 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
 
     The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`. Scaling by `across` turns the diagonal into ones.
     `along` is the only direction in which the rank-one part then gives another value than 1.
-
-    Returns:
-        α after the run.
     """
     rates = _trigamma(start).reciprocal()
     total = rates.sum(-1, keepdim=True)

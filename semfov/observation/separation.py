@@ -74,20 +74,11 @@ def visibility(model: ScoringModel) -> Tensor:
 def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha).
 
-    Args:
-        alpha: `(..., K)`, parameters of the distribution of the scores, positive.
-        target: `(..., K)`, parameters of the target's Dirichlet; broadcasts with `alpha`.
-        background: `(..., K)`, parameters of the background's Dirichlet; broadcasts with `alpha`.
-
-    Returns:
-        The mean and the variance, each `(...)`.
-
-    Raises:
-        InputError: the numbers of components differ, or a parameter is not positive.
-
     >>> mean, variance = log_ratio_moments(*torch.tensor([[2.0, 2.0], [2.0, 1.0], [1.0, 2.0]]))
     >>> mean, variance
     (tensor(0.), tensor(1.2899))
+
+    Shapes: alpha `(..., K)`, target `(..., K)`, background `(..., K)`.
     """
     check_shape(target, "target", alpha.shape[-1])
     check_shape(background, "background", alpha.shape[-1])

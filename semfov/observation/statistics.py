@@ -14,7 +14,7 @@ from semfov.io.storage import read, write_file
 
 # Sums are integers in units of 2^-32. Integers add exactly, so any order and any split of the samples give the same
 # bits.
-FRACTION_BITS = 32
+_FRACTION_BITS = 32
 # Largest deviation of a sum of half-precision scores from 1.
 _OFF_SIMPLEX = 1e-2
 
@@ -79,7 +79,7 @@ class DirichletStatistics:
         cells = self._cells(index, len(scores)).to(self.count.device)
         count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
         self._check_room(count)
-        terms = quantise(scores.to(self.count.device), self.epsilon)
+        terms = _quantise(scores.to(self.count.device), self.epsilon)
         self.count = count
         self.sums.view(3, -1, self.components).index_add_(1, cells, terms)
         return self
@@ -145,7 +145,7 @@ class DirichletStatistics:
             path: the file.
             record: JSON values to save with the statistics.
         """
-        own = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": FRACTION_BITS}
+        own = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": _FRACTION_BITS}
         write_file(path, {"count": self.count, "sums": self.sums}, {**record, **own})
 
     @classmethod
@@ -174,8 +174,8 @@ class DirichletStatistics:
             ).check(tensors, record)
         except InputError as error:
             raise DataError(f"{path}: expected a complete file of Dirichlet statistics, got: {error}") from None
-        if record.get("fraction_bits") != FRACTION_BITS:
-            raise DataError(f"{path}: expected sums in units of 2^-{FRACTION_BITS}, got {record.get('fraction_bits')}")
+        if record.get("fraction_bits") != _FRACTION_BITS:
+            raise DataError(f"{path}: expected sums in units of 2^-{_FRACTION_BITS}, got {record.get('fraction_bits')}")
         statistics = cls(tuple(count.shape), sums.shape[-1], epsilon=record["epsilon"])
         statistics.count, statistics.sums = count, sums
         return statistics, record
@@ -195,7 +195,7 @@ class DirichletStatistics:
         return f"DirichletStatistics(shape={self.shape}, components={self.components}, samples={samples})"
 
     def _mean(self, which: int) -> Tensor:
-        return self.sums[which].to(torch.float64) / 2.0**FRACTION_BITS / self.count[..., None]
+        return self.sums[which].to(torch.float64) / 2.0**_FRACTION_BITS / self.count[..., None]
 
     def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
         """Row-major cell numbers, after checking the index."""
@@ -214,31 +214,26 @@ class DirichletStatistics:
     def _check_room(self, count: Tensor) -> None:
         """Raise `InputError` if the sums of so many samples could exceed 63 bits."""
         longest = math.log((2 + self.components * self.epsilon) / self.epsilon)
-        room = int(2.0 ** (63 - FRACTION_BITS) / longest)
+        room = int(2.0 ** (63 - _FRACTION_BITS) / longest)
         if int(count.max()) > room:
             raise InputError(
                 f"statistics: expected at most {room} samples in a cell, got {int(count.max())}; fit on fewer samples"
             )
 
 
-def quantise(scores: Tensor, epsilon: float) -> Tensor:
+def _quantise(scores: Tensor, epsilon: float) -> Tensor:
     """Round `ln s`, `s` and `s²` of scores to integers in units of 2^-32.
 
     The sum that scales the scores is computed over integers, too: the last bit of a sum of floats can depend on the
     layout of the batch.
 
-    Args:
-        scores: `(M, K)`, not negative.
-        epsilon: lower bound of the scores.
-
-    Returns:
-        `(3, M, K)` int64.
-
     >>> quantise(torch.tensor([[0.5, 0.5]]), 1e-6)[1] / 2**32
     tensor([[0.5000, 0.5000]])
+
+    Shapes: scores `(M, K)` → `(3, M, K)`.
     """
     raised = scores.to(torch.float64).clamp(min=epsilon).contiguous()
     total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)
     shares = raised / (total.to(torch.float64) / 2.0**48)
     terms = torch.stack([shares.log(), shares, shares.square()])
-    return (terms * 2.0**FRACTION_BITS).round().to(torch.int64)
+    return (terms * 2.0**_FRACTION_BITS).round().to(torch.int64)

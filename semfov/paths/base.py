@@ -383,19 +383,7 @@ class Record(Conversion):
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Make the other attributes from the tensors and JSON values of a file.
-
-        Args:
-            tensors: all tensors.
-            record: all JSON values.
-            shared: attributes of the base.
-
-        Returns:
-            The attributes by name.
-
-        Raises:
-            InputError: they do not fit each other.
-        """
+        """Make the other attributes from the tensors and JSON values of a file."""
 
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
         """A table of the record as a pandas data frame.

@@ -163,9 +163,6 @@ class Conversion(ABC):
 def coco_categories() -> list[dict[str, Any]]:
     """The categories of COCO's annotation files, as torchvision has them.
 
-    Returns:
-        `id` and `name` of the 80 categories; ids go up to 90.
-
     >>> len(coco_categories()), coco_categories()[11]
     (80, {'id': 13, 'name': 'stop sign'})
     """

@@ -55,16 +55,6 @@ def sentence(
 ) -> str:
     """Explain in one sentence why a search or an exploration ended.
 
-    Args:
-        sentences: `FIXATIONS` or `WINDOWS`.
-        ending: reason for the end; None if it is not known.
-        outcome: outcome of the decision; None without one.
-        looks: number of looks.
-        closer: whether closer looks were made.
-
-    Returns:
-        The sentence; empty if the reason is not known.
-
     >>> sentence(FIXATIONS, "shifts", None, 8, closer=False), sentence(WINDOWS, "decision", "absent", 3, closer=True)
     ('All 7 gaze shifts were made.', 'No closer look was sure enough, and the target is probably absent.')
     """

@@ -46,13 +46,7 @@ def pair(of: Json) -> Pair:
 
 @dataclass(frozen=True)
 class Format:
-    """Format of the files of one kind of records.
-
-    Attributes:
-        kind: name of the kind in its files.
-        schema: requirements of the files.
-        closer: attributes of a closer look that the files keep, beside its box.
-    """
+    """Format of the files of one kind of records."""
 
     kind: str
     schema: Schema
@@ -68,18 +62,7 @@ class Format:
         endings: Sequence[Ending],
         closer: Sequence[str],
     ) -> Self:
-        """Make the format of a kind from what its records have beside the attributes of the base.
-
-        Args:
-            kind: name of the kind.
-            tensors: requirements of its own tensors; `n` is the number of looks, `C` that of classes with background.
-            record: requirements of its own JSON values.
-            endings: reasons for the end that its records can have.
-            closer: attributes of a closer look that the files keep, beside its box.
-
-        Returns:
-            The format.
-        """
+        """Make the format of a kind from what its records have beside the attributes of the base."""
         shared: dict[str, Json] = {
             "version": Text(),
             "classes": Array(Text(), "C", least=2),
@@ -106,17 +89,7 @@ class Format:
         tensors: Mapping[str, Tensor],
         record: Mapping[str, Any],
     ) -> None:
-        """Write a record to a file atomically.
-
-        Args:
-            path: the file.
-            fields: attributes of the base.
-            tensors: further tensors of the kind.
-            record: further JSON values of the kind.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
+        """Write a record to a file atomically."""
         looks: tuple[Detections, ...] = fields["detections"]
         decision: Decision | None = fields["decision"]
         # The detections of all looks in a row, without padding; `lengths` separates them again.
@@ -143,18 +116,7 @@ class Format:
         write_file(path, whole, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-        """Read a file that `write_file` wrote, and check it.
-
-        Args:
-            path: the file.
-
-        Returns:
-            The tensors, the JSON values, and the attributes of the base.
-
-        Raises:
-            DataError: the file is missing or damaged, or of another kind.
-            InputError: its content does not meet the requirements.
-        """
+        """Read a file that `write_file` wrote, and check it."""
         tensors, record = read(path, self.kind)
         record.pop("kind")
         unknown = record.keys() - self.schema.record.keys()

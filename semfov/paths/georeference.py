@@ -16,19 +16,7 @@ _KEYS = 34735
 
 
 def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """The map from pixels of a GeoTIFF, or of another raster, to longitude and latitude.
-
-    Args:
-        source: file of the picture.
-
-    Returns:
-        A function from points `(N, 2)`, `(x, y)` in pixels with edges of pixels at integers, to longitude and latitude
-        `(N, 2)` in degrees (WGS 84); None for a picture without georeference.
-
-    Raises:
-        InputError: the picture has a georeference, and rasterio is not installed.
-        DataError: the file is missing or cannot be read.
-    """
+    """The map from pixels of a GeoTIFF, or of another raster, to longitude and latitude; → `(N, 2)`."""
     kind = Path(source).suffix.lower()
     if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None

@@ -13,19 +13,12 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
 from semfov.observation.matching import box_iou
 
-CONFIRMED = 0.5
+_CONFIRMED = 0.5
 """Probability from which on a closer look confirms that the target is there."""
 
 
 class ConfirmedPlace(NamedTuple):
-    """A place that was confirmed.
-
-    Attributes:
-        box: `(4,)` in picture pixels.
-        label: class, 1..K.
-        probability: probability that the class is there.
-        look: number of the look that the box comes from.
-    """
+    """A place that was confirmed; box `(4,)`."""
 
     box: Tensor
     label: int
@@ -46,21 +39,13 @@ def merge_fixations(
     The nearest fixation sees a box most sharply, and a closer look more sharply still. The score of the box of a closer
     look is the probability that the target is there, so a place that a closer look has refuted is no candidate.
 
-    Args:
-        looks: detections of each fixation, a batch of one, boxes in picture pixels.
-        distances: for each fixation, its distance `(L,)` to each of the boxes.
-        closer: closer looks.
-        cut: for each fixation, which of its boxes `(L,)` the border of the view cuts; None where views have no border.
-        around: width of a picture whose left and right borders meet; None for others.
-
-    Returns:
-        Objects, most confident first.
-
     >>> far, near = torch.tensor([[[0.0, 0, 10, 10]]]), torch.tensor([[[0.0, 1, 11, 10]]])
     >>> scores, one = torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool)
     >>> looks = Detections(far, scores, one), Detections(near, scores, one)
     >>> merge_fixations(looks, [torch.tensor([90.0]), torch.tensor([5.0])]).boxes
     tensor([[ 0.,  1., 11., 10.]])
+
+    Shapes: distances `(L,)`, cut `(L,)`.
     """
     boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []
     for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
@@ -75,7 +60,7 @@ def merge_fixations(
         boxes.append(look.box[None].detach().float().cpu())
         scores.append(torch.tensor([look.place]))
         labels.append(torch.tensor([look.target]))
-        numbers.append(torch.tensor([number_of(look)]))
+        numbers.append(torch.tensor([_number_of(look)]))
         sharpness.append(torch.tensor([1.0]))
         broken.append(torch.tensor([False]))
     if not boxes:
@@ -87,22 +72,17 @@ def merge_fixations(
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
     """Distance of a point to boxes; 0 inside a box.
 
-    Args:
-        boxes: `(L, 4)`.
-        point: `(2,)`, `(x, y)`, in pixels whose centres are at integers.
-
-    Returns:
-        `(L,)`.
-
     >>> distances_to(torch.tensor([[10.0, 10, 20, 20], [0, 0, 4, 5]]), torch.tensor([6.5, 8.5])).tolist()
     [3.1622776985168457, 5.0]
+
+    Shapes: boxes `(L, 4)`, point `(2,)` → `(L,)`.
     """
     at = (point + 0.5).to(boxes)
     beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)
     return torch.linalg.vector_norm(beside, dim=-1)
 
 
-def number_of(look: CloseUp) -> int:
+def _number_of(look: CloseUp) -> int:
     """Number of the look that a closer look is, or after which it was made."""
     return (look.fixation if look.number is None else look.number) or 0
 
@@ -110,39 +90,19 @@ def number_of(look: CloseUp) -> int:
 def places_confirmed(
     decision: Decision | None, target: int | None, closer: Sequence[CloseUp], last: int
 ) -> list[ConfirmedPlace]:
-    """The places that closer looks confirmed, and the one that the decision found.
-
-    Args:
-        decision: decision of a search; None without one.
-        target: class that it is about.
-        closer: closer looks.
-        last: number of the last look.
-
-    Returns:
-        The places, each one once.
-    """
+    """The places that closer looks confirmed, and the one that the decision found."""
     box = decision.box if decision is not None and decision.outcome == "found" else None
-    others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
-    places = [ConfirmedPlace(look.box, look.target, look.place, number_of(look)) for look in others]
+    others = [look for look in closer if look.place >= _CONFIRMED and (box is None or not look.box.equal(box))]
+    places = [ConfirmedPlace(look.box, look.target, look.place, _number_of(look)) for look in others]
     if box is not None and decision is not None and target is not None:
-        last = next((number_of(look) for look in closer if look.box.equal(box)), last)
+        last = next((_number_of(look) for look in closer if look.box.equal(box)), last)
         probability = decision.probability if decision.place is None else decision.place
         places.append(ConfirmedPlace(box, target, probability, last))
     return places
 
 
 def confirm(candidates: Objects, places: Sequence[ConfirmedPlace], least: float) -> tuple[Objects, Tensor]:
-    """The candidates that count as objects: those with a high score, and those that were confirmed.
-
-    Args:
-        candidates: the candidates.
-        places: places that were confirmed. The candidate that overlaps a place by half takes its probability as score,
-            if that is higher. A place without a candidate becomes an object.
-        least: score from which on others count.
-
-    Returns:
-        The objects, most confident first, and which of them were confirmed, `(M,)` boolean.
-    """
+    """The candidates that count as objects: those with a high score, and those that were confirmed; → `(M,)`."""
     boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
     sure = torch.zeros(len(candidates), dtype=torch.bool)
     for place in places:

@@ -169,7 +169,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     torch.Size([3, 480, 1280])
     """
     if isinstance(picture, Tensor):
-        return in_bytes(reduced(picture))
+        return in_bytes(_reduced(picture))
     width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(height * scale)), max(1, round(width * scale))
@@ -177,7 +177,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     return resized(pixels, size)[0].contiguous()
 
 
-def reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
+def _reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
     """Reduce an image `(3, h, w)` so that its longer side is at most `longest` pixels."""
     check(longest >= 1, "longest", "at least 1 pixel", longest)
     scale = longest / max(image.shape[-2:])
@@ -189,12 +189,6 @@ def reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
 
 def in_bytes(image: Tensor) -> Tensor:
     """Convert pixels in [0, 1] to bytes, on the CPU.
-
-    Args:
-        image: `(...)`; values outside [0, 1] are clipped.
-
-    Returns:
-        `(...)` uint8.
 
     >>> in_bytes(torch.tensor([0.0, 0.5, 1.0])).tolist()
     [0, 128, 255]

@@ -78,7 +78,7 @@ def episode_data(
         {
             "cell": cell,
             "view": None if view is None else jpeg_uri(view, width, quality),
-            "detections": detection_data(scanpath, number),
+            "detections": _detection_data(scanpath, number),
             "values": [rounded(value) for value in scanpath.values[number].tolist()],
             "next": after[number],
             "seconds": dict(scanpath.seconds[number]) if timed else None,
@@ -87,9 +87,9 @@ def episode_data(
     ]
     return {
         "name": name,
-        **about_data(scanpath, settings),
+        **_about_data(scanpath, settings),
         "summary": scanpath.describe(),
-        "outcome": outcome_data(scanpath),
+        "outcome": _outcome_data(scanpath),
         "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
@@ -98,12 +98,12 @@ def episode_data(
         "found": scanpath.found,
         "truth": [] if boxes is None else boxes.tolist(),
         "fixations": fixations,
-        "maps": map_data(scanpath, classes),
-        "entropy": quantised(cell_entropy(scanpath)),
+        "maps": _map_data(scanpath, classes),
+        "entropy": _quantised(cell_entropy(scanpath)),
     }
 
 
-def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
+def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
     """Detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
@@ -123,7 +123,7 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
     }
 
 
-def outcome_data(scanpath: Scanpath) -> Data:
+def _outcome_data(scanpath: Scanpath) -> Data:
     """Why the episode ended, and the cell and box of a target that was found."""
     decision = scanpath.decision
     found = decision is not None and decision.outcome == "found"
@@ -135,18 +135,8 @@ def outcome_data(scanpath: Scanpath) -> Data:
     }
 
 
-def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: int = 5) -> list[Data]:
-    """The most confident detections of a look, each with its highest class scores and the position of its label.
-
-    Args:
-        scanpath: the episode.
-        fixation: number of the look.
-        most: largest number of detections.
-        scores: largest number of class scores for each detection.
-
-    Returns:
-        For each detection its box, its label, pairs of class name and score, and the rectangle of its label.
-    """
+def _detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: int = 5) -> list[Data]:
+    """The most confident detections of a look, each with its highest class scores and the position of its label."""
     looked, classes = scanpath.detections[fixation][0], scanpath.classes
     detections = []
     for box, vector in zip(looked.boxes[:most], looked.scores[:most], strict=True):
@@ -166,17 +156,7 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
 def tagged(
     detections: list[Data], texts: Sequence[str], frame: tuple[float, float], obstacles: Sequence[LabelBox] = ()
 ) -> list[Data]:
-    """Detections with `tag`, the rectangle of their text.
-
-    Args:
-        detections: each with its `box`.
-        texts: text of each.
-        frame: `(width, height)` of the picture in which they are drawn.
-        obstacles: rectangles that no text may cover.
-
-    Returns:
-        The detections.
-    """
+    """Detections with `tag`, the rectangle of their text; frame `(width, height)`."""
     unit = frame[0] / 640
     sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
     places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, obstacles)
@@ -185,26 +165,19 @@ def tagged(
     ]
 
 
-def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
+def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     """Probability maps `(n, X·Y)`: of the target, then of the classes most probable anywhere, then of background.
 
     The map of the target is the belief of the search, where the scanpath has one.
-
-    Args:
-        scanpath: the episode.
-        classes: number of maps to keep beside background; None keeps all.
-
-    Returns:
-        For each map its label, its maximum, and its values in base 64.
     """
     probabilities = scanpath.probabilities.detach().cpu()
     order = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
     target, maps = scanpath.target, []
     if target is not None:
         order = [index for index in order if index != target]
-        maps.append({"label": scanpath.classes[target], **quantised(class_posterior(scanpath))})
+        maps.append({"label": scanpath.classes[target], **_quantised(class_posterior(scanpath))})
     labels = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
-    maps += [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in labels]
+    maps += [{"label": scanpath.classes[index], **_quantised(probabilities[..., index])} for index in labels]
     # Some detectors give several classes the same name. A number tells their entries apart.
     times: Counter[str] = Counter()
     for each in maps:
@@ -214,7 +187,7 @@ def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     return maps
 
 
-def quantised(values: Tensor) -> Data:
+def _quantised(values: Tensor) -> Data:
     """Numbers of 0 or more in 255 steps of their maximum, in row-major order, in base 64."""
     greatest = max(float(values.max()), 1e-12)
     steps = (values.detach().cpu().double() / greatest * 255).round().to(torch.uint8)

@@ -21,16 +21,7 @@ ABOUT = {
 
 
 def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
-    """The picture with its windows and objects, all looks, and a table of the objects.
-
-    Args:
-        data: data of the path (`semfov.report.zoom.zoom_data`).
-        place: id of the element.
-        headed: whether the head of the page shows this path. Otherwise a head is added for readers without JavaScript.
-
-    Returns:
-        HTML.
-    """
+    """The picture with its windows and objects, all looks, and a table of the objects."""
     name, count = escape(data["name"]), data["count"]
     facts = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
     head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'

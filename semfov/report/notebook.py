@@ -25,7 +25,7 @@ MOST_CHARACTERS = 3_000_000
 HEIGHT = 760
 """Height of the frame in pixels; the page scrolls in it."""
 
-FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
+_FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
 """Widths in pixels and JPEG qualities of the pictures; the first pair that fits is taken."""
 
 _MAPS = MOST_CHARACTERS // 4
@@ -39,16 +39,10 @@ _MOST = 500  # largest number of objects that are drawn; the most confident ones
 _QUALITY = 75  # of the photograph, a JPEG
 
 
-def record_html(record: Record) -> str:
+def _record_html(record: Record) -> str:
     """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML.
 
     Objects that were confirmed are green, others orange. A grey rectangle stands for a photograph that was not kept.
-
-    Args:
-        record: the record.
-
-    Returns:
-        An HTML element.
     """
     width, height = record.size
     unit = max(width, height) / WIDTH
@@ -82,24 +76,18 @@ def _rect(box: Sequence[float], colour: str, line: float, inside: str = "") -> s
     return f'<rect {side} fill="none" stroke="{colour}" stroke-width="{line:.1f}" pointer-events="all">{inside}</rect>'
 
 
-def notebook_html(scanpath: Scanpath) -> str:
+def _notebook_html(scanpath: Scanpath) -> str:
     """The page to step through in a frame; a short text where the page would be too large.
 
     The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
     outside.
-
-    Args:
-        scanpath: the episode.
-
-    Returns:
-        HTML.
     """
     classes = _classes_that_fit(scanpath)
     if classes >= 1:
         views = None if scanpath.stimulus is None else scanpath.views()
         across, down = scanpath.grid.extent.tolist()
         name = f"{across:.0f} × {down:.0f} px"
-        for width, quality in FINENESS:
+        for width, quality in _FINENESS:
             data = episode_data(
                 scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality
             )
@@ -126,8 +114,8 @@ def _classes_that_fit(scanpath: Scanpath) -> int:
     return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
 
 
-draws("notebook", Record, record_html)
-draws("notebook", Scanpath, notebook_html)
+draws("notebook", Record, _record_html)
+draws("notebook", Scanpath, _notebook_html)
 draws("report", Record, write_record)
 draws("report", Scanpath, write_scanpath)
 draws("plot", Scanpath, plot_scanpath)

@@ -26,7 +26,7 @@ from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
-FOLDER = Path(__file__).parent
+_FOLDER = Path(__file__).parent
 
 _OPACITY = 0.82
 """Opacity over the photograph of colours that do not stand for probabilities."""
@@ -63,21 +63,7 @@ def write_record(
     picture: LargePicture | ImageLike | None = None,
     name: str | None = None,
 ) -> Path:
-    """Write the page of a record with its windows, objects and looks.
-
-    Args:
-        record: the record.
-        path: the HTML file.
-        picture: the picture in full size, in which narrow windows are sharp; None takes the one that the record kept.
-        name: name of the picture on the page; None takes that of its file, or its size.
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: the picture was neither kept nor given, or has other proportions.
-        DataError: the file cannot be written.
-    """
+    """Write the page of a record with its windows, objects and looks."""
     data = zoom_data(record, picture, name=_name(record, name))
     return write_page(Path(path), f"semfov: {record.describe()}", [data])
 
@@ -90,22 +76,7 @@ def write_scanpath(
     name: str | None = None,
     boxes: Tensor | None = None,
 ) -> Path:
-    """Write the page on which a reader steps through a scanpath.
-
-    Args:
-        scanpath: the scanpath.
-        path: the HTML file.
-        picture: the photograph; None takes the one that the scanpath kept.
-        name: name of the photograph on the page; None takes that of its file, or its size.
-        boxes: `(M, 4)`, true boxes of the target.
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: the photograph was neither kept nor given.
-        DataError: the file cannot be written.
-    """
+    """Write the page on which a reader steps through a scanpath; boxes `(M, 4)`."""
     image = photograph_of(scanpath, None if picture is None else as_image(picture))
     views = None if scanpath.stimulus is None else scanpath.views()
     data = episode_data(scanpath, image, views, name=_name(scanpath, name), boxes=boxes)
@@ -120,12 +91,6 @@ def _name(record: Record, name: str | None) -> str:
 
 def page_path(path: Path) -> Path:
     """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`.
-
-    Args:
-        path: the HTML file.
-
-    Returns:
-        The same path.
 
     >>> page_path(Path("cup.pdf"))
     Traceback (most recent call last):
@@ -157,19 +122,19 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
         "pictures": list(numbers),
         "colours": {
-            "time": colour_steps(TIME),
-            "overlay": colour_steps(overlay_colours()),
-            "probability": colour_steps(PROBABILITY, _OPACITY),
-            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
+            "time": _colour_steps(TIME),
+            "overlay": _colour_steps(overlay_colours()),
+            "probability": _colour_steps(PROBABILITY, _OPACITY),
+            "uncertainty": _colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
     contents = {
         "title": escape(title),
-        "style": (FOLDER / "page.css").read_text(encoding="utf-8"),
-        "program": (FOLDER / "page.js").read_text(encoding="utf-8"),
-        "data": json_script(data),
+        "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
+        "program": (_FOLDER / "page.js").read_text(encoding="utf-8"),
+        "data": _json_script(data),
         "sections": sections,
-        "about": about_html(episodes),
+        "about": _about_html(episodes),
         "looks": "".join(
             looks_html(episode, _place(number), headed=number == 0)
             for number, episode in enumerate(episodes)
@@ -177,12 +142,12 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         ),
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
-    template = (FOLDER / "page.html").read_text(encoding="utf-8")
+    template = (_FOLDER / "page.html").read_text(encoding="utf-8")
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template)
 
 
-def about_html(episodes: Sequence[Data]) -> str:
+def _about_html(episodes: Sequence[Data]) -> str:
     """The head of the page: facts about the first episode, which the script updates for other episodes."""
     if not episodes:
         return ""
@@ -216,7 +181,7 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
     return {**about, "article": _place(number), "looks": looks}
 
 
-def json_script(data: Any) -> str:
+def _json_script(data: Any) -> str:
     r"""JSON text that is safe inside a script element.
 
     Args:
@@ -232,7 +197,7 @@ def json_script(data: Any) -> str:
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
+def _colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
     """Red, green and blue from 0 to 255 and opacity from 0 to 1 of a colour map of matplotlib, at equal steps."""
     from matplotlib import colormaps
 

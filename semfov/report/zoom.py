@@ -29,7 +29,7 @@ DRAWN = 500
 LISTED = 100
 """Largest number of objects in the table."""
 
-MOST_DETECTIONS = 15
+_MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
 
 
@@ -96,18 +96,18 @@ def zoom_data(
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
     objects = _objects(path)
-    views = look_views(path, source)
+    views = _look_views(path, source)
     return {
         "name": name,
         "pixels": f"{wide} × {high} px",
         "detector": None if settings is None else settings["detector"]["name"],
-        "sensor": sensor_words(path),
+        "sensor": _sensor_words(path),
         "passes": str(path.passes),
-        "decision": outcome_in_words(path),
+        "decision": _outcome_in_words(path),
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
-        "values": values_in_words(path),
+        "values": _values_in_words(path),
         "image": jpeg_uri(_pixels(source, (0, 0, wide, high), path.size, min(width, wide)), width, quality),
         "looks": [_look(path, look, view, objects, quality) for look, view in zip(path, views, strict=True)],
         "objects": objects[:DRAWN],
@@ -116,15 +116,8 @@ def zoom_data(
     }
 
 
-class LookView(NamedTuple):
-    """What a look showed.
-
-    Attributes:
-        pixels: `(3, h, w)`, RGB in [0, 1].
-        size: `(width, height)` in the unit of the boxes.
-        boxes: `(L, 4)`, boxes of all detections in the view.
-        across: number of pixels across that the detector received.
-    """
+class _LookView(NamedTuple):
+    """What a look showed; pixels `(3, h, w)`, size `(width, height)`, boxes `(L, 4)`."""
 
     pixels: Tensor
     size: tuple[int, int]
@@ -133,7 +126,7 @@ class LookView(NamedTuple):
 
 
 @singledispatch
-def look_views(path: Record, source: LargePicture) -> Iterator[LookView]:
+def _look_views(path: Record, source: LargePicture) -> Iterator[_LookView]:
     """The views of all looks of a record, from its picture, which may be reduced."""
     for look in path:
         frame = _whole_pixels(look.region, path.size)
@@ -141,41 +134,41 @@ def look_views(path: Record, source: LargePicture) -> Iterator[LookView]:
         yield _view(look, frame, source, path.size, across)
 
 
-@look_views.register
-def _(path: ZoomPath, source: LargePicture) -> Iterator[LookView]:
+@_look_views.register
+def _(path: ZoomPath, source: LargePicture) -> Iterator[_LookView]:
     for look, glance in zip(path, path.glances, strict=True):
         frame = _whole_pixels(look.region, path.size)
         across = max(1, round((frame[2] - frame[0]) * glance.window.fixation[2]))
         yield _view(look, frame, source, path.size, across)
 
 
-@look_views.register
-def _(path: HeadPath, source: LargePicture) -> Iterator[LookView]:
+@_look_views.register
+def _(path: HeadPath, source: LargePicture) -> Iterator[_LookView]:
     whole = _pixels(source, (0, 0, *path.size), path.size, 2 * LONGEST)
     size = path.views.world.size
     for number, pixels in enumerate(head_views(path, whole)):
-        yield LookView(pixels, size, path.detections[number].boxes[0], size[0])
+        yield _LookView(pixels, size, path.detections[number].boxes[0], size[0])
 
 
-def _view(look: RecordedLook, frame: _Frame, source: LargePicture, size: tuple[int, int], across: int) -> LookView:
+def _view(look: RecordedLook, frame: _Frame, source: LargePicture, size: tuple[int, int], across: int) -> _LookView:
     """The view of a window of the picture."""
     x1, y1, x2, y2 = frame
     boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
-    return LookView(_pixels(source, frame, size, across), (x2 - x1, y2 - y1), boxes, across)
+    return _LookView(_pixels(source, frame, size, across), (x2 - x1, y2 - y1), boxes, across)
 
 
 @singledispatch
-def sensor_words(path: Record) -> str | None:
+def _sensor_words(path: Record) -> str | None:
     """Describe in words through what a record looked."""
     return None
 
 
-@sensor_words.register
+@_sensor_words.register
 def _(path: ZoomPath) -> str:
-    return windows_in_words(path.lattice)
+    return _windows_in_words(path.lattice)
 
 
-@sensor_words.register
+@_sensor_words.register
 def _(path: HeadPath) -> str:
     wide, high = path.views.world.size
     fields = ", ".join(f"{field:g}" for field in path.views.fields)
@@ -183,17 +176,17 @@ def _(path: HeadPath) -> str:
 
 
 @singledispatch
-def values_in_words(path: Record) -> str:
+def _values_in_words(path: Record) -> str:
     """Explain the values of the looks, where they have a meaning that the page does not tell elsewhere."""
     return ""
 
 
-@values_in_words.register
+@_values_in_words.register
 def _(path: ZoomPath) -> str:
     return f"{NUMBER if path.decision is None else _PROBABILITY} "
 
 
-def windows_in_words(lattice: Lattice) -> str:
+def _windows_in_words(lattice: Lattice) -> str:
     """Describe the windows of a lattice in words."""
     wide, high = lattice.canvas
     magnifications = ", ".join(f"{m:.2g}" for m in lattice.magnifications)
@@ -201,7 +194,7 @@ def windows_in_words(lattice: Lattice) -> str:
     return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
 
-def outcome_in_words(path: Record) -> str:
+def _outcome_in_words(path: Record) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
     reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
     if path.decision is None:
@@ -227,7 +220,7 @@ def _objects(path: Record) -> list[Data]:
     ]
 
 
-def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:
+def _look(path: Record, look: RecordedLook, view: _LookView, objects: list[Data], quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     (x, y), number, (x1, _, x2, _) = look.fixation, look.number, look.region
     whole = path.is_whole(look.region)
@@ -252,14 +245,14 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "magnification": rounded(magnification),
         "value": None if look.value is None else rounded(look.value),
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
-        "detections": detections[:MOST_DETECTIONS],
+        "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
         "brought": kinds or "none",
         "status": " ".join(sentences),
     }
 
 
-def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
+def _detections(path: Record, look: RecordedLook, view: _LookView) -> list[Data]:
     """Detections of a look, those of the target first, with boxes and labels in the unit of the view."""
     detections, rows = look.detections, []
     columns = zip(
@@ -281,8 +274,8 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     rows.sort(key=lambda row: row[:2], reverse=True)
     entries = [detection for _, _, detection in rows]
     # Names would cover small objects. The table has them.
-    numbers = [str(number) for number in range(1, min(len(entries), MOST_DETECTIONS) + 1)]
-    return [*tagged(entries[:MOST_DETECTIONS], numbers, view.size), *entries[MOST_DETECTIONS:]]
+    numbers = [str(number) for number in range(1, min(len(entries), _MOST_DETECTIONS) + 1)]
+    return [*tagged(entries[:_MOST_DETECTIONS], numbers, view.size), *entries[_MOST_DETECTIONS:]]
 
 
 def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int]) -> _Frame:

@@ -19,14 +19,6 @@ def usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[st
     Names of options may have dashes instead of underscores. A flag needs no value. A list of words needs no brackets,
     and `none` is the empty list.
 
-    Args:
-        arguments: the words of the command line.
-        config: dataclass of the settings.
-        options: options of the parser.
-
-    Returns:
-        The arguments.
-
     >>> from semfov.runs.settings import Settings
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)

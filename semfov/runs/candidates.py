@@ -27,15 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A policy under comparison, in one scene.
-
-    Attributes:
-        strategy: observer and policy.
-        table: the table of the scene that the policy needs (`Policy.table`); None if it needs none.
-        saliency: saliency of all cells as a prior over them (`SaliencyPrior`), seen from each cell, `(X·Y, X·Y)`, or
-            the same for all fixations, `(1, X·Y)`; None for no prior.
-        weight: weight of this prior.
-    """
+    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)`."""
 
     strategy: Strategy
     table: Tensor | None = None
@@ -56,7 +48,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Models:
+class _Models:
     """Fitted models that the policies of a run need; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
@@ -65,13 +57,13 @@ class Models:
     templates: ClassTemplates | None = None
 
 
-def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
+def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
     """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     policies = [resolve(choice, task) for choice in config.policies]
     belief = config.belief
-    return Models(
-        make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
+    return _Models(
+        make_observation(belief.model, eye) if _needs_observation(policies, belief) else None,
         make_learned(TargetEvidence, belief.target_model, eye)
         if any(by_evidence(policy, task) for policy in policies)
         else None,
@@ -96,7 +88,7 @@ def belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     return replace(policy, policy=Random.name, saliency=None, samples=None)
 
 
-def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
+def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
     """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
     return any(
         policy.scores == "calibrated"
@@ -107,24 +99,9 @@ def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) ->
 
 
 def make_strategy(
-    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: _Models, fovea: float
 ) -> Strategy:
-    """Build the observer and the policy that settings describe.
-
-    Args:
-        policy: the settings of the policy.
-        task: what the policy is for.
-        belief: the belief settings of the run, used where the policy has none of its own.
-        components: number of classes, background included.
-        models: fitted models.
-        fovea: width of the fovea as a fraction of the image's longer side.
-
-    Returns:
-        The observer and the policy.
-
-    Raises:
-        InputError: a model is missing.
-    """
+    """Build the observer and the policy that settings describe."""
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_required(models.evidence, "policy", "learned target evidence")), NonPredictive())
     calibrated = policy.scores == "calibrated"

@@ -26,18 +26,6 @@ def open_cluster(address: str, *, again: bool = False) -> Iterator[Executor]:
 
     Dask gives the tasks of a worker that dies to another one. Slurm, Kubernetes and others start such workers by
     `dask-jobqueue` and `dask-kubernetes`.
-
-    Args:
-        address: address of the scheduler, such as `tcp://host:8786`.
-        again: whether the scheduler was there before; it then has more time to come back.
-
-    Yields:
-        The executor.
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
-        ClusterLost: the connection to the scheduler broke.
-        SemfovError: a task ended several workers.
     """
     try:
         from distributed import Client, KilledWorker

@@ -39,17 +39,7 @@ def make_parser(
     positional: tuple[str, str] | None = None,
     program: str | None = None,
 ) -> ArgumentParser:
-    """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted.
-
-    Args:
-        config: the settings, without those that are `unused`.
-        description: description for `--help`.
-        program: name of the program in the usage; None for that of the process.
-        positional: name and help of a field that becomes an optional positional argument: a path, or a tuple of words.
-
-    Returns:
-        The parser.
-    """
+    """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted."""
     from jsonargparse import ArgumentParser, set_parsing_settings
 
     class Parser(ArgumentParser):
@@ -104,26 +94,7 @@ def run_command(
     goes_on: str = GOES_ON,
     words: Callable[[str], str] = str,
 ) -> int:
-    """Parse `arguments` into a `config` and call `main` with it.
-
-    Args:
-        main: the function to run; it may return an exit code.
-        config: class of its settings.
-        description: description for `--help`.
-        arguments: command-line arguments (None: those of the process).
-        positional: name and help of a field that becomes an optional positional argument (`make_parser`).
-        program: name of the program in the usage; None for that of the process.
-        goes_on: what is said after an interruption.
-        words: puts the message of an error into the words of the command.
-
-    Returns:
-        The exit code: 0 or that of `main`; 1 after a `SemfovError` or for a package that is missing (printed in one
-        line), 130 after Ctrl-C, 143 after SIGTERM, or 141 if the reader of the output has closed its pipe. Usage errors
-        exit with 2.
-
-    Raises:
-        ModuleNotFoundError: a module of this project is missing.
-    """
+    """Parse `arguments` into a `config` and call `main` with it."""
     try:
         with _signals(goes_on):
             parser = make_parser(config, description, positional, program)
@@ -163,16 +134,7 @@ def run_command(
 def command(
     main: Callable[[_Config], int | None], config: type[_Config], description: str | None
 ) -> Callable[..., int]:
-    """Make the function `main` of a module that is a command: it takes the arguments and returns the exit code.
-
-    Args:
-        main: the function to run.
-        config: class of its settings.
-        description: description for `--help`.
-
-    Returns:
-        `run_command` for these, by default with the arguments of the process.
-    """
+    """Make the function `main` of a module that is a command: it takes the arguments and returns the exit code."""
 
     def run(arguments: Sequence[str] | None = None) -> int:
         return run_command(main, config, description, arguments)

@@ -17,13 +17,7 @@ from semfov.runs.seeds import generator_for, noise_for
 
 @dataclass(frozen=True)
 class Exploration:
-    """One exploration of a scene.
-
-    Attributes:
-        scene: index of the scene in its data set.
-        repetition: number of the start, from 0.
-        start: cell of the first fixation.
-    """
+    """One exploration of a scene."""
 
     scene: int
     repetition: int
@@ -32,16 +26,7 @@ class Exploration:
 
 @dataclass(frozen=True)
 class Progress:
-    """Result of an exploration.
-
-    Attributes:
-        cells: the fixated cells in order.
-        right: after 0, 1, … gaze shifts, the number of cells with objects whose answer is the class of one of them. The
-            answer is the most probable class, background included (the published measure).
-        right_without_background: the same, but the answer is the most probable class other than background.
-        right_everywhere: the number of cells, among all, whose answer is the class of an object there, or background
-            where there is no object.
-    """
+    """Result of an exploration."""
 
     cells: tuple[int, ...]
     right: tuple[int, ...]
@@ -74,17 +59,7 @@ def run_explorations(
 ) -> list[Progress]:
     """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
 
-    Args:
-        episodes: the explorations, all of the same scene.
-        candidate: the policy under comparison.
-        looks: the looks at the scene.
-        answers: right classes of each cell (`answers_of`).
-        noise: `(episodes, shifts+1, X·Y)`, from `explore_noise`.
-        shifts: number of gaze shifts.
-        batch: number of episodes computed together.
-
-    Returns:
-        The result of each exploration.
+    Shapes: noise `(episodes, shifts+1, X·Y)`.
     """
     starts = torch.tensor([episode.start for episode in episodes])
     progress: list[Progress] = []

@@ -25,13 +25,6 @@ class Looking(SceneRun):
     """Scenes, and an eye that looks at each of them from every cell; its detections are stored.
 
     Its outcomes are the looks themselves. A subclass that compares policies adds the records of their episodes.
-
-    Args:
-        config: the settings.
-
-    Attributes:
-        eye: sensor and detector.
-        store: the stored detections.
     """
 
     config: LookingConfig
@@ -92,14 +85,7 @@ class Looking(SceneRun):
 
 
 class CellLooks(Looks):
-    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it.
-
-    Args:
-        look: gives the detections from a cell, a batch of one.
-        grid: the cells.
-        like: a tensor; beliefs take its dtype and device.
-        target: class 1..K that is searched for; None for an observer that does not ask for it.
-    """
+    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it."""
 
     def __init__(self, look: Callable[[int], Detections], grid: Grid, like: Tensor, target: int | None = None) -> None:
         self.look, self.grid, self.like, self.target = look, grid, like, target
@@ -111,14 +97,7 @@ class CellLooks(Looks):
 
 
 def looking_of(config: Any) -> Looking:
-    """Prepare the looks from every cell that a fit needs.
-
-    Args:
-        config: settings of the fit: data, detector, sensor, columns, rows, out, cache, workers and scheduler.
-
-    Returns:
-        The looks, none of which has been taken yet (`finish` takes them).
-    """
+    """Prepare the looks from every cell that a fit needs."""
     return Looking(
         LookingConfig(
             data=config.data,

@@ -34,16 +34,10 @@ def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
     """Look at an image from each of several fixations.
 
     The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
-    share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`):
-    a session of onnxruntime keeps the number of threads that it was opened with.
+    share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`): a
+    session of onnxruntime keeps the number of threads that it was opened with.
 
-    Args:
-        eye: the eye.
-        image: `(3, H, W)`.
-        points: `(F, 2)`, the fixations in pixels of the image.
-
-    Returns:
-        The detections from each fixation, a batch of F.
+    Shapes: image `(3, H, W)`, points `(F, 2)`.
     """
     with one_thread(), torch.inference_mode():
         view = eye.open(image[None])
@@ -53,13 +47,7 @@ def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
 def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | BoxKey], Detections]:
     """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
 
-    Args:
-        eye: sensor and detector.
-        image: gives the image, `(1, 3, H, W)`.
-        grid: the cells.
-
-    Returns:
-        A function that maps a cell or a box to the detections, a batch of one without padding.
+    Shapes: image `(1, 3, H, W)`.
     """
     view: View | None = None
 

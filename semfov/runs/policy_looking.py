@@ -27,16 +27,6 @@ class PolicyLooking(Looking):
     """Looks at scenes, and policies that are compared in them, with the tables that they need for each scene.
 
     A subclass runs their episodes (`outcomes`).
-
-    Args:
-        config: the settings.
-
-    Attributes:
-        task: the task of the policies.
-        policies: settings of the policies, by their names in tables.
-        models: fitted models that the policies need.
-        strategies: observer and policy, by name.
-        saliency_stores: stored saliency, by name of its model.
     """
 
     task: Task

@@ -13,7 +13,7 @@ from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
 from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 
 TARGET_EVIDENCE = "target-evidence"
-SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
+_SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
 WORDS = {
     "scores": Scores,
@@ -24,19 +24,19 @@ WORDS = {
 """Settings with a fixed set of values."""
 
 _ALIASES = ("recommended", "published")
-"""Presets that have another name in tables, like those of `MAXIMUM_A_POSTERIORI`."""
+"""Presets that have another name in tables, like those of `_MAXIMUM_A_POSTERIORI`."""
 
-MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
+_MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 """Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
 
-OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
+_OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
 """Settings of the map of all classes."""
 
 PolicyChoice = str | PolicyConfig
 """A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
 
 
-def valid_policies(task: Task) -> list[str]:
+def _valid_policies(task: Task) -> list[str]:
     """The values that `PolicyConfig.policy` may have."""
     return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
 
@@ -58,7 +58,7 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
         model: PolicyConfig(name, saliency=model)
         for name in policies
         if POLICIES[name].table == "saliency"
-        for model in SALIENCY_MODELS
+        for model in _SALIENCY_MODELS
     }
     if task == "search":
         # The scores do not matter to these: no belief guides them, or one of their own.
@@ -83,34 +83,23 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
     same = {"recommended": best, "published": published}
     if task == "search":
         same |= {
-            f"{MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
+            f"{_MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
         }
-        same[f"{MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
+        same[f"{_MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
     return MappingProxyType({**alone, **both, **same})
 
 
 def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
-    """The settings of a policy.
-
-    Args:
-        choice: the name of a preset, or settings.
-        task: what the policy is for.
-
-    Returns:
-        The settings.
-
-    Raises:
-        InputError: there is no such preset, no such policy, or its settings contradict each other.
-    """
+    """The settings of a policy."""
     by_name = presets(task)
     if isinstance(choice, str):
         if choice[:1] in ("[", "{"):
             settings = ", ".join(field.name for field in fields(PolicyConfig))
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
-    lookup(choice.policy, valid_policies(task), "policy")
+    lookup(choice.policy, _valid_policies(task), "policy")
     if table_of(choice) == "saliency" and choice.saliency is None:
-        models = ", ".join(SALIENCY_MODELS)
+        models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
     for setting, words in WORDS.items():
         if getattr(choice, setting) is not None:
@@ -125,7 +114,7 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
     if choice.scores == "learned" or choice.policy == TARGET_EVIDENCE:
-        conflict = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
+        conflict = next((setting for setting in _OF_THE_MAP if getattr(choice, setting) is not None), None)
         if conflict is not None:
             raise InputError(
                 f"{conflict}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
@@ -137,13 +126,6 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
 def label(choice: PolicyChoice, task: Task) -> str:
     """The name of a policy in tables: the preset that it is based on, and the settings that differ from it.
 
-    Args:
-        choice: the name of a preset, or settings.
-        task: what the policy is for.
-
-    Returns:
-        The name.
-
     >>> label(PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre"), "search")
     'non-predictive-raw, tempering 0.25, footprint box_centre'
     """
@@ -151,7 +133,7 @@ def label(choice: PolicyChoice, task: Task) -> str:
     names = {
         preset: name
         for name, preset in presets(task).items()
-        if name not in _ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
+        if name not in _ALIASES and not name.startswith(_MAXIMUM_A_POSTERIORI)
     }
     alone = settings.saliency if table_of(settings) == "saliency" else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]

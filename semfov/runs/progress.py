@@ -32,11 +32,6 @@ class WholeBar:
 
     While it is open, `track` and `task_bar` move this bar instead of opening a bar for each task.
 
-    Args:
-        title: label of the bar.
-        stages: for each stage, in order, the approximate durations of its tasks by their titles. Only their ratios
-            matter. A task with another title does not move the bar.
-
     >>> with WholeBar("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
     ...     with whole.stage("one"):
     ...         _ = list(track(range(5), "half", "unit"))

@@ -16,13 +16,7 @@ ResultRecord = dict[str, Any]
 
 
 class SceneResults:
-    """Outcomes of finished scenes, one file each.
-
-    Args:
-        folder: folder of the outcomes; each run has its own folder in it.
-        key: key of the run: a digest of its settings and a digest of its code, joined by a dash.
-        digest: sha256 of a scene's image, by the scene's number.
-    """
+    """Outcomes of finished scenes, one file each."""
 
     def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
         self.folder = folder / key

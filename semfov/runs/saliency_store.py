@@ -18,35 +18,29 @@ from semfov.runs.looks import one_thread
 from semfov.runs.store import SceneStore, looks_digest
 from semfov.sensor.base import Sensor
 
-SaliencyMap = Callable[[Tensor], Tensor]
+_SaliencyMap = Callable[[Tensor], Tensor]
 
 _SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
 """Modules that saliency depends on, in addition to those of a look."""
 
-SALIENCY_CLASSES: dict[str, Callable[[], SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
+SALIENCY_CLASSES: dict[str, Callable[[], _SaliencyMap]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
 
-SaliencyView = Literal["foveated", "picture"]
+_SaliencyView = Literal["foveated", "picture"]
 """What saliency is computed of: the foveated view from each fixation, or the whole photograph once."""
 
 
 class SaliencyStore(SceneStore):
     """Saliency of a scene's cells on disk, `(F, X·Y)` for F = X·Y fixations, or F = 1 for the whole photograph.
 
-    Args:
-        folder: folder of the store.
-        name: name of the saliency model.
-        view: what saliency is computed of.
-        reduction: how the saliency of a cell follows from that of its pixels.
-        sensor: settings of the sensor; the saliency of the whole photograph does not depend on them.
-        grid: `(columns, rows)`.
+    Shapes: grid `(columns, rows)`.
     """
 
     def __init__(
         self,
         folder: Path,
         name: str,
-        view: SaliencyView,
+        view: _SaliencyView,
         reduction: Reduction,
         sensor: Mapping[str, Any],
         grid: tuple[int, int],
@@ -74,24 +68,14 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_table(
-    name: str, view: SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
+    name: str, view: _SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
     """Saliency of every cell of a photograph.
 
     It does not depend on a detector: the photograph is resized so that its longer side is `reference`, the size that
     the sensor's settings are for.
 
-    Args:
-        name: name of the saliency model.
-        view: what saliency is computed of.
-        reduction: how the saliency of a cell follows from that of its pixels.
-        sensor: the sensor.
-        reference: longer side in pixels of the images that the sensor's settings are for.
-        image: `(3, H, W)`.
-        grid: the grid over the image.
-
-    Returns:
-        `(X·Y, X·Y)`, a row for the view from the centre of each cell, or `(1, X·Y)` for the whole photograph.
+    Shapes: image `(3, H, W)` → `(X·Y, X·Y)`.
     """
     model = SALIENCY_CLASSES[name]()
     with one_thread(), torch.inference_mode():

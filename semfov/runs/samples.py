@@ -35,14 +35,8 @@ from semfov.zoom.eye import WindowEye
 class Samples:
     """Detections with their true classes, and the looks that they come from.
 
-    Attributes:
-        boxes: `(M, 4)`, in pixels of the image.
-        scores: `(M, K+1)`, score vectors.
-        distance: `(M,)`, distance of the box's centre from the fixation, as a fraction of the image's longer side.
-        labels: `(M,)`, true classes, 0 where a detection matches no object.
-        look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
-        scenes: `(R,)`, index of the scene of each look; a look may have no detections.
-        fixations: `(R, 2)`, the fixation of each look; for glimpses of large pictures `(R, 3)`, with the magnification.
+    Shapes: boxes `(M, 4)`, scores `(M, K+1)`, distance `(M,)`, labels `(M,)`, look `(M,)`, scenes `(R,)`, fixations
+    `(R, 2)`.
     """
 
     boxes: Tensor
@@ -79,18 +73,7 @@ class Samples:
     @classmethod
     @torch.inference_mode()
     def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
-        """Label the detections of the looks at one scene.
-
-        Args:
-            detections: the detections, a batch of R looks.
-            fixations: `(R, 2)`, the fixation of each look.
-            annotation: the scene's annotated objects.
-            index: index of the scene.
-            iou: smallest intersection over union at which a detection matches an object.
-
-        Returns:
-            The labelled detections.
-        """
+        """Label the detections of the looks at one scene; fixations `(R, 2)`."""
         labels = [
             match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
             for boxes, mask in zip(detections.boxes, detections.mask, strict=True)
@@ -173,17 +156,7 @@ def whole_photograph(columns: int, rows: int) -> CellsOfLook:
 
 
 class Sampler:
-    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
-
-    Args:
-        settings: settings of the samples.
-        folder: folder of the shards.
-
-    Attributes:
-        store: store of the shards.
-        sources: modules that samples depend on; all modules that they import count, too.
-        coordinates: number of coordinates of a fixation.
-    """
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs."""
 
     sources: ClassVar[tuple[str, ...]] = _SOURCES
     coordinates: ClassVar[int] = 2
@@ -241,14 +214,7 @@ class Sampler:
         self.store.write(self.digest(shard), samples.tensors())
 
     def by_shard(self) -> Iterator[Samples]:
-        """The samples of one shard after another, so that not all are in memory.
-
-        Yields:
-            The samples of each shard, in the order of the photographs.
-
-        Raises:
-            DataError: the file of a shard is missing or damaged.
-        """
+        """The samples of one shard after another, so that not all are in memory."""
         for shard in self.shards:
             samples = self.load(shard)
             if samples is None:
@@ -257,14 +223,7 @@ class Sampler:
             yield samples
 
     def drawn(self, most: int) -> Samples:
-        """About so many detections, each drawn with the same probability, with all looks; all of them if they are less.
-
-        Args:
-            most: expected number of detections.
-
-        Returns:
-            The detections, in the order of the photographs.
-        """
+        """About so many detections, each drawn with the same probability, with all looks; all if they are less."""
         share = most / max(sum(len(samples) for samples in self.by_shard()), 1)
         if share >= 1:
             return self.all()
@@ -322,16 +281,6 @@ def collect_samples(
     """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
 
     The result is the same to the last bit wherever the work is done, on processors of one kind.
-
-    Args:
-        settings: the settings of the samples.
-        folder: folder of the shards.
-        where: where the work is done (`semfov.runs.workers.Where`).
-        title: label of the progress bar.
-        kind: the class of the sampler.
-
-    Returns:
-        The sampler, which reads the samples.
     """
     sampler = kind(settings, folder)
     todo = [shard for shard in sampler.shards if sampler.load(shard) is None]

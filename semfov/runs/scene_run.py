@@ -29,15 +29,7 @@ _BESIDES = (*WHERE, "store", "data", "detector")
 
 
 class SceneRun(ABC):
-    """Base of runs over many scenes, one after the other; any process can build the run from its settings.
-
-    Attributes:
-        config: the settings.
-        scenes: the scenes in order.
-        settings_key: sha256 of all settings, models and scenes that the outcomes depend on.
-        code: sha256 of all code that the outcomes depend on.
-        key: short key of both; it keeps the outcomes of different runs apart.
-    """
+    """Base of runs over many scenes, one after the other; any process can build the run from its settings."""
 
     config: Any
     scenes: Scenes
@@ -59,11 +51,7 @@ class SceneRun(ABC):
 
     @abstractmethod
     def depends_on(self) -> dict[str, Any]:
-        """List the fitted models and the settings that the outcomes depend on, beside scenes and code.
-
-        Returns:
-            JSON values by name, in which a fitted model stands for itself.
-        """
+        """List the fitted models and the settings that the outcomes depend on, beside scenes and code."""
 
     def own_settings(self, *others: str) -> dict[str, Any]:
         """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
@@ -105,12 +93,7 @@ def store_folder(chosen: Path | None) -> Path:
 
 
 def finish(run: SceneRun, title: str) -> None:
-    """Run the scenes that are not finished yet, and store their outcomes.
-
-    Args:
-        run: the run; its settings tell where the work is done.
-        title: label of the progress bar.
-    """
+    """Run the scenes that are not finished yet, and store their outcomes."""
     results = run.results
     todo = [index for index in range(len(run.scenes)) if results.load(index) is None]
     older = results.by_other_code()
@@ -122,10 +105,10 @@ def finish(run: SceneRun, title: str) -> None:
             older,
         )
     done = run_tasks(
-        outcomes_of,
+        _outcomes_of,
         todo,
         where=run.config.where,
-        setup=prepare_process,
+        setup=_prepare_process,
         settings=(type(run), run.config),
         title=title,
         unit="scene",
@@ -159,13 +142,13 @@ def digest_of(what: object) -> str:
 _process: dict[str, SceneRun] = {}
 
 
-def prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
+def _prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
     """Build the run in this process, once."""
     prepare_worker()
     _process["run"] = make(config)
 
 
-def outcomes_of(index: int) -> tuple[list[ResultRecord], dict[str, float], bytes | None]:
+def _outcomes_of(index: int) -> tuple[list[ResultRecord], dict[str, float], bytes | None]:
     """Run all episodes of a scene; returns their records, the seconds of each stage, and what was stored."""
     run = _process["run"]
     return *run.outcomes(index), run.stored(index)

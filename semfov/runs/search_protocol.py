@@ -21,17 +21,7 @@ from semfov.strategy import Strategy
 
 @dataclass(frozen=True)
 class Episode:
-    """One search for a target class in a scene.
-
-    Attributes:
-        scene: index of the scene in its data set.
-        target: class index, 1..K.
-        cue: class that the searcher is told to look for; it differs from the target only in a control experiment.
-        repetition: number of the start, from 0.
-        start: cell of the first fixation.
-        goal: cells that an object of the target class overlaps.
-        commonest: whether the target is the class with most instances in the scene (of several, the lowest index).
-    """
+    """One search for a target class in a scene."""
 
     scene: int
     target: int
@@ -61,17 +51,6 @@ def episodes_of(
     """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
 
     Starts differ from each other as long as there are enough cells.
-
-    Args:
-        scenes: the data set.
-        index: index of the scene.
-        columns: number of columns of the grid.
-        rows: number of rows of the grid.
-        protocol: the protocol of the experiment.
-        targets: classes to search for (None: the classes that the data set allows).
-
-    Returns:
-        The episodes.
     """
     annotation = scenes.annotation(index)
     labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
@@ -112,20 +91,7 @@ def choose_classes(
     seed: int,
     absent: int | None = None,
 ) -> list[int]:
-    """Draw target classes for a photograph: some that it holds, and some that it does not hold.
-
-    Args:
-        scenes: the data set.
-        index: index of the scene.
-        annotation: the scene's annotated objects.
-        classes: largest number of present classes.
-        max_area: classes that cover a larger share of the image are left out.
-        seed: random seed of the choice.
-        absent: largest number of absent classes (None: the number of present classes that were drawn).
-
-    Returns:
-        The present classes, then the absent ones.
-    """
+    """Draw target classes for a photograph: some that it holds, and some that it does not hold."""
     generator = generator_for("classes", seed, scenes.ids[index])
     held = set(annotation.labels.tolist())
     legal = legal_targets(annotation, max_area)
@@ -139,11 +105,7 @@ def choose_classes(
 class DrawnSearch:
     """A search for a drawn class, which the photograph may hold or not.
 
-    Attributes:
-        target: the class, 1..K.
-        goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
-        start: `(1,)`, the first fixated cell.
-        noise: `(1, shifts+1, X·Y)`, random numbers that choose among cells of equal value.
+    Shapes: goal `(X·Y,)`, start `(1,)`, noise `(1, shifts+1, X·Y)`.
     """
 
     target: int
@@ -166,20 +128,7 @@ def choose_searches(
     max_area: float,
     absent: int | None = None,
 ) -> list[DrawnSearch]:
-    """Draw searches of a photograph: their classes (`choose_classes`), first fixations and ties.
-
-    Args:
-        scenes: the data set.
-        index: index of the scene.
-        grid: the cells.
-        protocol: gaze shifts, ties and seed.
-        classes: largest number of present classes.
-        max_area: classes that cover a larger share of the image are left out.
-        absent: largest number of absent classes (None: the number of present classes that were drawn).
-
-    Returns:
-        The searches, those for present classes first.
-    """
+    """Draw searches of a photograph: their classes (`choose_classes`), first fixations and ties."""
     annotation, scene, seed = scenes.annotation(index), scenes.ids[index], protocol.seed
     covered = grid.footprint(annotation.boxes)
     return [
@@ -199,16 +148,7 @@ def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolCo
 
 
 def looks_of(episodes: Sequence[Episode], detections: Detections, grid: Grid) -> StoredLooks:
-    """The looks of episodes of one scene, which all policies share.
-
-    Args:
-        episodes: the episodes.
-        detections: detections from every cell of the scene, a batch of X·Y.
-        grid: the grid over the scene.
-
-    Returns:
-        The looks.
-    """
+    """The looks of episodes of one scene, which all policies share."""
     return StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
 
 
@@ -223,16 +163,7 @@ def run_episodes(
 ) -> list[EpisodeOutcome]:
     """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
 
-    Args:
-        episodes: the episodes, all of the same scene.
-        candidate: the policy under comparison.
-        looks: the looks of these episodes (`looks_of`).
-        noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
-        shifts: largest number of gaze shifts.
-        batch: number of episodes computed together.
-
-    Returns:
-        The result of each episode.
+    Shapes: noise `(episodes, shifts+1, X·Y)`.
     """
     outcomes: list[EpisodeOutcome] = []
     for first in range(0, len(episodes), batch):
@@ -279,19 +210,7 @@ def _run_batch(
 def search_steps(
     looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> list[Step]:
-    """Run one search until it decides or all looks are spent.
-
-    Args:
-        looks: the looks at the scene.
-        strategy: observer and policy of the search.
-        target: the class to search for.
-        start: `(1,)`, the first cell.
-        noise: `(1, N, X·Y)`, random numbers that break ties in at most N looks.
-        rule: maps a step to a number `(1,)`; a number above 0 ends the search.
-
-    Returns:
-        The steps of the search.
-    """
+    """Run one search until it decides or all looks are spent; start `(1,)`, noise `(1, N, X·Y)`, rule `(1,)`."""
     policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
     ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
     return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))

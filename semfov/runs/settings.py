@@ -19,13 +19,7 @@ from semfov.io.schema import excerpt, interval, is_number
 
 @dataclass(frozen=True)
 class Range:
-    """Range of the values of a setting, in a type annotation: `Annotated[int, Range(1, 100)]`.
-
-    Attributes:
-        low: smallest value.
-        high: largest value.
-        above: every value is larger than this.
-    """
+    """Range of the values of a setting, in a type annotation: `Annotated[int, Range(1, 100)]`."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -40,7 +34,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class FileName:
+class _FileName:
     """Restriction of a text setting to valid file names, in a type annotation."""
 
     def __repr__(self) -> str:
@@ -51,7 +45,7 @@ class FileName:
         return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
 
 
-SingleName = Annotated[str, FileName()]
+SingleName = Annotated[str, _FileName()]
 """Name of a model to write."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 """Seed of a random generator."""
@@ -110,14 +104,7 @@ _WORDS = {int: "a whole number", float: "a number", str: "a name"}
 
 
 def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: bool = True) -> None:
-    """Raise `InputError`, with the dotted name and the range, if a setting is out of the range of its type.
-
-    Args:
-        config: dataclass of the settings.
-        values: values of the settings by name.
-        prefix: prefix of the names in messages.
-        nested: also check settings that are dataclasses themselves.
-    """
+    """Raise `InputError`, with the dotted name and the range, if a setting is out of the range of its type."""
     hints = _hints(config)  # type: ignore[arg-type]
     for field in fields(config):
         if field.name not in values:
@@ -144,7 +131,7 @@ def _check(hint: Any, value: Any, name: str) -> None:
     if origin is Annotated:
         base, *more = options
         for allowed in more:
-            if isinstance(allowed, Range | FileName):
+            if isinstance(allowed, Range | _FileName):
                 what = f"{_WORDS[base]} {allowed}"
                 check(allowed.holds(value, whole=base is int), name, what, excerpt(value))
     elif origin is tuple and isinstance(value, list | tuple):

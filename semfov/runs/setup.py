@@ -30,17 +30,17 @@ from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
 
-Learned = TypeVar("Learned", TargetEvidence, MapEvidence, Verification)
-Made = TypeVar("Made")
+_Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
+_Made = TypeVar("_Made")
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
     """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
-    check_data(data)
+    _check_data(data)
     check_detector(detector.name)
 
 
-def check_data(data: DataConfig) -> None:
+def _check_data(data: DataConfig) -> None:
     """Raise an error unless photographs and annotations both exist, or the settings name neither of them."""
     if (data.root is None) != (data.annotations is None):
         present, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
@@ -56,10 +56,10 @@ def check_data(data: DataConfig) -> None:
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
-    check_data(data)
+    _check_data(data)
     if data.root is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
-    return _photographs(data, classes, None if data.ids is None else read_ids(data.ids), data.limit)
+    return _photographs(data, classes, None if data.ids is None else _read_ids(data.ids), data.limit)
 
 
 def _photographs(
@@ -73,20 +73,8 @@ def _photographs(
 
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
-    """Split photographs into every n-th one and the others; of the embedded scenes make two sets.
-
-    Args:
-        data: the settings of the photographs.
-        classes: the detector's classes.
-        every: n.
-
-    Returns:
-        The larger part, and every n-th photograph.
-
-    Raises:
-        InputError: there are too few photographs to split.
-    """
-    check_data(data)
+    """Split photographs into every n-th one and the others; of the embedded scenes make two sets."""
+    _check_data(data)
     if data.root is None:
         count, seeds = data.limit or 16, (data.scene_seed, data.scene_seed + 1)
         larger, smaller = (EmbeddedScenes(classes, count=count, seed=seed) for seed in seeds)
@@ -97,7 +85,7 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     return _photographs(data, classes, others), _photographs(data, classes, ids[::every])
 
 
-def read_ids(path: Path) -> list[str]:
+def _read_ids(path: Path) -> list[str]:
     """Read the ids of photographs from a text file with one per line."""
     check_regular(path)
     try:
@@ -132,7 +120,7 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
-def growth_of(eye: Eye) -> float:
+def _growth_of(eye: Eye) -> float:
     """The growth of an eye's fovea, by which shipped models are chosen; they exist only for a `Foveation`."""
     sensor = eye.sensor
     if not isinstance(sensor, Foveation):
@@ -155,15 +143,6 @@ def observation_name(eye: Eye) -> str:
 
     For a published sensor it is the model of `semfov.ActivePerception.published`, which is fitted by maximum
     likelihood. For any other sensor it is the model of our own for the growth of its fovea.
-
-    Args:
-        eye: sensor and detector.
-
-    Returns:
-        The name of the model.
-
-    Raises:
-        InputError: no model is shipped for the eye.
     """
     detector, settings = eye.detector, eye.sensor.settings()
     for sensor in PUBLISHED_SENSORS:
@@ -171,38 +150,25 @@ def observation_name(eye: Eye) -> str:
         name = published_model(detector.name, sensor, detector.selection.threshold)
         if published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
             return name
-    return shipped_model(FovealObservationModel, recommended_model(detector.name, growth_of(eye)), "MODEL")
+    return shipped_model(FovealObservationModel, recommended_model(detector.name, _growth_of(eye)), "MODEL")
 
 
-def make_learned(kind: type[Learned], name: str | None, eye: Eye) -> Learned:
+def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:
     """Load a learned model by name, or the one shipped for the eye; check that it fits the eye."""
     if name is None:
-        name = shipped_model(kind, learned_for(eye.detector.name, growth_of(eye)), "MODEL")
+        name = shipped_model(kind, learned_for(eye.detector.name, _growth_of(eye)), "MODEL")
     model = kind.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 
 
 def if_shipped(
-    make: Callable[[str | None, Eye], Made],
+    make: Callable[[str | None, Eye], _Made],
     name: str | None,
     eye: Eye,
     missing: Callable[[str], object] = lambda reason: None,
-) -> Made | None:
-    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped.
-
-    Args:
-        make: loads the model (`make_learned`, `make_observation`).
-        name: name or file of the model; None for the shipped one.
-        eye: sensor and detector.
-        missing: called with the reason where none is shipped.
-
-    Returns:
-        The model.
-
-    Raises:
-        InputError: the model that the settings name cannot be used.
-    """
+) -> _Made | None:
+    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped."""
     try:
         return make(name, eye)
     except InputError as error:

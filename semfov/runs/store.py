@@ -25,8 +25,8 @@ from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.looks import LOOK_SOURCES, BoxKey, one_thread, photograph_looks
 from semfov.version import __version__
 
-Action = TypeVar("Action", bound=Hashable)
-StoredLook = TypeVar("StoredLook")
+_Action = TypeVar("_Action", bound=Hashable)
+_StoredLook = TypeVar("_StoredLook")
 
 
 class SceneStore:
@@ -34,12 +34,6 @@ class SceneStore:
 
     Files are written atomically and carry a checksum. A file that is damaged, truncated, of another version or of
     another schema counts as missing, and its tensors are computed again.
-
-    Args:
-        folder: folder of the store; several runs and processes may share it.
-        what: settings that the tensors depend on.
-        code: sha256 of the source code that the tensors depend on.
-        schema: schema of a file.
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object], code: str, schema: Schema) -> None:
@@ -61,19 +55,10 @@ class SceneStore:
         write_tensors(self.path(digest), self.key, tensors)
 
 
-class LookStore(SceneStore, ABC, Generic[Action, StoredLook]):
+class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
     """Looks at scenes by action, with the looks at a scene in one file.
 
     A subclass says how an action is written as numbers, and how looks are written as tensors.
-
-    Args:
-        folder: folder of the store; several runs and processes may share it.
-        what: settings that the looks depend on.
-        sources: modules that turn a scene into looks; all modules that they import count, too.
-        components: length of the score vectors (None: any length).
-
-    Attributes:
-        width: number of numbers of an action.
     """
 
     width: ClassVar[int]
@@ -90,28 +75,16 @@ class LookStore(SceneStore, ABC, Generic[Action, StoredLook]):
         code = modules_digest(*sources, __name__)
         super().__init__(folder, what, code, Schema(fields | self.more()))
 
-    def load(self, digest: str) -> dict[Action, StoredLook]:
-        """Read the looks at a scene.
-
-        Args:
-            digest: sha256 of what the pixels of the scene depend on.
-
-        Returns:
-            The looks by action; empty if they are missing or incomplete.
-        """
+    def load(self, digest: str) -> dict[_Action, _StoredLook]:
+        """Read the looks at a scene."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return {}
         actions = [self.decode(row) for row in tensors["actions"].tolist()]
         return dict(zip(actions, self.unpack(tensors, actions), strict=True))
 
-    def save(self, digest: str, looks: Mapping[Action, StoredLook]) -> None:
-        """Store the looks at a scene.
-
-        Args:
-            digest: sha256 of what the pixels of the scene depend on.
-            looks: the looks by action; at least one.
-        """
+    def save(self, digest: str, looks: Mapping[_Action, _StoredLook]) -> None:
+        """Store the looks at a scene."""
         rows = {action: tuple(map(float, self.encode(action))) for action in looks}
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
@@ -122,19 +95,19 @@ class LookStore(SceneStore, ABC, Generic[Action, StoredLook]):
         return {}
 
     @abstractmethod
-    def encode(self, action: Action) -> Sequence[float]:
+    def encode(self, action: _Action) -> Sequence[float]:
         """Write an action as `width` numbers."""
 
     @abstractmethod
-    def decode(self, row: Sequence[float]) -> Action:
+    def decode(self, row: Sequence[float]) -> _Action:
         """Read an action from its numbers."""
 
     @abstractmethod
-    def pack(self, looks: Sequence[StoredLook]) -> dict[str, Tensor]:
+    def pack(self, looks: Sequence[_StoredLook]) -> dict[str, Tensor]:
         """Convert looks to tensors for a file."""
 
     @abstractmethod
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Action]) -> list[StoredLook]:
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[_Action]) -> list[_StoredLook]:
         """Convert the tensors of a file back to the looks of these actions."""
 
 
@@ -185,56 +158,40 @@ def unpack(tensors: Mapping[str, Tensor]) -> list[Detections]:
 def cell_store(
     folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
 ) -> DetectionStore:
-    """Open a store of looks from the cells of a grid, and of closer looks.
-
-    Args:
-        folder: folder of the store.
-        settings: `Eye.settings()`.
-        columns: number of columns of the grid.
-        rows: number of rows of the grid.
-        components: length of the score vectors (None: any length).
-
-    Returns:
-        The store.
-    """
+    """Open a store of looks from the cells of a grid, and of closer looks."""
     # The cell centres in a picture of odd size identify the way in which a grid is laid out.
     centres = Grid(columns, rows, (641, 479)).centres.tolist()
     what = {"settings": settings, "grid": [columns, rows], "centres": centres}
     return DetectionStore(folder, what, LOOK_SOURCES, components)
 
 
-class RememberedLooks(Generic[Action, StoredLook]):
+class RememberedLooks(Generic[_Action, _StoredLook]):
     """Looks at one scene by action, each made once: read from a store, or computed when it is first asked for.
 
     Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
     batch nor on the number of CPU cores.
-
-    Args:
-        open_scene: opens the scene; returns the function that looks. It is called only when a look is missing.
-        store: store of the looks; None keeps them in memory.
-        digest: gives the sha256 of what the pixels of the scene depend on; called only with a store.
     """
 
     def __init__(
         self,
-        open_scene: Callable[[], Callable[[Action], StoredLook]],
-        store: LookStore[Action, StoredLook] | None = None,
+        open_scene: Callable[[], Callable[[_Action], _StoredLook]],
+        store: LookStore[_Action, _StoredLook] | None = None,
         digest: Callable[[], str] = lambda: "",
     ) -> None:
         self._open, self._store, self._digest = open_scene, store, digest
-        self._look: Callable[[Action], StoredLook] | None = None
-        self._looks: dict[Action, StoredLook] | None = None
+        self._look: Callable[[_Action], _StoredLook] | None = None
+        self._looks: dict[_Action, _StoredLook] | None = None
         self._stored = 0
 
     @property
-    def looks(self) -> dict[Action, StoredLook]:
+    def looks(self) -> dict[_Action, _StoredLook]:
         """All looks so far, by action."""
         if self._looks is None:
             self._looks = {} if self._store is None else self._store.load(self._digest())
             self._stored = len(self._looks)
         return self._looks
 
-    def __call__(self, action: Action) -> StoredLook:
+    def __call__(self, action: _Action) -> _StoredLook:
         """Look, or remember."""
         looks = self.looks
         if action not in looks:
@@ -262,15 +219,7 @@ def look_everywhere(
 ) -> Detections:
     """Detections from the centre of every cell of a photograph, read from a store, or computed and stored.
 
-    Args:
-        eye: sensor and detector.
-        image: gives the image, `(1, 3, H, W)`.
-        grid: the cells.
-        store: store of the looks; None stores none.
-        digest: gives the sha256 of what the pixels depend on.
-
-    Returns:
-        The detections, a batch of X·Y.
+    Shapes: image `(1, 3, H, W)`.
     """
     looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)
     detections = Detections.stack([looks(cell) for cell in range(len(grid))])
@@ -293,12 +242,5 @@ def versions() -> dict[str, object]:
 
 
 def looks_digest(*more: str) -> str:
-    """Digest of the source code that turns an image into detections; a store is not reused after a change of it.
-
-    Args:
-        *more: dotted names of further modules.
-
-    Returns:
-        The sha256.
-    """
+    """Digest of the source code that turns an image into detections; a store is not reused after a change of it."""
     return modules_digest(*LOOK_SOURCES, *more)

@@ -62,17 +62,7 @@ class WindowLookingConfig(WorkConfig):
 
 
 class WindowLooking:
-    """Large pictures, an eye that looks at their windows, and learned evidence; the detections are stored.
-
-    Args:
-        config: the settings.
-
-    Attributes:
-        scenes: the mosaics or photographs.
-        eye: the eye.
-        evidence: learned evidence by magnification.
-        store: the stored looks.
-    """
+    """Large pictures, an eye that looks at their windows, and learned evidence; the detections are stored."""
 
     config: WindowLookingConfig
     scenes: Scenes
@@ -116,17 +106,10 @@ def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None
 def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -> Tensor:
     """Compare objects with the annotated ones, class by class.
 
-    Each object in turn, the most confident first, is matched to the annotated object of its class that it overlaps
-    most among those not matched yet.
+    Each object in turn, the most confident first, is matched to the annotated object of its class that it overlaps most
+    among those not matched yet.
 
-    Args:
-        objects: M objects, the most confident first.
-        annotation: the annotated objects.
-        iou: least intersection over union of a match.
-
-    Returns:
-        `(M,)`: 1 for an object that matches an annotated one, 0 for one that does not, and -1 for one that matches none
-        but lies by half in an area that is annotated as a crowd of its class, which is neither.
+    Shapes: → `(M,)`.
     """
     verdicts = torch.zeros(len(objects), dtype=torch.long)
     for label in objects.labels.unique().tolist():

@@ -24,7 +24,7 @@ from semfov.runs.cluster import ClusterLost, open_cluster
 from semfov.runs.progress import Bar, task_bar
 
 _Task = TypeVar("_Task")
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 
 Where = int | str | Executor | None
 """Where tasks run: in so many processes of this machine (1: in this one; None: one for each CPU core), on the workers
@@ -45,7 +45,7 @@ def available_cores() -> int:
 
 
 def run_tasks(
-    function: Callable[[_Task], Result],
+    function: Callable[[_Task], _Result],
     tasks: Sequence[_Task],
     *,
     where: Where,
@@ -53,29 +53,11 @@ def run_tasks(
     settings: tuple[object, ...],
     title: str,
     unit: str,
-) -> Generator[tuple[_Task, Result], None, None]:
+) -> Generator[tuple[_Task, _Result], None, None]:
     """Run `function(task)` for every task, and yield tasks and results in any order, with a progress bar.
 
     Results come back to this process, which stores them: workers need not see its folders. Close the generator if you
     stop early: that ends the work.
-
-    Args:
-        function: a module-level function; it reads the globals that `setup` has set in its module.
-        tasks: the tasks.
-        where: number of processes, address of a Dask scheduler, or an executor (`Where`). The workers of an executor
-            have the same version of this package; an executor that is given stays open.
-        setup: called once in each process with `settings`, before its first task.
-        settings: arguments of `setup`.
-        title: label of the progress bar.
-        unit: name of a task in the progress bar.
-
-    Yields:
-        Each task with its result, as tasks finish.
-
-    Raises:
-        InputError: there is no scheduler at the address.
-        SemfovError: a process died, or a cluster was lost. An error of a task is raised unchanged. All of them end the
-            processes that were started here.
     """
     if not tasks:
         return
@@ -111,12 +93,12 @@ def shared_processes() -> Iterator[None]:
             _shared.reset(before)
 
 
-class _Job(Generic[_Task, Result]):
+class _Job(Generic[_Task, _Result]):
     """A function with its setup, for workers that may have had other jobs; `code` is checked if it is given."""
 
     def __init__(
         self,
-        function: Callable[[_Task], Result],
+        function: Callable[[_Task], _Result],
         setup: Callable[..., None],
         settings: tuple[object, ...],
         code: str | None = None,
@@ -124,7 +106,7 @@ class _Job(Generic[_Task, Result]):
         self.function, self.setup, self.settings, self.code = function, setup, settings, code
         self.folder = Path.cwd()
 
-    def __call__(self, task: _Task) -> Result:
+    def __call__(self, task: _Task) -> _Result:
         """Prepare the process unless its last task has, and run the task; threads of a worker take turns."""
         with _turn:
             if self.code is not None and package_digest() != self.code:
@@ -146,14 +128,14 @@ _ready: list[tuple[Callable[..., None], tuple[object, ...]]] = []
 
 def _results(
     executor: Executor,
-    function: Callable[[_Task], Result],
+    function: Callable[[_Task], _Result],
     tasks: Sequence[_Task],
     bar: Bar,
     starting: AbstractContextManager[object] | None = None,
-) -> Iterator[tuple[_Task, Result]]:
+) -> Iterator[tuple[_Task, _Result]]:
     """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish."""
-    finished: SimpleQueue[Future[Result]] = SimpleQueue()
-    running: dict[Future[Result], _Task] = {}
+    finished: SimpleQueue[Future[_Result]] = SimpleQueue()
+    running: dict[Future[_Result], _Task] = {}
     waiting = iter(tasks)
 
     def submit(number: int) -> None:
@@ -180,8 +162,8 @@ _shared: ContextVar[tuple[ExitStack, dict[int, Executor]] | None] = ContextVar("
 
 
 def _in_processes(
-    job: Callable[[_Task], Result], tasks: Sequence[_Task], processes: int, title: str, bar: Bar
-) -> Iterator[tuple[_Task, Result]]:
+    job: Callable[[_Task], _Result], tasks: Sequence[_Task], processes: int, title: str, bar: Bar
+) -> Iterator[tuple[_Task, _Result]]:
     shared = _shared.get()
     try:
         if shared is None:
@@ -214,8 +196,8 @@ def _started(processes: int) -> Iterator[Executor]:
 
 
 def _on_cluster(
-    address: str, job: Callable[[_Task], Result], tasks: Sequence[_Task], title: str, bar: Bar
-) -> Iterator[tuple[_Task, Result]]:
+    address: str, job: Callable[[_Task], _Result], tasks: Sequence[_Task], title: str, bar: Bar
+) -> Iterator[tuple[_Task, _Result]]:
     """Run tasks on a cluster; those that were lost with its scheduler are given to the next one at the same address."""
     left = dict.fromkeys(tasks)
     for attempt in range(_PATIENCE):

@@ -27,14 +27,8 @@ Such a mosaic is so large that the overview reduces it by more than three octave
 """
 
 
-class HeldOutMosaics:
-    """Mosaics of which every n-th is composed of photographs that no other mosaic shows.
-
-    Args:
-        kept: source of the other mosaics.
-        held: source of every n-th mosaic.
-        every: n.
-    """
+class _HeldOutMosaics:
+    """Mosaics of which every n-th is composed of photographs that no other mosaic shows."""
 
     def __init__(self, training: Mosaics, held: Mosaics, every: int) -> None:
         self._training, self._held, self._every = training, held, every
@@ -83,7 +77,7 @@ class MosaicSampler(Sampler):
             Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed)
             for some in (training, held)
         )
-        return eye, HeldOutMosaics(near, far, settings.holdout)
+        return eye, _HeldOutMosaics(near, far, settings.holdout)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
         """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
@@ -99,7 +93,7 @@ class MosaicSampler(Sampler):
         scene = self.scenes[index]
         eye = cast(WindowEye, self.eye)
         view = eye.open(scene.image)
-        windows = choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
+        windows = _choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
         fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]
         annotation = self.scenes.annotation(index)
         samples = []
@@ -115,7 +109,7 @@ class MosaicSampler(Sampler):
         return Samples.join(samples)
 
 
-def choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> Tensor:
+def _choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> Tensor:
     """Draw windows `(R, 3)`: the overview, and `count` windows at random places of every other magnification."""
     generator = generator_for("windows", seed, scene)
     rows = [torch.zeros(1, 3, dtype=torch.long)]

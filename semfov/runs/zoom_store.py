@@ -21,13 +21,7 @@ WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.ima
 
 
 class GlanceStore(LookStore[Window, Glance]):
-    """Glances at pictures by window, on disk.
-
-    Args:
-        folder: folder of the store.
-        settings: `WindowEye.settings()`.
-        classes: number of the detector's classes.
-    """
+    """Glances at pictures by window, on disk."""
 
     width = 12
 
@@ -40,7 +34,7 @@ class GlanceStore(LookStore[Window, Glance]):
         return {
             "cut": Field(("M",), torch.bool),
             "show": Field(("N", self.classes), torch.float32, low=0, high=1),
-            **gist_fields(self.classes),
+            **_gist_fields(self.classes),
         }
 
     def encode(self, action: Window) -> Sequence[float]:
@@ -60,12 +54,12 @@ class GlanceStore(LookStore[Window, Glance]):
             **pack([glance.detections for glance in looks]),
             "cut": torch.cat([glance.cut for glance in looks]),
             "show": torch.stack([glance.show for glance in looks]),
-            **pack_gists([glance.gist for glance in looks], self.classes),
+            **_pack_gists([glance.gist for glance in looks], self.classes),
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
         """Convert the tensors of a file back to the glances at these windows."""
-        cut, gists = tensors["cut"].split(tensors["count"].tolist()), unpack_gists(tensors, actions)
+        cut, gists = tensors["cut"].split(tensors["count"].tolist()), _unpack_gists(tensors, actions)
         return [Glance(*each) for each in zip(actions, unpack(tensors), cut, tensors["show"], gists, strict=True)]
 
 
@@ -73,12 +67,6 @@ class StoredGlances(Glances):
     """Looks at the windows of one picture, each computed once. They have all their hints.
 
     The picture is composed or read only when a look is missing.
-
-    Args:
-        eye: the eye.
-        scenes: the pictures.
-        index: index of the picture.
-        store: store of the looks; None keeps them in memory.
     """
 
     def __init__(self, eye: WindowEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
@@ -99,7 +87,7 @@ class StoredGlances(Glances):
         self.looks.save()
 
 
-def gist_fields(kinds: int) -> dict[str, Field]:
+def _gist_fields(kinds: int) -> dict[str, Field]:
     """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file."""
     return {
         "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
@@ -111,8 +99,8 @@ def gist_fields(kinds: int) -> dict[str, Field]:
     }
 
 
-def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Pack gists into the tensors of `gist_fields`; a look without a gist has no cells."""
+def _pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
+    """Pack gists into the tensors of `_gist_fields`; a look without a gist has no cells."""
     frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
     cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
     scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]
@@ -136,16 +124,8 @@ def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
     }
 
 
-def unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
-    """Unpack the tensors of `pack_gists`.
-
-    Args:
-        tensors: the tensors by name.
-        windows: the windows of the looks.
-
-    Returns:
-        The gists of the looks; None for a look without one.
-    """
+def _unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
+    """Unpack the tensors of `_pack_gists`."""
     cell_counts, found_counts = (column.tolist() for column in tensors["gist.counts"].unbind(1))
     looks = zip(
         windows,

@@ -81,13 +81,8 @@ def foveate(
 
 
 @dataclass(frozen=True)
-class FoveationCanvas:
-    """A canvas that `Foveation.open` has prepared.
-
-    Attributes:
-        bands: Laplacian pyramid of the canvas.
-        sigma: width of the fovea in canvas pixels along x and y, `(1, 2)`.
-    """
+class _FoveationCanvas:
+    """A canvas that `Foveation.open` has prepared; sigma `(1, 2)`."""
 
     bands: Bands
     sigma: Tensor
@@ -156,12 +151,12 @@ class Foveation(Sensor):
         """
         return laplacian_pyramid(_batch(image), self.levels, self.convention)
 
-    def open(self, canvas: Tensor, scale: Tensor) -> FoveationCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> _FoveationCanvas:
         """Compute the pyramid of a canvas, and scale the width of the fovea."""
         shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
-        return FoveationCanvas(self.pyramid(canvas), self.sigma * shrink)
+        return _FoveationCanvas(self.pyramid(canvas), self.sigma * shrink)
 
-    def look(self, state: FoveationCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: _FoveationCanvas, gaze: Tensor) -> Tensor:
         """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
         return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
 

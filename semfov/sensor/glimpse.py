@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
 from semfov.sensor.base import stacked_views
 
-Padding = Literal["zeros", "border", "fill"]
-Length = TypeVar("Length", float, Tensor)
+_Padding = Literal["zeros", "border", "fill"]
+_Length = TypeVar("_Length", float, Tensor)
 
 
 def glimpse(
@@ -17,7 +17,7 @@ def glimpse(
     boxes: Tensor,
     size: tuple[int, int],
     *,
-    padding_mode: Padding = "zeros",
+    padding_mode: _Padding = "zeros",
     fill_value: float = 0.0,
 ) -> Tensor:
     r"""Resample windows of an image to one size.
@@ -58,7 +58,7 @@ def glimpse(
     fits = boxes.ndim in (2, 3) and boxes.shape[0] == batch
     check(fits, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
     check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
-    lookup(padding_mode, get_args(Padding), "padding mode")
+    lookup(padding_mode, get_args(_Padding), "padding mode")
     check(image.is_floating_point(), "image", "floating-point pixels", image.dtype)
     if values_known(boxes):
         check_finite(boxes.detach(), "boxes")
@@ -94,7 +94,7 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
     return torch.cat(edges_at(points, magnification[..., None], points.new_tensor(size)), -1)
 
 
-def edges_at(point: Length, magnification: Length, length: Length) -> tuple[Length, Length]:
+def edges_at(point: _Length, magnification: _Length, length: _Length) -> tuple[_Length, _Length]:
     """Edges along one axis of the window that is centred at a point, of a canvas of `length` pixels (`windows_at`)."""
     centre, half = point + 0.5, length / (2 * magnification)
     return centre - half, centre + half
@@ -106,17 +106,10 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     The window is a square, `context` times as large as the longer side of the box, and at least `least` times as large
     as the longer side of the picture. It is moved to lie inside the picture. Where the picture is narrower, it is cut.
 
-    Args:
-        box: `(4,)`, as `(x1, y1, x2, y2)` in picture pixels.
-        picture: `(width, height)` of the picture.
-        context: side of the window, in longer sides of the box.
-        least: smallest side of the window, in longer sides of the picture.
-
-    Returns:
-        `(4,)`, the window as `(x1, y1, x2, y2)`, edges between pixels.
-
     >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 80))
     tensor([ 0., 10., 60., 70.])
+
+    Shapes: box `(4,)`, picture `(width, height)` → `(4,)`.
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
@@ -130,16 +123,10 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
     """List magnifications one octave apart, from the one that shows the whole picture up to a finest one.
 
-    Args:
-        picture: `(width, height)` of the picture.
-        size: `(width, height)` of the canvas.
-        finest: largest magnification allowed, in canvas pixels for each picture pixel; 1 for native pixels.
-
-    Returns:
-        The magnifications, smallest first; the first shows the whole picture.
-
     >>> ladder((2560, 1920), (416, 416))
     (0.1625, 0.325, 0.65)
+
+    Shapes: picture `(width, height)`, size `(width, height)`.
     """
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
     check(finest > 0, "finest", "a positive magnification", finest)
@@ -163,11 +150,13 @@ class Glimpse(nn.Module):
     torch.Size([1, 1, 3, 32, 32])
     """
 
-    def __init__(self, size: tuple[int, int], *, padding_mode: Padding = "fill", fill_value: float = 114 / 255) -> None:
+    def __init__(
+        self, size: tuple[int, int], *, padding_mode: _Padding = "fill", fill_value: float = 114 / 255
+    ) -> None:
         super().__init__()
         check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
         self.size = size
-        self.padding_mode: Padding = lookup(padding_mode, get_args(Padding), "padding mode")
+        self.padding_mode: _Padding = lookup(padding_mode, get_args(_Padding), "padding mode")
         self.fill_value = fill_value
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
@@ -189,7 +178,7 @@ class Glimpse(nn.Module):
         return f"size={self.size}, padding_mode={self.padding_mode!r}, fill_value={self.fill_value:g}"
 
 
-def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding, value: float) -> Tensor:
+def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding, value: float) -> Tensor:
     """One window of an image `(C, H, W)`: two matrix products, over the pixels that the window shows."""
     across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")

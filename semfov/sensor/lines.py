@@ -45,9 +45,7 @@ def constant(function: Callable[[*_Settings], Constant]) -> Callable[[*_Settings
 class Taps:
     """A linear filter of a line: every output pixel is a weighted sum of input pixels.
 
-    Attributes:
-        index: input pixels of each output pixel, `(length, taps)`; one pixel may be listed several times.
-        weight: weights of the input pixels, `(length, taps)`, float64.
+    Shapes: index `(length, taps)`, weight `(length, taps)`.
     """
 
     index: Tensor
@@ -57,13 +55,7 @@ class Taps:
 class Lines(NamedTuple):
     """A matrix from input lines to output lines, dense or cut into tiles.
 
-    Attributes:
-        first: dense matrix of the first a output pixels from the first n input pixels, `(a, n)`; without `middle` it
-            is the whole matrix.
-        middle: matrices of the tiles that follow, `(tiles, tile, window)`.
-        last: dense matrix of the last b output pixels from the last m input pixels, `(b, m)`.
-        start: first input pixel of the window of the first tile in `middle`.
-        shift: distance in input pixels between the windows of successive tiles.
+    Shapes: first `(a, n)`, middle `(tiles, tile, window)`, last `(b, m)`.
     """
 
     first: Tensor

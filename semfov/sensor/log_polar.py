@@ -14,7 +14,7 @@ from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import gaussian_pyramid
 
-Levels = tuple[Tensor, ...]
+_Levels = tuple[Tensor, ...]
 """A Gaussian pyramid, finest level first."""
 
 _TALLEST = 30  # levels of a pyramid; an image with sides of 2^30 pixels is a single pixel then
@@ -23,15 +23,8 @@ _FARTHEST = 1e15  # pixels from the image to a fixation
 
 
 @dataclass(frozen=True)
-class Retina:
-    """The layout of the receptors.
-
-    Attributes:
-        fovea: eccentricity a, in any unit of length, at which receptors are twice as far apart as at the fixation.
-        spacing: distance δ between neighbouring receptors at the fixation, in the same unit.
-        pooling: width of a receptive field, as a multiple of the distance between neighbours.
-        scale: image pixels for each unit of length, along x and y.
-    """
+class _Retina:
+    """The layout of the receptors."""
 
     fovea: float
     spacing: float = 1.0
@@ -69,7 +62,7 @@ class Retina:
 
 
 def log_polar(
-    image: Tensor | Levels, gaze: Tensor, *, fovea: float, spacing: float = 1.0, pooling: float = 1.0
+    image: Tensor | _Levels, gaze: Tensor, *, fovea: float, spacing: float = 1.0, pooling: float = 1.0
 ) -> Tensor:
     r"""Compute cortical images: the responses of receptors on rings around a fixation.
 
@@ -108,7 +101,7 @@ def log_polar(
     >>> log_polar(image, torch.tensor([32.0, 24.0]), fovea=10.0).shape
     torch.Size([1, 3, 24, 64])
     """
-    retina = Retina(fovea, spacing, pooling)
+    retina = _Retina(fovea, spacing, pooling)
     levels = image if isinstance(image, tuple) else gaussian_pyramid(image, retina.levels(_size(image)))
     fixation, many = fixations(gaze, levels[0])
     result = _sample(levels, fixation, retina)
@@ -141,7 +134,7 @@ def from_log_polar(
     True
     """
     check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
-    retina = Retina(fovea, spacing)
+    retina = _Retina(fovea, spacing)
     check_shape(cortical, "cortical", None, None, *retina.receptors(size))
     fixation, many = fixations(gaze, cortical)
     check(cortical.ndim == 4 + many, "cortical", f"{4 + many} dimensions with a gaze of this shape", cortical.ndim)
@@ -150,16 +143,11 @@ def from_log_polar(
 
 
 @dataclass(frozen=True)
-class LogPolarCanvas:
-    """A canvas that `LogPolar.open` has prepared.
+class _LogPolarCanvas:
+    """A canvas that `LogPolar.open` has prepared."""
 
-    Attributes:
-        levels: Gaussian pyramid of the canvas.
-        retina: layout of the receptors, scaled to the canvas.
-    """
-
-    levels: Levels
-    retina: Retina
+    levels: _Levels
+    retina: _Retina
 
 
 class LogPolar(Sensor):
@@ -183,9 +171,9 @@ class LogPolar(Sensor):
 
     def __init__(self, fovea: float, spacing: float = 1.0, pooling: float = 1.0) -> None:
         super().__init__()
-        self.retina = Retina(fovea, spacing, pooling)
+        self.retina = _Retina(fovea, spacing, pooling)
 
-    def pyramid(self, image: Tensor) -> Levels:
+    def pyramid(self, image: Tensor) -> _Levels:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
 
         Args:
@@ -196,7 +184,7 @@ class LogPolar(Sensor):
         """
         return gaussian_pyramid(image, self.retina.levels(_size(image)))
 
-    def cortical(self, image: Tensor | Levels, gaze: Tensor) -> Tensor:
+    def cortical(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
         """Compute cortical images, see `log_polar`.
 
         Args:
@@ -222,7 +210,7 @@ class LogPolar(Sensor):
         """
         return from_log_polar(cortical, gaze, size, fovea=self.retina.fovea, spacing=self.retina.spacing)
 
-    def forward(self, image: Tensor | Levels, gaze: Tensor) -> Tensor:
+    def forward(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
         """Compute the back-projection of the cortical images of fixations.
 
         Args:
@@ -235,14 +223,14 @@ class LogPolar(Sensor):
         finest = image[0] if isinstance(image, tuple) else image
         return self.back(self.cortical(image, gaze), gaze, _size(finest))
 
-    def open(self, canvas: Tensor, scale: Tensor) -> LogPolarCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> _LogPolarCanvas:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
         own = self.retina
-        retina = Retina(own.fovea, own.spacing, own.pooling, (across, down))
-        return LogPolarCanvas(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
+        retina = _Retina(own.fovea, own.spacing, own.pooling, (across, down))
+        return _LogPolarCanvas(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
 
-    def look(self, state: LogPolarCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: _LogPolarCanvas, gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         fixation, _ = fixations(gaze[None], state.levels[0])
         cortical = _sample(state.levels, fixation, state.retina)
@@ -269,7 +257,7 @@ def _size(image: Tensor) -> tuple[int, int]:
     return image.shape[-1], image.shape[-2]
 
 
-def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
+def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
     """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
     finest = levels[0]
     size = _size(finest)
@@ -289,7 +277,7 @@ def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
     return torch.stack(by_level).sum(0).transpose(1, 2)
 
 
-def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: Retina) -> Tensor:
+def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: _Retina) -> Tensor:
     """Images `(B, G, C, H, W)` from cortical images `(B, G, C, M, N)` of fixations `(B, G, 2)`."""
     batch, many, _, rings, wedges = cortical.shape
     # Squares of longer distances overflow, and beyond this distance the view no longer changes.
@@ -317,7 +305,7 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
 
 
 @constant
-def _places(retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
+def _places(retina: _Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Positions of the receptors relative to the fixation, `(M, N, 2)`, in image pixels."""
     rings, wedges = retina.receptors(size)
     rho = (torch.arange(rings, dtype=torch.float64) + 0.5) * retina.spacing
@@ -329,7 +317,7 @@ def _places(retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: t
 
 @constant
 def _shares(
-    retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+    retina: _Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> list[tuple[int, int, Tensor]]:
     """For each level of the pyramid that is read: its number, the first ring that reads it, and its weight by ring."""
     rings, top = retina.receptors(size)[0], retina.levels(size)

@@ -12,20 +12,15 @@ from semfov.errors import check, check_shape, check_whole
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.glimpse import windows_at
 
-Planes = tuple[Tensor, ...]
+_Planes = tuple[Tensor, ...]
 """Planes of all squares of 2^l pixels that touch an image, with a black border, finest scale first."""
 
 
 @dataclass(frozen=True)
-class MultiScaleCanvas:
-    """A canvas that `MultiScaleFovea.open` has prepared.
+class _MultiScaleCanvas:
+    """A canvas that `MultiScaleFovea.open` has prepared; size `(width, height)`."""
 
-    Attributes:
-        means: means of squares at every scale.
-        size: `(width, height)` of the canvas.
-    """
-
-    means: Planes
+    means: _Planes
     size: tuple[int, int]
 
 
@@ -75,7 +70,7 @@ class MultiScaleFovea(Sensor):
         """Number of pictures that the detector sees in a look, L."""
         return self.scales
 
-    def means(self, image: Tensor) -> Planes:
+    def means(self, image: Tensor) -> _Planes:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
 
         Args:
@@ -95,7 +90,7 @@ class MultiScaleFovea(Sensor):
             means.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
         return tuple(means)
 
-    def forward(self, image: Tensor | Planes, gaze: Tensor) -> Tensor:
+    def forward(self, image: Tensor | _Planes, gaze: Tensor) -> Tensor:
         """Compute the crops around fixations.
 
         Args:
@@ -132,15 +127,15 @@ class MultiScaleFovea(Sensor):
         width, height = (max(1, round(length * reference / max(size))) for length in size)
         return width, height
 
-    def open(self, canvas: Tensor, scale: Tensor) -> MultiScaleCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> _MultiScaleCanvas:
         """Compute the means of a canvas. Crops are in pixels of the canvas, whatever the scale."""
-        return MultiScaleCanvas(self.means(canvas), (canvas.shape[-1], canvas.shape[-2]))
+        return _MultiScaleCanvas(self.means(canvas), (canvas.shape[-1], canvas.shape[-2]))
 
-    def look(self, state: MultiScaleCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: _MultiScaleCanvas, gaze: Tensor) -> Tensor:
         """Compute the crops `(F·L, 3, side, side)` around fixations `(F, 2)`, those of a fixation together."""
         return self(state.means, gaze[None])[0].flatten(0, 1)
 
-    def picture(self, state: MultiScaleCanvas, gaze: Tensor) -> Tensor:
+    def picture(self, state: _MultiScaleCanvas, gaze: Tensor) -> Tensor:
         """Compose the crops into pictures `(F, 3, H, W)` in which each place is shown by its finest crop."""
         crops = self(state.means, gaze[None])[0]
         fixation, _ = fixations(gaze, crops)
@@ -155,7 +150,7 @@ class MultiScaleFovea(Sensor):
             picture = torch.where((where.abs() <= 1).all(-1)[:, None], crop, picture)
         return picture
 
-    def boxes_to_canvas(self, state: MultiScaleCanvas, gaze: Tensor, boxes: Tensor) -> Tensor:
+    def boxes_to_canvas(self, state: _MultiScaleCanvas, gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
         windows = self.windows(gaze.to(boxes)).flatten(0, 1)[:, None]
         unit = (windows[..., 2:] - windows[..., :2]).repeat(1, 1, 2) / self.side

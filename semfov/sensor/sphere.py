@@ -41,15 +41,10 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
 
     x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
 
-    Args:
-        directions: vectors `(..., 3)` of any length.
-        size: `(width, height)` of the panorama.
-
-    Returns:
-        Pixels `(..., 2)`, pixel centres at integers.
-
     >>> panorama_points(torch.tensor([0.0, -1.0, 1.0]), (1024, 512))
     tensor([511.5000, 127.5000])
+
+    Shapes: directions `(..., 3)`, size `(width, height)` → `(..., 2)`.
     """
     check_shape(directions, "directions", 3)
     x, y, z = directions.unbind(-1)

@@ -29,14 +29,7 @@ Frame = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Film:
-    """Frames that a notebook shows one after the other.
-
-    Attributes:
-        frames: pixels `(H, W, 3)`, all of one size.
-        seconds: duration of each frame.
-        hold: additional seconds of the last frame.
-        title: description of the film.
-    """
+    """Frames that a notebook shows one after the other; frames `(H, W, 3)`."""
 
     frames: list[Frame]
     seconds: float = 1.0
@@ -54,14 +47,14 @@ class Film:
 
     def save(self, path: str | PathLike[str]) -> list[Path]:
         """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""
-        return save_animation(self.frames, Path(path), seconds=self.seconds, hold=self.hold)
+        return _save_animation(self.frames, Path(path), seconds=self.seconds, hold=self.hold)
 
     def _repr_html_(self) -> str:
         """The film as a GIF inside the notebook's file."""
         from html import escape
 
         file = io.BytesIO()
-        write_gif(self.frames, file, self.seconds, self.hold)
+        _write_gif(self.frames, file, self.seconds, self.hold)
         data = base64.b64encode(file.getvalue()).decode()
         return f'<img style="max-width:100%" alt="{escape(self.title)}" src="data:image/gif;base64,{data}">'
 
@@ -116,11 +109,11 @@ def film_of(
     """Make the film of an episode; arguments and errors as for `animate`."""
     check(seconds > 0, "seconds", "a positive time", seconds)
     check(hold >= 0, "hold", "0 seconds or more", hold)
-    frames = episode_frames(scanpath, photograph_of(scanpath, image), views_of(scanpath, views), boxes)
+    frames = _episode_frames(scanpath, photograph_of(scanpath, image), views_of(scanpath, views), boxes)
     return Film(frames, seconds, hold, scanpath.describe())
 
 
-def episode_frames(
+def _episode_frames(
     scanpath: Scanpath, image: Tensor, views: Sequence[Tensor], boxes: Tensor | None = None, dpi: int = 90
 ) -> list[Frame]:
     """Frames of an episode, all drawn in one figure; each is the figure of `plot_fixation`."""
@@ -167,43 +160,28 @@ def in_palette(frame: Frame, refine: int = 0) -> Any:
     return image.quantize(palette=image.quantize(256, kmeans=refine))
 
 
-def save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:
-    """Write frames as a GIF and, where ffmpeg is installed, as an MP4 beside it.
-
-    Args:
-        frames: pixels `(H, W, 3)`, all of one size.
-        path: of the GIF.
-        seconds: duration of each frame.
-        hold: additional seconds of the last frame.
-
-    Returns:
-        The paths written.
-    """
+def _save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:
+    """Write frames as a GIF and, where ffmpeg is installed, as an MP4 beside it; frames `(H, W, 3)`."""
     with replacing(path) as temporary, temporary.open("wb") as file:
-        write_gif(frames, file, seconds, hold)
+        _write_gif(frames, file, seconds, hold)
     ffmpeg = shutil.which("ffmpeg")
     return [path] if ffmpeg is None else [path, _save_mp4(ffmpeg, frames, path.with_suffix(".mp4"), seconds, hold)]
 
 
-def write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:
+def _write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:
     """Write frames as a GIF with a common palette of 256 colours."""
-    first, *others = in_one_palette(frames)
+    first, *others = _in_one_palette(frames)
     times = [int(1000 * seconds)] * len(frames)
     times[-1] += int(1000 * hold)
     first.save(file, format="GIF", save_all=True, append_images=others, duration=times, loop=0)
 
 
-def in_one_palette(frames: Sequence[Frame], most: int = 6) -> list[Any]:
+def _in_one_palette(frames: Sequence[Frame], most: int = 6) -> list[Any]:
     """Frames as Pillow images with a common palette of 256 colours, which is made from `most` of them.
 
     With a palette for each frame, static parts of the film would flicker.
 
-    Args:
-        frames: pixels `(H, W, 3)`, all of one size.
-        most: largest number of frames that the palette is made from.
-
-    Returns:
-        The Pillow images.
+    Shapes: frames `(H, W, 3)`.
     """
     from PIL import Image
 

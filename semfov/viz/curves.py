@@ -114,13 +114,6 @@ def plot_curve_panels(
 def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
     """The curves that a legend names: the highest on average, and random gaze as the reference.
 
-    Args:
-        curves: by name.
-        most: largest number of curves to name.
-
-    Returns:
-        Their names, in the order of `curves`.
-
     >>> highlighted({"random": np.zeros(2), "a": np.ones(2), "b": np.full(2, 0.5)}, most=2)
     ['random', 'a']
     """
@@ -131,12 +124,6 @@ def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
 
 def others_named(count: int) -> str:
     """The legend's single entry for all curves that it does not name.
-
-    Args:
-        count: number of these curves.
-
-    Returns:
-        The text.
 
     >>> others_named(9)
     '9 others'

@@ -29,18 +29,7 @@ LABEL = 6.5
 
 
 def photograph_of(record: Record, image: Tensor | None) -> Tensor:
-    """The given image, or the one that the record kept.
-
-    Args:
-        record: the record.
-        image: `(3, h, w)`, or None.
-
-    Returns:
-        `(3, h, w)`.
-
-    Raises:
-        InputError: there is neither.
-    """
+    """The given image, or the one that the record kept; image `(3, h, w)` → `(3, h, w)`."""
     picture = record.image if image is None else image
     if picture is None:
         raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
@@ -66,14 +55,7 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
 
     Pixel edges, not centres, are at integers, as for boxes and for the grid.
 
-    Args:
-        axes: to draw in.
-        image: `(3, h, w)`, RGB in [0, 1].
-        grid: the cells.
-        grey: draw the luma alone, so that colours can be laid over it.
-
-    Returns:
-        The matplotlib image.
+    Shapes: image `(3, h, w)`.
     """
     width, height = grid.extent.tolist()
     drawn = axes.imshow(picture_array(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
@@ -182,16 +164,7 @@ def draw_look(
 
     The figure must be laid out, because the positions of labels depend on the layout.
 
-    Args:
-        axes: to draw in.
-        detections: the detections, a batch of one.
-        classes: names of the classes, background first.
-        frame: `(width, height)` of the picture.
-        target: class whose detections have a colour of their own.
-        obstacles: rectangles that labels must not cover.
-
-    Returns:
-        The artists drawn.
+    Shapes: frame `(width, height)`.
     """
     tags: list[Tag] = []
     drawn: list[Artist] = []
@@ -206,13 +179,7 @@ def draw_look(
 
 
 class Tag(NamedTuple):
-    """The label of a box in a figure.
-
-    Attributes:
-        box: `(x1, y1, x2, y2)` of the box.
-        text: text of the label.
-        colour: colour of the box.
-    """
+    """The label of a box in a figure."""
 
     box: LabelBox
     text: str
@@ -222,18 +189,7 @@ class Tag(NamedTuple):
 def draw_tags(
     axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], points: float = LABEL
 ) -> list[Artist]:
-    """Write the labels of boxes, so that none covers another; the figure must be laid out.
-
-    Args:
-        axes: to draw in.
-        tags: the labels.
-        frame: `(width, height)` of the picture.
-        obstacles: rectangles that labels must not cover.
-        points: font size.
-
-    Returns:
-        The texts.
-    """
+    """Write the labels of boxes, so that none covers another; the figure must be laid out; frame `(width, height)`."""
     sizes = [text_size(axes, tag.text, points) for tag in tags]
     places = place_labels([tag.box for tag in tags], sizes, frame, obstacles)
     return [

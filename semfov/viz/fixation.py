@@ -73,16 +73,7 @@ def plot_fixation(
 class FixationFigure:
     """A figure of one fixation that can show other fixations: it is laid out once, and only differences are redrawn.
 
-    Args:
-        scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1].
-        view: any foveated photograph `(3, h, w)`, for its size.
-        boxes: `(M, 4)`, true boxes of the target.
-        axes: three axes to draw in; None makes a figure.
-
-    Attributes:
-        figure: the figure.
-        axes: axes of scanpath, view and belief.
+    Shapes: image `(3, H, W)`, view `(3, h, w)`, boxes `(M, 4)`.
     """
 
     def __init__(

@@ -30,26 +30,7 @@ if TYPE_CHECKING:
 def plot_head_path(
     path: HeadPath, image: ImageLike | None = None, *, looks: int | None = None, ax: Axes | None = None
 ) -> Figure:
-    """Plot the windows that the head turned to, the fixations in their order, and the objects that were found.
-
-    Args:
-        path: record of a search or an exploration.
-        image: the scene's picture in any size, of any common kind (`semfov.as_image`); None takes the one that the path
-            kept.
-        looks: number of looks to draw, from the first; None draws all.
-        ax: axes to draw in; None makes a figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: the picture is neither given nor kept, or there are fewer looks.
-
-    Example::
-
-        path = agent.search(Panorama("street.jpg"), "bicycle")
-        save_figure(plot_head_path(path), "path.png")
-    """
+    """Plot the windows that the head turned to, the fixations in their order, and the objects that were found."""
     picture = photograph_of(path, None if image is None else as_image(image))
     count = len(path) if looks is None else looks
     check(1 <= count <= len(path), "looks", f"a number from 1 to {len(path)}", count)
@@ -57,7 +38,7 @@ def plot_head_path(
     figure, (axes,) = make_figure(
         1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", axes=only(ax)
     )
-    draw_path(axes, path, picture, count)
+    _draw_path(axes, path, picture, count)
     axes.set_title(path.describe(), parse_math=False)
     draw_legend(axes, [(GAZE, "-", "views of the head"), *object_entries(path)])
     lay_out(figure)
@@ -65,7 +46,7 @@ def plot_head_path(
     return figure
 
 
-def draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
+def _draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
     """Draw the first `count` looks, in pixels of the scene's picture."""
     world = path.views.world
     draw_image(axes, image, world.scene)
@@ -118,27 +99,7 @@ def animate_head(
     seconds: float = 0.8,
     hold: float = 2.0,
 ) -> Path | Film:
-    """Make a film of eye and head: for each look the scene with the windows so far, the view, and the belief.
-
-    Args:
-        path: record of a search or an exploration.
-        file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
-        image: the scene's picture, of any common kind (`semfov.as_image`); None takes the one that the path kept.
-        seconds: duration of each frame.
-        hold: additional seconds of the last frame.
-
-    Returns:
-        The path of the GIF, or a film, which a notebook shows.
-
-    Raises:
-        InputError: the picture is neither given nor kept.
-        DataError: the file cannot be written.
-
-    Example::
-
-        path = agent.search(Panorama("street.jpg"), "bicycle")
-        animate_head(path, "path.gif")
-    """
+    """Make a film of eye and head: for each look the scene with the windows so far, the view, and the belief."""
     picture = photograph_of(path, None if image is None else as_image(image))
     return film_or_file(path, _frames(path, picture), seconds, hold, file)
 
@@ -155,7 +116,7 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
         halves: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
         above, below = halves
         axes = above.subplots()
-        draw_path(axes, path, image, look + 1)
+        _draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
         draw_objects(axes, path, last=look, tagged=False)
         left, right = below.subplots(1, 2, width_ratios=[1, 1.25])

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 LabelBox = tuple[float, float, float, float]
 _Size = tuple[float, float]
-Point = tuple[float, float]
+_Point = tuple[float, float]
 
 
 def place_labels(
@@ -13,17 +13,10 @@ def place_labels(
 ) -> list[LabelBox]:
     """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
 
-    Args:
-        boxes: `(x1, y1, x2, y2)`, y growing downwards.
-        sizes: `(width, height)` of each label.
-        frame: `(width, height)` of the picture, which labels leave only if they do not fit.
-        obstacles: rectangles that labels must not cover.
-
-    Returns:
-        A rectangle `(x1, y1, x2, y2)` for each label, in their order.
-
     >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
     [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
+
+    Shapes: sizes `(width, height)`, frame `(width, height)` → `(x1, y1, x2, y2)`.
     """
     placed: list[LabelBox] = list(obstacles)
     for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
@@ -41,23 +34,18 @@ def place_labels(
     return placed[len(obstacles) :]
 
 
-def place_numbers(points: Sequence[Point], sizes: Sequence[_Size], frame: _Size, reach: float) -> list[LabelBox | None]:
+def place_numbers(
+    points: Sequence[_Point], sizes: Sequence[_Size], frame: _Size, reach: float
+) -> list[LabelBox | None]:
     """Rectangles for the numbers of points: on the point where there is room, or else near it.
 
     No number covers another number or another point. The first and the last point are placed first.
 
-    Args:
-        points: `(x, y)`; equal points count as one.
-        sizes: `(width, height)` of each number.
-        frame: `(width, height)` of the picture, which numbers do not leave.
-        reach: largest distance of a number from its point.
-
-    Returns:
-        A rectangle for each number; None where there is no room.
-
     >>> first, second = place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
     >>> first[2] <= second[0]
     True
+
+    Shapes: sizes `(width, height)`, frame `(width, height)`.
     """
     placed: list[LabelBox] = []
     places: list[LabelBox | None] = [None] * len(points)
@@ -75,23 +63,16 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[_Size], frame: _Size,
 
 
 def place_within(
-    candidates: Sequence[Iterable[Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
+    candidates: Sequence[Iterable[_Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
     """Rectangles for labels whose middle may be at any of several points: at the first free one.
 
     Where none is free, the label is moved down from the first point.
 
-    Args:
-        candidates: for each label the possible middles, best first.
-        sizes: `(width, height)` of each label.
-        frame: `(width, height)` of the picture.
-        obstacles: rectangles that labels must not cover.
-
-    Returns:
-        A rectangle for each label, in their order.
-
     >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
     [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
+
+    Shapes: sizes `(width, height)`, frame `(width, height)`.
     """
     placed: list[LabelBox] = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
@@ -101,7 +82,7 @@ def place_within(
     return placed[len(obstacles) :]
 
 
-def _around(point: Point, size: _Size, reach: float) -> Iterator[Point]:
+def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
     """The point itself, followed by rings of points around it."""
     yield point
     radius = step = 0.6 * max(size)
@@ -112,7 +93,7 @@ def _around(point: Point, size: _Size, reach: float) -> Iterator[Point]:
         radius += step / 2
 
 
-def _holds(label: LabelBox, point: Point) -> bool:
+def _holds(label: LabelBox, point: _Point) -> bool:
     return label[0] < point[0] < label[2] and label[1] < point[1] < label[3]
 
 

@@ -40,14 +40,7 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
     Of windows, a frame marks the present window, a thin one the next, and boxes the objects: those that are confirmed
     in their own colour.
 
-    Args:
-        image: `(3, H, W)`, RGB in [0, 1] or bytes.
-        moment: what is known at this frame.
-        text: text at the upper edge.
-
-    Returns:
-        Pixels `(h, w, 3)`. The longer side has at most 640 pixels, or of windows 1280, and both sides are even, as
-        videos require.
+    Shapes: image `(3, H, W)` → `(h, w, 3)`.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -120,18 +113,7 @@ def video_suffix() -> str:
 
 @contextmanager
 def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
-    """Write frames to a video, whole or not at all.
-
-    Args:
-        path: of the file, with a suffix of `VIDEO_CODECS`.
-        rate: frames per second.
-
-    Yields:
-        A function that takes the frames `(h, w, 3)`, all of one size, one after the other.
-
-    Raises:
-        DataError: the file cannot be written, or OpenCV is not installed.
-    """
+    """Write frames to a video, whole or not at all."""
     try:
         import cv2
     except ImportError:

@@ -48,13 +48,6 @@ def draw_objects(
     """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
 
     For labels the figure must be laid out, because their positions depend on the layout.
-
-    Args:
-        axes: axes that hold the picture.
-        record: the record.
-        obstacles: rectangles that labels must not cover.
-        last: number of the last look whose objects are drawn; None draws all.
-        tagged: whether objects have labels.
     """
     rows = [row for row in record.object_rows() if last is None or row["look"] <= last]
     width, height = record.size
@@ -76,12 +69,7 @@ def draw_objects(
 
 
 def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
-    """Draw a legend below the picture.
-
-    Args:
-        axes: axes that hold the picture.
-        entries: the entries; without any there is no legend.
-    """
+    """Draw a legend below the picture."""
     from matplotlib.lines import Line2D
 
     if not entries:

@@ -31,15 +31,7 @@ class GazePath:
 
     All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown.
 
-    Args:
-        axes: axes that hold the photograph, laid out.
-        fixations: `(n, 2)`, in pixels of the photograph, pixel centres at integers.
-        frame: `(width, height)` of the photograph.
-        found: whether the last fixation found a target.
-
-    Attributes:
-        numbers: text of each fixation's number; None where it did not fit.
-        number_boxes: rectangles that the numbers occupy.
+    Shapes: fixations `(n, 2)`, frame `(width, height)`.
     """
 
     def __init__(self, axes: Axes, fixations: FixationValues, frame: tuple[float, float], *, found: bool) -> None:

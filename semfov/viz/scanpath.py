@@ -142,7 +142,7 @@ def plot_foveated_strip(
     figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
     used = list(zip(panels, fixations, strict=False))
     for panel, fixation in used:
-        draw_view(panel, scanpath, fixation, views[fixation])
+        _draw_view(panel, scanpath, fixation, views[fixation])
     for panel in panels[len(fixations) :]:
         panel.remove()
     _label_views(figure, scanpath, used)
@@ -197,7 +197,7 @@ def plot_episode(
     draw_legend(first, annotation_entries(scanpath, boxes))
     panels = right.subplots(2, len(fixations), squeeze=False)
     for (above, below), fixation in zip(panels.T, fixations, strict=True):
-        draw_view(above, scanpath, fixation, views[fixation])
+        _draw_view(above, scanpath, fixation, views[fixation])
         if scanpath.target is None:
             drawn = draw_semantic_map(below, scanpath, fixation, image)
         else:
@@ -226,7 +226,7 @@ def annotation_entries(scanpath: Scanpath, boxes: Tensor | None) -> list[LegendE
     return [(TRUTH, "--", f"annotated: {name}")] if boxes is not None and len(boxes) else []
 
 
-def draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:
+def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:
     """Draw the foveated view of a fixation."""
     draw_image(axes, view, scanpath.grid)
     draw_gaze(axes, scanpath, fixation)

@@ -144,13 +144,6 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
 def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
     """Sides of cells that bound a region.
 
-    Args:
-        grid: the cells.
-        region: cells of the region.
-
-    Returns:
-        Each side as its two end points.
-
     >>> len(borders(Grid(3, 2, (30, 20)), [0, 1]))
     6
     """
@@ -200,14 +193,10 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
 def regions(labels: Tensor) -> list[list[int]]:
     """Regions of cells that touch at a side and share a label other than 0.
 
-    Args:
-        labels: `(Y, X)`, label of each cell.
-
-    Returns:
-        Cells of each region, ascending.
-
     >>> regions(torch.tensor([[1, 1, 0], [2, 1, 1]]))
     [[0, 1, 4, 5], [3]]
+
+    Shapes: labels `(Y, X)`.
     """
     rows, columns = labels.shape
     flat, seen, groups = labels.flatten().tolist(), set[int](), []

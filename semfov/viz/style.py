@@ -28,7 +28,7 @@ LINES = ("-", "--", "-.", ":")
 PROBABILITY = "viridis"
 UNCERTAINTY = "cividis"
 TIME = "viridis"
-OVERLAY = "plasma"
+_OVERLAY = "plasma"
 """Colour maps, whose lightness increases steadily, so that they work in grey print too."""
 
 _OPACITY = 0.85
@@ -47,17 +47,17 @@ STYLE: Any = {
 FILES: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
 """Text in vector files looks the same everywhere: PDFs embed the font, and SVGs its outlines."""
 
-Arguments = ParamSpec("Arguments")
+_Arguments = ParamSpec("_Arguments")
 
 _PLACES = ("ax", "axes", "figure")
 _laid_out: WeakSet[Figure] = WeakSet()
 
 
-def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
+def styled(plot: Callable[_Arguments, Figure]) -> Callable[_Arguments, Figure]:
     """Decorate a plot function to draw with `STYLE`, whatever the caller's settings of matplotlib are."""
 
     @wraps(plot)
-    def draw(*arguments: Arguments.args, **options: Arguments.kwargs) -> Figure:
+    def draw(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> Figure:
         from matplotlib import rc_context
 
         with rc_context(STYLE):
@@ -66,13 +66,13 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
             # the caller has given is left for the caller to draw.
             if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
                 figure.draw_without_rendering()
-            teach_notebook()
+            _teach_notebook()
             return figure
 
     return draw
 
 
-def teach_notebook() -> None:
+def _teach_notebook() -> None:
     """Register figures with IPython, so that a notebook shows one that is the last value of a cell."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
@@ -104,21 +104,6 @@ def make_figure(
     """Make a figure of `width` × `height` inches without a window, or use the given axes.
 
     The layout is `compressed` for pictures, whose proportions are fixed, so that they move together.
-
-    Args:
-        rows: number of rows of axes.
-        columns: number of columns of axes.
-        width: in inches.
-        height: in inches.
-        ratios: relative heights of the rows.
-        layout: layout engine of matplotlib.
-        axes: axes to use instead of a new figure.
-
-    Returns:
-        The figure, and its axes row by row.
-
-    Raises:
-        InputError: the number of given axes does not fit.
     """
     from matplotlib.figure import Figure
 
@@ -184,7 +169,7 @@ def overlay_colours() -> Colormap:
     from matplotlib.colors import ListedColormap
 
     share = np.linspace(0, 1, 256)
-    colours = colormaps[OVERLAY](share)
+    colours = colormaps[_OVERLAY](share)
     colours[:, 3] = _OPACITY * np.sqrt(share)
     return ListedColormap(colours, name="overlay")
 

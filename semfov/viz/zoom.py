@@ -52,7 +52,7 @@ def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None
     size = 7.2, 7.2 * height / width + 0.6
     figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", axes=only(ax))
     draw_image(axes, image, Grid(1, 1, (width, height)))
-    number_boxes = draw_windows(axes, path)
+    number_boxes = _draw_windows(axes, path)
     axes.set_title(path.describe(), parse_math=False)
     windows = [(GAZE, "-", "windows of the looks")] if number_boxes else []
     draw_legend(axes, [*windows, *object_entries(path)])
@@ -61,7 +61,7 @@ def plot_zoom_path(path: Record, image: Tensor | None = None, *, ax: Axes | None
     return figure
 
 
-def draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[LabelBox]:
+def _draw_windows(axes: Axes, path: Record, last: int | None = None) -> list[LabelBox]:
     """Draw the windows of looks up to `last` (None: all), numbered; returns the rectangles of the numbers."""
     from matplotlib.patches import Rectangle
 
@@ -97,23 +97,7 @@ def _free(
 
 @styled
 def plot_moment(moment: FoveaMoment, image: Tensor | None = None, *, ax: Axes | None = None) -> Figure:
-    """Plot the point of gaze in a frame, and the objects.
-
-    Args:
-        moment: record of the frame.
-        image: `(3, h, w)`, RGB in [0, 1], the frame in any size; None takes the one that the record kept.
-        ax: axes to draw in; None makes a figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: the frame is neither given nor kept.
-
-    Example::
-
-        save_figure(plot_moment(live.step(frame)), "frame.png")
-    """
+    """Plot the point of gaze in a frame, and the objects; image `(3, h, w)`."""
     figure = plot_zoom_path(moment, image, ax=ax)
     axes = figure.axes[0] if ax is None else ax
     draw_cross(axes, moment.fixation)
@@ -130,24 +114,7 @@ def animate_looks(
 ) -> Path | Film:
     """Make a film of a record: for each look the picture with the windows so far, and the window with its detections.
 
-    Args:
-        path: the record.
-        file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
-        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; None takes the one that the record kept, in which
-            narrow windows are coarse.
-        seconds: duration of each frame.
-        hold: additional seconds of the last frame.
-
-    Returns:
-        The path of the GIF, or a film, which a notebook shows.
-
-    Raises:
-        InputError: the picture is neither given nor kept.
-        DataError: the file cannot be written.
-
-    Example::
-
-        animate_looks(agent.find_all("harbour.tif", "person"), "harbour.gif")
+    Shapes: image `(3, h, w)`.
     """
     return film_or_file(path, _frames(path, photograph_of(path, image)), seconds, hold, file)
 
@@ -159,7 +126,7 @@ def _frames(path: Record, image: Tensor) -> Iterator[Figure]:
         figure, (whole, window) = make_figure(1, 2, width=4.8 + 1.15 * high, height=high + 0.4, layout="compressed")
         for axes in (whole, window):
             draw_image(axes, image, Grid(1, 1, (width, height)))
-        number_boxes = draw_windows(whole, path, look.number)
+        number_boxes = _draw_windows(whole, path, look.number)
         whole.set_title(f"look {look.number}")
         x1, y1, x2, y2 = look.region
         window.set(xlim=(x1, x2), ylim=(y2, y1), title="its window and detections")

@@ -98,11 +98,7 @@ class ZoomBelief:
         return self._rates.foresight
 
     def restore(self, left: Tensor) -> None:
-        """Set back what is left to see, to undo `discount`.
-
-        Args:
-            left: `(rows, columns)`, a copy of `left` from before.
-        """
+        """Set back what is left to see, to undo `discount`; left `(rows, columns)`."""
         before, now = left.numpy(), self.left.numpy()
         differs = before != now
         if differs.any():
@@ -172,11 +168,7 @@ class ZoomBelief:
         return torch.from_numpy(self._expected(level))
 
     def remaining(self) -> tuple[float, float]:
-        """Number of objects that looks are still expected to find: in each cell those of the level that finds most.
-
-        Returns:
-            The number in cells in which a tenth of an object or more is expected, and the number in all others.
-        """
+        """Number of objects that looks are still expected to find: in each cell those of the level that finds most."""
         levels = range(1, self.lattice.levels)
         if not levels:
             return 0.0, 0.0
@@ -200,15 +192,7 @@ class ZoomBelief:
         return torch.from_numpy(self._sum(level, 1).copy())
 
     def value(self, level: int, foresight: float) -> Cells:
-        """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`).
-
-        Args:
-            level: level of the windows.
-            foresight: κ.
-
-        Returns:
-            `(down, across)`, not to be written to.
-        """
+        """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`); → `(down, across)`."""
         values = self._sum(level, 1)
         if not foresight or level + 1 >= self.lattice.levels:
             return values
@@ -221,16 +205,7 @@ class ZoomBelief:
         return self._sum(level, 0) / np.float32(whole)
 
     def _sum(self, level: int, octaves: int) -> Cells:
-        """Sums over the windows of a level.
-
-        Args:
-            level: the level.
-            octaves: 0 for the cells that no look has shown at that level or closer; 1 for `finds`; 2 for the finds of
-                looks one octave closer, in cells not looked at from the level yet.
-
-        Returns:
-            `(down, across)`, not to be written to.
-        """
+        """Sums over the windows of a level; → `(down, across)`."""
         if (level, octaves) not in self._sums:
             cells: Callable[[Place], Cells] = (
                 lambda at: self.left.numpy()[at] * self._unseen(level, at),
@@ -299,12 +274,7 @@ class ZoomBelief:
 def before_of(rate: Cells, look: Gist) -> Tensor:
     """Logarithms of the rates that earlier looks predicted for a look's cells, one octave closer than the look.
 
-    Args:
-        rate: `(rows, columns)`, the rates in the lattice cells that the look shows.
-        look: the new look.
-
-    Returns:
-        `(rows, columns)` of the gist.
+    Shapes: rate `(rows, columns)` → `(rows, columns)`.
     """
     before = torch.from_numpy(rate)
     rows, columns = look.scores.shape[:2]

@@ -78,18 +78,7 @@ class Certainty:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
-        """Read a certainty from the numbers of a file.
-
-        Args:
-            numbers: a, b, :math:`c_0`, k, w and u. Files of earlier versions have neither w nor u, or a and the weight
-                of the score alone.
-
-        Returns:
-            The certainty.
-
-        Raises:
-            InputError: there are more or fewer numbers.
-        """
+        """Read a certainty from the numbers of a file."""
         if len(numbers) == 2:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
         first = len(FACTS) + 1
@@ -106,28 +95,11 @@ class Certainty:
         return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise]
 
     def probability(self, facts: Tensor) -> Tensor:
-        """The probabilities of objects.
-
-        Args:
-            facts: `(M, 14)`, facts about them (`object_facts`).
-
-        Returns:
-            `(M,)`, in (0, 1).
-        """
+        """The probabilities of objects; facts `(M, 14)` → `(M,)`."""
         return (self.offset + facts @ facts.new_tensor(self.weights)).sigmoid()
 
     def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[float, float]:
-        """How many objects further looks would show.
-
-        Args:
-            expected: :math:`R_1` and :math:`R_2`, the numbers of objects that the evidence expects further looks to
-                show (`ZoomBelief.remaining`).
-            promised: W, the number that it expected of the looks after the first.
-            discoveries: F, the number that they have shown.
-
-        Returns:
-            The expected number, and its variance.
-        """
+        """How many objects further looks would show."""
         clear, faint = expected
         number = clear + self.faint * faint
         if math.isinf(self.strength):
@@ -157,27 +129,8 @@ def object_facts(
     of which four fifths lie in it. A look should show an object of 6 canvas pixels or more that lies in its window and
     not at its border.
 
-    Args:
-        index: `(M,)`, indices of the boxes that stand for objects.
-        boxes: `(L, 4)`, all boxes of all looks, in picture pixels.
-        scores: `(L,)`, their scores.
-        labels: `(L,)`, their classes.
-        looks: `(L,)`, number of the look of each box.
-        cut: `(L,)`, boolean, boxes that the border of their window cuts.
-        windows: `(N, 4)`, windows of the looks, in picture pixels.
-        magnifications: `(N,)`, in canvas pixels per picture pixel.
-        size: `(width, height)` of the picture, whose border cuts nothing.
-        finest: the largest magnification that a look can have.
-        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
-
-    Returns:
-        `(M, 14)`, the facts in the order of `FACTS`. `score`, `best` and `sharpest` are log odds: the score of the box
-        that was kept, the highest of all looks, and that of the sharpest look that shows or should show the object.
-        `shown` and `missed` are logarithms of one more than the number of looks that show it, and that should and do
-        not. `cut` is 1 for a cut box. `size` is the logarithm of its size on the canvas. `agreement` is the mean
-        overlap of other boxes with it, less 0.6. `double`, `inside` and `around` tell how far it overlaps a better
-        object of its class, lies in one, and contains one, times the score of that object; `rival` how far it overlaps
-        a better object of another class. `octaves` is the distance to the largest magnification.
+    Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, looks `(L,)`, cut `(L,)`, windows `(N, 4)`,
+    magnifications `(N,)`, size `(width, height)` → `(M, 14)`.
     """
     count = len(index)
     if not count:

@@ -14,7 +14,7 @@ from semfov.zoom.glances import Glance, Glances, Window, around
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
-CONTEXT = 3.0
+_CONTEXT = 3.0
 """Side of the window of a closer look, in longer sides of the examined box."""
 
 _SMALLEST = 1e-4
@@ -26,22 +26,17 @@ def closer_window(lattice: Lattice, box: Tensor) -> Window:
     It is three times as large as the longer side of the box (`semfov.sensor.glimpse.window_around`), but its
     magnification is at most one octave above that of the last level: pictures show no more beyond it.
 
-    Args:
-        lattice: lattice of the picture.
-        box: `(4,)`, as `(x1, y1, x2, y2)` in picture pixels.
-
-    Returns:
-        The window.
-
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> closer_window(lattice, torch.tensor([600.0, 600.0, 800.0, 700.0])).within
     (400.0, 350.0, 1000.0, 950.0)
     >>> x1, _, x2, _ = closer_window(lattice, torch.tensor([600.0, 600.0, 610.0, 620.0])).within
     >>> x2 - x1, 416 / (2 * lattice.magnifications[-1])
     (320.0, 320.0)
+
+    Shapes: box `(4,)`.
     """
     smallest = min(lattice.canvas) / (2 * lattice.magnifications[-1])
-    window = window_around(box.double(), lattice.size, context=CONTEXT, least=smallest / max(lattice.size))
+    window = window_around(box.double(), lattice.size, context=_CONTEXT, least=smallest / max(lattice.size))
     x1, y1, x2, y2 = window.tolist()
     return around(lattice, (x1, y1, x2, y2))
 
@@ -52,15 +47,7 @@ def look_closely(glances: Glances, box: Tensor) -> Glance:
 
 
 class WindowLook(NamedTuple):
-    """One look of a search, and what is known of the target after it.
-
-    Attributes:
-        detections: its detections, a batch of one, boxes in picture pixels.
-        number: number of looks so far.
-        presence: probability that the picture holds the target, from all looks but the closer ones.
-        best: highest score of the target in any look.
-        left: value of the best look that is left.
-    """
+    """One look of a search, and what is known of the target after it."""
 
     detections: Detections
     number: int

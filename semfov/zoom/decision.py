@@ -21,16 +21,8 @@ from semfov.zoom.lattice import CELLS, Lattice
 from semfov.zoom.networks import features
 
 
-class LookFacts(NamedTuple):
-    """What one look of a search shows of the target.
-
-    Attributes:
-        score: highest score of the target in any hint.
-        closest: the same for a look of the last level; 0 for others.
-        named: highest score of the target in a detection whose best class it is; 0 without one.
-        found: highest score of the target in any detection; 0 without one.
-        box: `(4,)`, box of that detection; None if there is none.
-    """
+class _LookFacts(NamedTuple):
+    """What one look of a search shows of the target; box `(4,)`."""
 
     score: float
     closest: float
@@ -53,18 +45,11 @@ class LookFacts(NamedTuple):
 
 
 class SearchFacts:
-    """What the looks of a search have shown of the target, and what is left to see.
-
-    Args:
-        belief: belief of the search; it is updated with each look before these facts are.
-
-    Attributes:
-        looks: the facts of each look.
-    """
+    """What the looks of a search have shown of the target, and what is left to see."""
 
     def __init__(self, belief: ZoomBelief) -> None:
         self.belief = belief
-        self.looks: list[LookFacts] = []
+        self.looks: list[_LookFacts] = []
 
     def see(self, looks: Sequence[Glance]) -> None:
         """Take the looks that count after another look; those of earlier ones that are missing were forgotten."""
@@ -75,7 +60,7 @@ class SearchFacts:
 
     def add(self, glance: Glance) -> None:
         """Add the facts of a look."""
-        self.looks.append(LookFacts.of(glance, self.belief.target, self.belief.lattice))
+        self.looks.append(_LookFacts.of(glance, self.belief.target, self.belief.lattice))
 
     @property
     def best(self) -> float:
@@ -102,11 +87,7 @@ class SearchFacts:
         the picture, that are still expected to show the target. Then the share of the picture that is left to see. As
         logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
 
-        Args:
-            ahead: value of the best look that is left.
-
-        Returns:
-            `(10,)`.
+        Shapes: → `(10,)`.
         """
         looks = self.looks
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
@@ -124,14 +105,7 @@ class SearchFacts:
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:
-        """Predict whether the picture holds the target.
-
-        Args:
-            ahead: value of the best look that is left.
-
-        Returns:
-            The probability.
-        """
+        """Predict whether the picture holds the target."""
         odds = self.belief.evidence.anywhere(torch.tensor(self.best), self.case(ahead))
         return float(odds.sigmoid())
 
@@ -139,37 +113,17 @@ class SearchFacts:
 CLOSER = 100
 """Default for the largest number of closer looks: as many as there are passes for."""
 
-SCORE = 0.5
+_SCORE = 0.5
 """Default for the score from which on a detection alone counts as found."""
 
-DEFAULTS = Thresholds(0.9, 0.005)
+_DEFAULTS = Thresholds(0.9, 0.005)
 """Thresholds of searches whose evidence has none."""
 
 
 class WindowDecisions:
     """Decides one search by windows, turn by turn, with closer looks where the evidence has fitted verification.
 
-    Args:
-        evidence: learned evidence by magnification.
-        target: class 1..K.
-        close_up: looks closely at a box `(4,)`; gives the detections, a batch of one.
-        confirm: probability from which on the target is found; None takes the threshold of the evidence.
-        give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
-            of the evidence.
-        closer: largest number of closer looks; 0 decides without them.
-        forgetting: forgetting between the frames of a stream; None forgets nothing.
-
-    Attributes:
-        outcome: 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
-
-    Example::
-
-        deciding = WindowDecisions(evidence, target, lambda box: look_closely(glances, box).detections)
-        for number, turn in enumerate(look_for(glances, evidence, target, confirm=math.inf), 1):
-            deciding.see(turn, number, last=turn.ahead == 0)
-            while deciding.candidate is not None:
-                deciding.look()
-        print(deciding.decision(over=True))
+    Shapes: close_up `(4,)`.
     """
 
     def __init__(
@@ -183,7 +137,7 @@ class WindowDecisions:
         closer: int = CLOSER,
         forgetting: Forgetting | None = None,
     ) -> None:
-        self.thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
+        self.thresholds = (evidence.thresholds or _DEFAULTS).changed(give_up=give_up)
         self.verifier: Verifier[WindowLook] | None = None
         model = evidence.verification
         if closer and model is not None and model.thresholds is not None:
@@ -203,13 +157,7 @@ class WindowDecisions:
             self.verifier.wait()
 
     def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
-        """Take in a look, and choose the place that is to be looked at closely.
-
-        Args:
-            turn: the look.
-            number: number of looks so far, closer ones included.
-            last: whether no other look can follow.
-        """
+        """Take in a look, and choose the place that is to be looked at closely."""
         self._facts = self._facts or SearchFacts(turn.belief)
         self._facts.see(turn.looks)
         self._ahead, self._presence = turn.ahead, None
@@ -236,25 +184,14 @@ class WindowDecisions:
         return [] if self.verifier is None else self.verifier.looks
 
     def look(self) -> CloseUp:
-        """Look closely at the candidate, and choose the next one.
-
-        Returns:
-            The closer look.
-        """
+        """Look closely at the candidate, and choose the next one."""
         assert self.verifier is not None
         look = self.verifier.look()
         self.outcome = self.verifier.outcome()
         return look
 
     def decision(self, *, over: bool | None = None) -> Decision:
-        """The decision as it stands.
-
-        Args:
-            over: whether the search is over; None: it is if no look is worth a pass, and no place is left to examine.
-
-        Returns:
-            `found`, `absent` or `undecided`.
-        """
+        """The decision as it stands."""
         assert self._facts is not None
         if self.verifier is not None and self.verifier.looks:
             return self.verifier.decision(over=over)
@@ -264,20 +201,11 @@ class WindowDecisions:
 
 
 def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None = None) -> Decision:
-    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them.
-
-    Args:
-        looks: the looks.
-        target: class 1..K.
-        confirm: score from which on a detection whose best class is the target counts as `found`; None takes 0.5.
-
-    Returns:
-        The decision: `found` or `undecided`, with the highest score.
-    """
+    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
     best, box = 0.0, None
     for detections in (look.detections for look in looks):
         scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
         if len(scores) and float(scores.max()) > best:
             best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
-    found = best >= (SCORE if confirm is None else confirm)
+    found = best >= (_SCORE if confirm is None else confirm)
     return Decision("found" if found else "undecided", best, None, box if found else None)

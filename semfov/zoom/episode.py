@@ -18,14 +18,7 @@ none ends the episode."""
 
 
 class WindowStep(Generic[_Belief]):
-    """One step of an episode: a look, its value when it was chosen, and the belief after it.
-
-    Attributes:
-        glance: result of the look.
-        worth: value of the look when it was chosen.
-        belief: belief after it; None in episodes without one.
-        looks: the looks that count after it, the overview first.
-    """
+    """One step of an episode: a look, its value when it was chosen, and the belief after it."""
 
     def __init__(
         self,
@@ -50,13 +43,7 @@ class WindowStep(Generic[_Belief]):
 
 
 class _Recent(Generic[_Belief]):
-    """The looks of an episode that count, and the belief of them.
-
-    Attributes:
-        looks: the looks, the overview first.
-        windows: their windows.
-        renewed: whether the overview is to be renewed.
-    """
+    """The looks of an episode that count, and the belief of them."""
 
     def __init__(self, belief: _Belief, forgetting: Forgetting | None) -> None:
         self.belief, self.forgetting = belief, forgetting
@@ -171,20 +158,7 @@ def look_for(
     closest: bool = False,
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
-
-    Args:
-        glances: source of looks at the picture.
-        evidence: learned evidence by magnification.
-        target: class 1..K.
-        confirm: score from which on a look confirms the target.
-        slices: windows that can confirm the target; None lets windows of all magnifications confirm it.
-        closest: whether only windows of the last level can confirm it.
-        forgetting: forgetting between the frames of a stream, which never end (`look_by_look`).
-
-    Yields:
-        Each turn.
-    """
+    """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at."""
     belief, last = ZoomBelief(glances.lattice, evidence, target), glances.lattice.levels - 1
     allowed = None if slices is None else set(slices)
 
@@ -209,19 +183,7 @@ def find_everything(
     worth: float = 0.0,
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
-
-    Args:
-        glances: source of looks at the picture.
-        evidence: learned evidence by magnification.
-        target: class 1..K; None for all classes.
-        batch: number of windows that are chosen jointly and looked at together.
-        worth: the exploration ends when no look is expected to find more new objects than this.
-        forgetting: forgetting between the frames of a stream, which never end (`look_by_look`).
-
-    Yields:
-        Each turn; the value of a look is the number of new objects that it is expected to find.
-    """
+    """Look for all objects of a class, or of all classes, look by look, until no look promises enough."""
     belief = ZoomBelief(glances.lattice, evidence, target or 0)
 
     def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:

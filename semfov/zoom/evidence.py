@@ -324,31 +324,14 @@ def _thresholds(record: Mapping[str, float] | None) -> Thresholds | None:
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:
-    """Pool the hints in a window of cells.
-
-    Args:
-        scores: `(rows, columns, K)`, strongest hint of each class in each cell.
-        box: `(x1, y1, x2, y2)` in cells. Cells beyond the map are left out.
-
-    Returns:
-        Strongest hint of each class, `(K,)`, and a summary `(3,)` of all cells: the sum of their strongest hints, the
-        share of cells with a hint, and the number of cells with a hint above 0.02.
-    """
+    """Pool the hints in a window of cells; scores `(rows, columns, K)` → `(K,)`."""
     x1, y1, x2, y2 = box
     cells = scores[max(y1, 0) : y2, max(x1, 0) : x2].flatten(0, 1)
     return cells.amax(0), _summary(cells.amax(-1))
 
 
 def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
-    """Pool the hints in all windows of `span` × `span` cells.
-
-    Args:
-        scores: `(rows, columns, K)`. Along a side shorter than `span` there is one window, as long as the side.
-        span: cells along a side of a window.
-
-    Returns:
-        The results of `pool`, `(N, K)` and `(N, 3)`, for the windows row by row.
-    """
+    """Pool the hints in all windows of `span` × `span` cells; scores `(rows, columns, K)` → `(N, K)`."""
     top, sums = pool_spans(scores, [span])[0]
     return top.flatten(0, 1), sums.flatten(0, 1)
 
@@ -356,12 +339,7 @@ def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
 def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
     """`pool_all` for windows of several sizes; each size is pooled from the next smaller one.
 
-    Args:
-        scores: `(rows, columns, K)`.
-        spans: cells along a side of the windows of each size.
-
-    Returns:
-        For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
+    Shapes: scores `(rows, columns, K)` → `(down, across, K)`.
     """
     best = scores.amax(-1)
     maps = torch.cat([best[None], (best > _levels(scores.dtype, scores.device)).to(best)])

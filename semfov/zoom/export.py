@@ -26,7 +26,7 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import FINEST, Gist
 from semfov.zoom.networks import STEPS
 
-LOOK_METADATA_KEY = "semfov.look"
+_LOOK_METADATA_KEY = "semfov.look"
 
 
 def export_look(
@@ -124,7 +124,7 @@ def export_look(
         ir_version=IR_VERSION,
     )
     metadata = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
-    model.metadata_props.add(key=LOOK_METADATA_KEY, value=json.dumps(metadata))
+    model.metadata_props.add(key=_LOOK_METADATA_KEY, value=json.dumps(metadata))
     checker.check_model(model)
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(model.SerializeToString())

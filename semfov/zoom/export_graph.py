@@ -19,11 +19,7 @@ _DOUBLE, _FLOAT, _INT64, _BOOL = 11, 1, 7, 9  # of onnx.TensorProto
 
 
 class LookGraph(Graph):
-    """ONNX nodes of a look.
-
-    Args:
-        detector: the detector, whose input is the canvas.
-    """
+    """ONNX nodes of a look."""
 
     def __init__(self, detector: Detector) -> None:
         super().__init__()
@@ -51,14 +47,7 @@ class LookGraph(Graph):
     def window(self, picture: str, fixation: str) -> tuple[str, str, str]:
         """Resample a window to the canvas, as `WindowEye` does.
 
-        Args:
-            picture: name of the picture `(H, W, 3)`, bytes.
-            fixation: name of the fixation `(3,)`.
-
-        Returns:
-            Names of the canvas `(1, 3, h, w)`; of the window in the picture and on the canvas, `(8,)`; and of the point
-            where the window would start if it were neither cut nor rounded, with the magnification, `(3,)`. The last
-            two are in double precision.
+        Shapes: picture `(H, W, 3)`, fixation `(3,)` → `(1, 3, h, w)`.
         """
         point = self.add("Cast", fixation, to=_DOUBLE)
         x, y, m = (self.add("Gather", point, self.constant(n)) for n in range(3))
@@ -170,19 +159,7 @@ class LookGraph(Graph):
     def gist(
         self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
-        """Compute the gist of a look, as `semfov.zoom.hints.gist` does.
-
-        Args:
-            hints: names of boxes in picture pixels and of score vectors.
-            detections: names of boxes and of score vectors.
-            start: name of the start of the window, from `window`.
-            cells: c, number of cells along a side of the window.
-            classes: K.
-
-        Returns:
-            Names of the strongest hint of each class `(c, c, K)`, of the size `(c, c)` and of the classes that are
-            found `(c, c, K)`.
-        """
+        """Compute the gist of a look, as `semfov.zoom.hints.gist` does; → `(c, c, K)`."""
         boxes, vectors = hints
         at, scores, best = self._cells(boxes, start, cells), self._scores(vectors), self._best(vectors)
         nothing = self.constant(torch.zeros(cells * cells, classes))

@@ -20,7 +20,7 @@ from semfov.zoom.hints import Hints, hints_of
 from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
-Limit = tuple[float, float, float, float]
+_Limit = tuple[float, float, float, float]
 _Frame = tuple[int, int, int, int, int, int, int, int]
 """`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
 
@@ -48,14 +48,7 @@ class WindowView:
 
 @dataclass(frozen=True)
 class WindowLooks:
-    """The result of several looks.
-
-    Attributes:
-        detections: a batch of F, boxes in picture pixels.
-        cut: `(F, L)`, boolean, true where the border of the window cuts the box.
-        hints: hints of each look, F, boxes in picture pixels; None where they were not asked for.
-        windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
-    """
+    """The result of several looks; cut `(F, L)`, windows `(F, 4)`."""
 
     detections: Detections
     cut: Tensor
@@ -124,7 +117,7 @@ class WindowEye(nn.Module):
         return self.glance(view, fixations).detections
 
     def glance(
-        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
+        self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None, *, hints: bool = True
     ) -> WindowLooks:
         """Look at a picture and return hints too.
 
@@ -161,7 +154,7 @@ class WindowEye(nn.Module):
         return WindowLooks(detections, cut, tuple(placed), windows)
 
     def glimpse(
-        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None = None
+        self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Resample windows without detecting in them.
 
@@ -181,7 +174,7 @@ class WindowEye(nn.Module):
         return _unit(canvases), torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)
 
     def _resample(
-        self, view: WindowView, fixations: Tensor, within: Sequence[Limit | None] | None
+        self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None
     ) -> tuple[Tensor, list[_Frame]]:
         """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames; the canvases are bytes if the padding is a byte."""
         if fixations.shape[-1] == 2:
@@ -200,7 +193,7 @@ class WindowEye(nn.Module):
         return canvases[0] if len(canvases) == 1 else torch.cat(canvases), [frame for _, frame in pairs]
 
     def _show(
-        self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None
+        self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: _Limit | None
     ) -> tuple[Tensor, _Frame]:
         """One canvas `(1, 3, h, w)` of the dtype of `blank`, a pixel of padding, and its frame."""
         wide, high = self.detector.input_size
@@ -262,20 +255,7 @@ def _unit(canvases: Tensor) -> Tensor:
 def _window_pixels(
     point: float, magnification: float, count: int, length: int, low: float, high: float, step: int
 ) -> tuple[int, int, int, int]:
-    """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas.
-
-    Args:
-        point: centre of the window.
-        magnification: canvas pixels per picture pixel.
-        count: length of the canvas.
-        length: length of the picture.
-        low: lower limit of the part of the picture that is shown.
-        high: its upper limit.
-        step: edges of the window are multiples of it.
-
-    Returns:
-        Whole edges between pixels: two in the picture and two on the canvas.
-    """
+    """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas."""
     start, stop = edges_at(point, magnification, float(count))
     start, stop = step * round(start / step), step * round(stop / step)
     low, high = round(max(low, 0.0)), round(min(high, length))
@@ -286,13 +266,7 @@ def _window_pixels(
 
 
 class _Placement:
-    """Maps boxes from the canvases of several looks to the picture.
-
-    Args:
-        frames: frame of each look, from `WindowEye.glimpse`.
-        size: `(width, height)` of the picture.
-        like: boxes that have the dtype and device to compute in.
-    """
+    """Maps boxes from the canvases of several looks to the picture; size `(width, height)`."""
 
     def __init__(self, frames: Sequence[_Frame], size: tuple[int, int], like: Tensor) -> None:
         wide, high = size

@@ -16,15 +16,7 @@ from semfov.zoom.lattice import Lattice
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a picture: where to look, and how closely.
-
-    Attributes:
-        fixation: `(x, y, magnification)`.
-        level: level of the lattice. A window that is not on the lattice has the level of the nearest magnification.
-        cells: `(x1, y1, x2, y2)`, the cells of the lattice that it shows.
-        within: `(x1, y1, x2, y2)` in picture pixels, the part of the picture that it shows; None for all that fits the
-            canvas.
-    """
+    """A window of a picture: where to look, and how closely."""
 
     fixation: tuple[float, float, float]
     level: int
@@ -32,14 +24,7 @@ class Window:
     within: tuple[float, float, float, float] | None = None
 
     def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
-        """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels.
-
-        Args:
-            lattice: lattice of the picture.
-
-        Returns:
-            The part.
-        """
+        """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels."""
         if self.within is not None:
             return self.within
         (x, y, magnification), (wide, high), (width, height) = self.fixation, lattice.canvas, lattice.size
@@ -51,12 +36,6 @@ class Window:
         """Centre of the part of the picture that it shows, `(x, y)` in pixels whose centres are at integers.
 
         It is not the centre of a window that reaches beyond the picture, as the overview does.
-
-        Args:
-            lattice: lattice of the picture.
-
-        Returns:
-            The point.
         """
         x1, y1, x2, y2 = self.region(lattice)
         return (x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2
@@ -64,16 +43,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Glance:
-    """The result of a look at a window.
-
-    Attributes:
-        window: the window.
-        detections: a batch of one, boxes in picture pixels.
-        cut: `(L,)`, boolean, true where the border of the window cuts the box.
-        show: `(K,)`, highest score of each class in any hint; in any detection where hints were not asked for
-            (`Glances.see`).
-        gist: strongest hints in each cell; None for windows of the last level, which cannot be looked at more closely.
-    """
+    """The result of a look at a window; cut `(L,)`, show `(K,)`."""
 
     window: Window
     detections: Detections
@@ -117,48 +87,24 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
 
 
 class Glances(ABC):
-    """Base of sources of looks at one picture: live ones, and stored ones.
-
-    Attributes:
-        lattice: the lattice of the picture.
-        frame: number of the frame of a stream that looks show; 0 for a picture.
-    """
+    """Base of sources of looks at one picture: live ones, and stored ones."""
 
     lattice: Lattice
     frame: int = 0
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
-        """Look at windows, in one batch where that is possible.
-
-        Args:
-            windows: the windows.
-            hints: whether hints are needed in windows of the last level, too. Nothing can be looked at more closely
-                there, so explorations do without.
-
-        Returns:
-            The result of each look.
-        """
+        """Look at windows, in one batch where that is possible."""
 
 
 class LiveGlances(Glances):
-    """Looks of an eye at a picture.
-
-    Args:
-        eye: resamples windows and detects in them.
-        view: the picture, from `WindowEye.open`.
-    """
+    """Looks of an eye at a picture."""
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
 
     def show(self, view: WindowView, frame: int) -> None:
-        """Take the next frame of a stream, which has the size of the first.
-
-        Args:
-            view: the frame, from `WindowEye.open`.
-            frame: its number.
-        """
+        """Take the next frame of a stream, which has the size of the first."""
         self.view, self.frame = view, frame
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:

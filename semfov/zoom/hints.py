@@ -25,9 +25,7 @@ DETECTION_SCORE = 0.1
 class Hints:
     """The hints of one look: boxes with class scores, in no order; several may be of one object.
 
-    Attributes:
-        boxes: `(N, 4)`, `(x1, y1, x2, y2)`.
-        scores: `(N, K)`, score of each class, without background.
+    Shapes: boxes `(N, 4)`, scores `(N, K)`.
     """
 
     boxes: Tensor
@@ -36,18 +34,6 @@ class Hints:
 
 def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float = FAINT) -> Hints:
     """Take the hints from all boxes of a detector's head.
-
-    Args:
-        candidates: the boxes, in canvas pixels.
-        image: index of the image in the batch.
-        policy: background policy of the scores.
-        faint: confidence from which on a candidate is a hint.
-
-    Returns:
-        The hints, in canvas pixels, without gradients.
-
-    Raises:
-        InputError: the detector returned numbers that are not finite, or scores outside [0, 1].
 
     >>> import torch
     >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.001], [0.01], [0.9]]]))
@@ -71,15 +57,7 @@ class Gist:
     The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
     form one cell of the gist.
 
-    Attributes:
-        level: level of the window.
-        first: `(column, row)` of the window's first cell on the lattice.
-        scale: number of lattice cells along a side of a cell of the gist.
-        scores: `(rows, columns, K)`, highest score of each class among hints whose centre lies in the cell; 0 without
-            hints.
-        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint; 0 without
-            hints.
-        found: `(rows, columns, K)`, boolean, classes of detections whose centre lies in the cell.
+    Shapes: first `(column, row)`, scores `(rows, columns, K)`, size `(rows, columns)`, found `(rows, columns, K)`.
     """
 
     level: int
@@ -96,17 +74,7 @@ class Gist:
 
 
 def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
-    """Compute the gist of a look at a window of the lattice.
-
-    Args:
-        hints: hints of the look, in picture pixels.
-        detections: detections of the look, a batch of one without padding, likewise.
-        lattice: lattice of the picture.
-        action: `(level, column, row)` of the window.
-
-    Returns:
-        The gist.
-    """
+    """Compute the gist of a look at a window of the lattice; action `(level, column, row)`."""
     level, column, row = action
     span = lattice.span(level)
     scale = max(1, span // FINEST)

@@ -35,15 +35,8 @@ def features(scores: Tensor) -> Tensor:
 def hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
     """List the maps of one look: hints, detections and sizes of objects in and around each cell.
 
-    Args:
-        own: `(T, rows, columns)`, features of the strongest hint of each target.
-        best: `(rows, columns)`, the same of any class.
-        detections: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
-        size: `(rows, columns)`, as in `semfov.zoom.hints.Gist`.
-        crowd: `(rows, columns)`, means of `best` over the square of `CROWD` cells about each cell.
-
-    Returns:
-        Eleven maps `(T, rows, columns)`.
+    Shapes: own `(T, rows, columns)`, best `(rows, columns)`, detections `(T, rows, columns)`, size `(rows, columns)`,
+    crowd `(rows, columns)` → `(T, rows, columns)`.
     """
 
     def wide(values: Tensor) -> Tensor:
@@ -154,14 +147,7 @@ class Survey(nn.Module):
     def rates(self, look: Gist, targets: Tensor | None = None, before: Tensor | None = None) -> Tensor:
         """Predict how many objects centred in each cell closer looks find that this look did not.
 
-        Args:
-            look: the look.
-            targets: `(1,)`, 0 for any class; there is no other.
-            before: `(1, rows, columns)`, logarithms of the rates that an earlier, coarser look gave for looks one
-                octave closer than this one; None for a first look.
-
-        Returns:
-            `(1, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
+        Shapes: targets `(1,)`, before `(1, rows, columns)` → `(1, 3, rows, columns)`.
         """
         hints, best = features(look.scores), features(look.best)
         # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
@@ -177,14 +163,7 @@ class Survey(nn.Module):
         return value.clamp(max=3).movedim(-1, 0)[None]
 
     def taper(self, span: int) -> Tensor:
-        """Weights r of the cells along a side of a window; objects at its border are cut.
-
-        Args:
-            span: number of cells along the side.
-
-        Returns:
-            `(span,)`, from 0 to 1.
-        """
+        """Weights r of the cells along a side of a window; objects at its border are cut; → `(span,)`."""
         return tapered(self.border, span)
 
 

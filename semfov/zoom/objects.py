@@ -24,13 +24,6 @@ def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance
 
     What moves would otherwise be shown at every place where a look saw it. A box counts as shown if it lies in the
     window with half its size around it, as far as the picture reaches.
-
-    Args:
-        glances: looks at frames, in their order.
-        lattice: lattice of the frames.
-
-    Returns:
-        The looks with the detections that no later window of at least the same magnification has shown.
     """
     current = []
     for number, glance in enumerate(glances):
@@ -95,15 +88,6 @@ def merge_with_facts(
 
     A cut box is the same object as one of another look from half of its area on, and the box of an object is the mean
     over the looks that show it (`fused`), except in a stream.
-
-    Args:
-        glances: looks at one picture.
-        lattice: lattice of the picture.
-        target: as for `merge`.
-        latest: whether a look no longer counts where a later one shows the same as closely (a stream).
-
-    Returns:
-        Objects, the highest scores first, and their facts (`semfov.zoom.certainty.object_facts`).
     """
     if not glances:
         return Objects.none(), torch.zeros(0, len(FACTS))
@@ -173,21 +157,7 @@ def probable_objects(
     promised: float = 0.0,
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float]]:
-    """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown.
-
-    Args:
-        glances: looks at one picture, the overview first.
-        lattice: lattice of the picture.
-        target: as for `merge`.
-        certainty: predicts the probabilities.
-        remaining: numbers of objects that looks are still expected to find (`ZoomBelief.remaining`).
-        promised: number of objects that the looks after the first were expected to find.
-        latest: as for `merge_with_facts`.
-
-    Returns:
-        Objects, the most probable first, and the number of objects that further looks are expected to show, with its
-        variance.
-    """
+    """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown."""
     objects = _probable(*merge_with_facts(glances, lattice, target, latest=latest), certainty)
     before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)

@@ -21,14 +21,7 @@ _UNKNOWN = -4.0
 
 @dataclass
 class _Table:
-    """The windows of a level that lie in a look.
-
-    Attributes:
-        span: number of cells of the gist along a side of a window.
-        shape: `(down, across)`, number of windows.
-        rows: their rows in the arrays of the look.
-        places: `(down * across,)`, index of each in an array of all windows of the level.
-    """
+    """The windows of a level that lie in a look; shape `(down, across)`, places `(down * across,)`."""
 
     span: int
     shape: tuple[int, int]
@@ -46,15 +39,7 @@ class _Table:
 
 
 class _Pooled(NamedTuple):
-    """Pooled hints of windows of one level in a look.
-
-    Attributes:
-        step: octaves between the look and the windows.
-        scores: `(n, K)`, from `pool_all`.
-        summary: `(n, 3)`, from `pool_all`.
-        facts: their place in the facts of the look.
-        stale: their place in `stale` of the look.
-    """
+    """Pooled hints of windows of one level in a look; scores `(n, K)`, summary `(n, 3)`."""
 
     step: int
     scores: Tensor
@@ -66,21 +51,8 @@ class _Pooled(NamedTuple):
 class _Look:
     """A look and its predictions for N windows: those of up to three closer levels that lie in it.
 
-    Args:
-        gist: gist of the look.
-        lattice: lattice of the picture.
-
-    Attributes:
-        box: the cells of the lattice that it shows, `(x1, y1, x2, y2)`.
-        fresh: whether nothing was predicted from it yet.
-        left: `(rows, columns)`, share of each cell that is left to see.
-        scores: `(rows, columns, K)`, those of the gist.
-        visible: `(rows, columns, K)`, scores times the share that is left to see.
-        tables: the windows of each level.
-        facts: `(N, 6)`, `GlimpseEvidence.hint_facts`.
-        before: `(N,)`, log odds from coarser looks.
-        odds: `(N,)`, log odds from this look.
-        stale: `(N,)`, whether the log odds are to be computed anew.
+    Shapes: left `(rows, columns)`, scores `(rows, columns, K)`, visible `(rows, columns, K)`, facts `(N, 6)`, before
+    `(N,)`, odds `(N,)`, stale `(N,)`.
     """
 
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
@@ -109,14 +81,7 @@ class _Look:
         self.stale = np.ones(count, np.bool_)
 
     def pool(self, left: Cells) -> Iterator[_Pooled]:
-        """Pool the hints that are left to see, in the windows where they have changed.
-
-        Args:
-            left: share of each cell of the lattice that is left to see.
-
-        Yields:
-            The hints of the windows of each level, the coarsest first.
-        """
+        """Pool the hints that are left to see, in the windows where they have changed."""
         before = self.left
         self.left = self._left_of(left)
         if self.fresh:

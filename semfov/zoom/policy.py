@@ -43,14 +43,6 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
 
     The value of a window is the probability that it shows the target. For windows that can be looked at more closely it
     is the sum of these probabilities over the closer windows in it, divided by `patience`, if that is larger.
-
-    Args:
-        belief: belief about the target.
-        done: windows that were looked at.
-        closest: whether only windows of the last level can confirm the target.
-
-    Returns:
-        The window and its value; None if no window can show the target.
     """
     lattice, patience = belief.lattice, belief.evidence.patience
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
@@ -70,8 +62,7 @@ def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells
 
     Closer windows whose middle was looked at from this level already count as 0.
 
-    Returns:
-        `(down, across)`; where several levels are closer, the largest of their sums.
+    Shapes: → `(down, across)`.
     """
     lattice, source = belief.lattice, belief.source.numpy()
     down, across = lattice.places(level)[::-1]
@@ -148,17 +139,7 @@ def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
 def jointly(
     choose: Callable[[set[Window]], WindowChoice | None], belief: ZoomBelief, done: set[Window], count: int
 ) -> list[WindowChoice]:
-    """Choose several windows to look at together, each as if the windows before it had been looked at.
-
-    Args:
-        choose: policy that returns the next window, given the windows that were looked at.
-        belief: belief that the policy uses. It is changed for the choice and set back afterwards.
-        done: windows that were looked at.
-        count: largest number of windows.
-
-    Returns:
-        The windows and their values.
-    """
+    """Choose several windows to look at together, each as if the windows before it had been looked at."""
     if count == 1:
         choice = choose(done)
         return [] if choice is None else [choice]

@@ -9,20 +9,12 @@ from semfov.zoom.glances import Glance, Window, around
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
 
-OVERLAP = 0.2
+_OVERLAP = 0.2
 """Share of a slice by which neighbours overlap."""
 
 
 def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
     """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them.
-
-    Args:
-        lattice: lattice of the picture.
-        side: side of a slice in pixels of the picture.
-        overlap: share of a slice by which neighbours overlap.
-
-    Returns:
-        The slices.
 
     >>> [window.within for window in slices(Lattice.over((900, 400), (416, 416)), 500, 0.2)]
     [(0.0, 0.0, 500.0, 400.0), (400.0, 0.0, 900.0, 400.0)]
@@ -74,32 +66,17 @@ def usual_slices(lattice: Lattice) -> list[Window]:
     In a picture that is not four times as long as the canvas they have the largest magnification itself. A picture that
     the overview shows at it has none.
 
-    Args:
-        lattice: lattice of the picture.
-
-    Returns:
-        The slices, row by row.
-
     >>> [len(usual_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1200, 900), (640, 480))]
     [28, 6, 0]
     """
     if lattice.levels == 1:
         return []
     wider = 1.5 if lattice.levels > 2 else 1.0
-    return slices(lattice, round(wider * min(lattice.canvas) / lattice.magnifications[-1]), OVERLAP)
+    return slices(lattice, round(wider * min(lattice.canvas) / lattice.magnifications[-1]), _OVERLAP)
 
 
 def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:
-    """The windows in descending order of the overview's raw scores in them.
-
-    Args:
-        windows: windows to look at.
-        targets: classes 1..K; none: any class.
-        most: rank a window by its highest score; false: by the sum of its scores.
-
-    Returns:
-        The order.
-    """
+    """The windows in descending order of the overview's raw scores in them."""
     ranking: list[WindowChoice] = []
     ranked_by: Glance | None = None
 
@@ -116,17 +93,7 @@ def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool
 
 
 def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
-    """Value of a window by the raw scores of a coarser look: their sum, or the highest, over the cells of the window.
-
-    Args:
-        glance: the coarser look.
-        window: the window.
-        targets: classes 1..K; none: any class.
-        most: whether the highest score counts, and not the sum.
-
-    Returns:
-        The value; 0 where the look shows nothing of the window.
-    """
+    """Value of a window by the raw scores of a coarser look: their sum, or the highest, over its cells."""
     look = glance.gist
     assert look is not None
     x1, y1, x2, y2 = window.cells

@@ -80,14 +80,10 @@ def union(box: Box, other: Box | None) -> Box:
 def extent(marked: NDArray[np.bool_]) -> Box:
     """Find the smallest box that contains all marked cells.
 
-    Args:
-        marked: `(rows, columns)`; at least one cell is marked.
-
-    Returns:
-        The box.
-
     >>> extent(np.array([[False, True, True], [False, False, True]]))
     (1, 0, 3, 2)
+
+    Shapes: marked `(rows, columns)`.
     """
     rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

@@ -9,7 +9,7 @@ import pytest
 
 import semfov
 from semfov.cli import agent, live, search, start
-from semfov.cli.main import SUBCOMMANDS, main
+from semfov.cli.main import _SUBCOMMANDS, main
 from semfov.errors import InputError
 from semfov.runs.command import make_parser
 
@@ -99,12 +99,12 @@ def test_wrong_use_is_refused_in_one_line_with_exit_code_2(command, tmp_path, ca
 def test_alone_it_lists_its_commands(words, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
-    assert all(re.search(rf"^  {name} ", printed, re.M) for name in SUBCOMMANDS)
+    assert all(re.search(rf"^  {name} ", printed, re.M) for name in _SUBCOMMANDS)
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"semfov {semfov.__version__}\n"
 
 
-@pytest.mark.parametrize("name", SUBCOMMANDS)
+@pytest.mark.parametrize("name", _SUBCOMMANDS)
 def test_help_is_one_screen_with_options_that_exist(name, capsys):
     """Its examples come first, and --help-all lists every option of the short help."""
     assert main([name, "--help"]) == 0
@@ -121,7 +121,7 @@ def test_help_is_one_screen_with_options_that_exist(name, capsys):
 
 
 def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
-    command = SUBCOMMANDS["search"]
+    command = _SUBCOMMANDS["search"]
     for words in (["--give-up", "0.2"], ["--give_up=0.2"], ["--give-up=0.2"]):
         with pytest.raises(SystemExit) as stopped:
             main(["search", *words, "--print-config"])

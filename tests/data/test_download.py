@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from semfov.data import download
-from semfov.data.download import SPLITS, Archive, download_coco, fetch_archive, fetch_split, main, unpack_members
+from semfov.data.download import _SPLITS, _Archive, _download_coco, _fetch_archive, fetch_split, main, unpack_members
 from semfov.errors import DataError, InputError
 
 NAMES = [f"{n:012d}.jpg" for n in (139, 285, 632)]
@@ -35,7 +35,7 @@ FILES = {
         {"annotations/instances_val2017.json": INSTANCES, "annotations/captions_val2017.json": "{}"}
     ),
 }
-ARCHIVES = {p: Archive(p.lstrip("/"), len(data), hashlib.sha256(data).hexdigest()) for p, data in FILES.items()}
+ARCHIVES = {p: _Archive(p.lstrip("/"), len(data), hashlib.sha256(data).hexdigest()) for p, data in FILES.items()}
 IMAGES, ANNOTATIONS = ARCHIVES.values()
 
 
@@ -132,17 +132,17 @@ def test_a_later_run_resumes_the_transfer(server, tmp_path):
     server.stop_after = 0
     (tmp_path / "val2017.zip.part").write_bytes(FILES["/zips/val2017.zip"][:70_000])
     with pytest.raises(DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"):
-        fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
+        _fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
     assert (tmp_path / "val2017.zip.part").stat().st_size == 70_000
     server.stop_after = None
-    assert fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+    assert _fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
     assert server.requests[-1][1] == 70_000
 
 
 def test_a_server_without_range_requests_sends_the_whole_file(server, tmp_path):
     server.ranges = False
     (tmp_path / "val2017.zip.part").write_bytes(b"x" * 70_000)
-    assert fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+    assert _fetch_archive(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
 
 
 def test_changed_content_is_refused_and_deleted(server, tmp_path):
@@ -150,22 +150,22 @@ def test_changed_content_is_refused_and_deleted(server, tmp_path):
     data[1000] ^= 1
     server.files["/zips/val2017.zip"] = bytes(data)
     with pytest.raises(DataError, match=f"expected sha256 {IMAGES.sha256}, got .*; it was deleted; run again"):
-        fetch_archive(IMAGES, tmp_path, address=server.address)
+        _fetch_archive(IMAGES, tmp_path, address=server.address)
     assert tree(tmp_path) == []
 
 
 def test_a_file_of_another_size_is_refused(server, tmp_path):
     server.files["/zips/val2017.zip"] += b"more"
     with pytest.raises(DataError, match=r"expected [\d,]+ bytes, the server has"):
-        fetch_archive(IMAGES, tmp_path, address=server.address)
+        _fetch_archive(IMAGES, tmp_path, address=server.address)
 
 
 def test_a_busy_server_is_asked_again_and_a_missing_file_is_an_error(server, tmp_path):
     with pytest.raises(DataError, match=r"/elsewhere/zips/val2017\.zip: the server answers 404"):
-        fetch_archive(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
+        _fetch_archive(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
     server.status = 503
     with pytest.raises(DataError, match="transfer failed at 0"):
-        fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
+        _fetch_archive(IMAGES, tmp_path, address=server.address, pause=0)
     assert len(server.requests) == 4  # one request for a missing file, several to a busy server
 
 
@@ -275,7 +275,7 @@ def test_a_disk_that_fills_up_is_an_error_and_a_later_run_completes(server, tmp_
 
 
 def test_the_program_downloads_and_reports_errors(server, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(SPLITS, "val2017", IMAGES)
+    monkeypatch.setitem(_SPLITS, "val2017", IMAGES)
     monkeypatch.setattr(download, "_ANNOTATIONS", ANNOTATIONS)
     assert main(["val2017", "--root", str(tmp_path), "--address", server.address]) == 0
     assert f"data.root: {tmp_path / 'val2017'}" in capsys.readouterr().out
@@ -295,8 +295,8 @@ def test_an_interrupted_program_says_how_to_resume(tmp_path, monkeypatch, capsys
 
 def test_bad_arguments(tmp_path):
     with pytest.raises(InputError, match="unknown split 'val2071'; did you mean 'val2017'"):
-        download_coco("val2071", tmp_path)
+        _download_coco("val2071", tmp_path)
     with pytest.raises(InputError, match="address"):
-        download_coco("val2017", tmp_path, address="file:///tmp")
+        _download_coco("val2017", tmp_path, address="file:///tmp")
     with pytest.raises(SystemExit):
         main(["val2017"])

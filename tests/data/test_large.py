@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from semfov.data.images import read_image
-from semfov.data.large import ArrayPicture, MemoryPicture, TiffPicture, open_large
+from semfov.data.large import _ArrayPicture, _MemoryPicture, _TiffPicture, open_large
 from semfov.errors import DataError, InputError
 
 
@@ -66,7 +66,7 @@ def test_windows_of_a_memory_mapped_file_need_little_memory(tmp_path):
     side = 6000
     mapped = np.lib.format.open_memmap(tmp_path / "large.npy", mode="w+", dtype=np.uint8, shape=(side, side, 3))
     mapped[2000:2100, 3000:3100] = 200
-    picture = ArrayPicture(mapped)
+    picture = _ArrayPicture(mapped)
     tracemalloc.start()
     window = picture.read((2900, 1900, 3316, 2316))
     overview = picture.read((0, 0, side, side), 8)
@@ -83,7 +83,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     array[1000:1100, 2000:2100] = 77
     tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
     del array
-    picture = TiffPicture(tmp_path / "large.tif")
+    picture = _TiffPicture(tmp_path / "large.tif")
     tracemalloc.start()
     window = picture.read((1900, 900, 2316, 1316))
     peak = tracemalloc.get_traced_memory()[1]
@@ -110,7 +110,7 @@ def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
     with pytest.raises(InputError, match="picture: expected bytes, 16-bit numbers or floats"):
         open_large(np.zeros((4, 4, 3), np.int64))
     with pytest.raises(InputError, match="box: expected a window inside 4 × 4 pixels"):
-        MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
+        _MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
 
 
 def test_truncated_files_are_refused(tmp_path):
@@ -167,4 +167,4 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
     monkeypatch.setitem(sys.modules, "tifffile", None)
     assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)
     with pytest.raises(DataError, match="pip install tifffile"):
-        TiffPicture(tmp_path / "a.tif")
+        _TiffPicture(tmp_path / "a.tif")

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 from torch.nn import functional
 
-from semfov.data.large import ArrayPicture, TiffPicture
+from semfov.data.large import _ArrayPicture, _TiffPicture
 from semfov.data.reduction import ReducedCopies, resized
 from tests.data.test_large import pixels
 
@@ -53,7 +53,7 @@ def test_a_copy_made_in_strips_equals_the_whole_picture_reduced(strips):
 def test_windows_of_copies_show_the_place_they_are_of(strips, shape):
     """Also where the sides of the picture are no multiples of the reduction."""
     height, width = shape
-    picture = ArrayPicture(ramps(height, width))
+    picture = _ArrayPicture(ramps(height, width))
     assert picture.reduction(10.0) == 4
     for x1, y1, x2, y2 in ((0, 0, width // 8 * 8, height // 8 * 8), (16, 8, 80, 72)):
         window = picture.read((x1, y1, x2, y2), 8)
@@ -66,7 +66,7 @@ def test_windows_of_copies_show_the_place_they_are_of(strips, shape):
 @pytest.mark.parametrize("size", [(2, 4000), (4000, 2), (1, 9000)])
 def test_thin_pictures_have_copies(strips, size):
     width, height = size
-    picture = ArrayPicture(np.full((height, width, 3), 9, np.uint8))
+    picture = _ArrayPicture(np.full((height, width, 3), 9, np.uint8))
     window = picture.read((0, 0, width, height), 8)
     assert window.shape == (3, max(1, height // 8), max(1, width // 8))
     assert bool((window == 9).all())
@@ -87,7 +87,7 @@ def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
 
 
 def test_small_pictures_and_fine_windows_are_read_as_they_are(strips):
-    small, large = ArrayPicture(pixels(60, 70)), ArrayPicture(pixels(128, 192))
+    small, large = _ArrayPicture(pixels(60, 70)), _ArrayPicture(pixels(128, 192))
     assert [small.reduction(ratio) for ratio in (1, 9, 40)] == [1, 1, 1]
     assert [large.reduction(ratio) for ratio in (0.3, 1, 4, 5.9, 6, 17, 40)] == [1, 1, 1, 1, 4, 8, 16]
     assert small.read((0, 0, 70, 60), 4).shape == (3, 60, 70)
@@ -99,7 +99,7 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)
-    assert torch.equal(TiffPicture(tmp_path / "a.tif").read(box, 8), ArrayPicture(array).read(box, 8))
+    assert torch.equal(_TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
 
 
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):
@@ -107,7 +107,7 @@ def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatc
     monkeypatch.setattr("semfov.data.reduction.LARGEST", 1600)
     array, rows = pixels(256, 384), []
 
-    class Counting(ArrayPicture):
+    class Counting(_ArrayPicture):
         def pixels(self, box):
             rows.append(box[3] - box[1])
             return super().pixels(box)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from semfov.data import EmbeddedScenes
 from semfov.data import scenes as module
-from semfov.data.scenes import DISTRACTORS, PHOTOGRAPHED_OBJECTS, TEXTURES
+from semfov.data.scenes import _DISTRACTORS, _PHOTOGRAPHED_OBJECTS, _TEXTURES
 from semfov.errors import DataError, InputError
 
 CLASSES = ("person", "motorbike", "cat", "cup")
@@ -96,7 +96,7 @@ def test_patches_show_their_photographs(scenes):
 
 
 def test_boxes_lie_in_their_crops():
-    for photograph in PHOTOGRAPHED_OBJECTS + DISTRACTORS:
+    for photograph in _PHOTOGRAPHED_OBJECTS + _DISTRACTORS:
         left, top, right, bottom = photograph.crop
         with Image.open(module._path(photograph.package, photograph.file)) as image:
             assert 0 <= left < right <= image.width
@@ -111,9 +111,9 @@ def test_photographs_are_files_of_the_installed_packages():
     from importlib.metadata import files
 
     carried = {str(f) for name in ("scikit-image", "matplotlib") for f in files(name)}
-    for photograph in PHOTOGRAPHED_OBJECTS + DISTRACTORS:
+    for photograph in _PHOTOGRAPHED_OBJECTS + _DISTRACTORS:
         assert f"{photograph.package}/{module._FOLDERS[photograph.package]}/{photograph.file}" in carried
-    assert all(f"skimage/data/{texture}" in carried for texture in TEXTURES)
+    assert all(f"skimage/data/{texture}" in carried for texture in _TEXTURES)
 
 
 @pytest.mark.slow

@@ -132,7 +132,7 @@ def test_closer_looks_survive_a_file(image, tmp_path):
 
 
 def test_the_picture_and_the_page_show_closer_looks(image):
-    from semfov.report.episode import about_data
+    from semfov.report.episode import _about_data
     from semfov.viz import plot_scanpath
 
     scanpath = agent(Scripted((cells(c11=0.9, rest=0.05), 0.95)), Fine()).search(image, "green", start=11)
@@ -142,7 +142,7 @@ def test_the_picture_and_the_page_show_closer_looks(image):
     assert "not confirmed by a closer look" in texts
     x, y = scanpath.closer[0].box[:2].tolist()
     assert (pytest.approx(x), pytest.approx(y)) in [patch.get_xy() for patch in axes.patches]
-    assert "Closer look at column 3, row 2: probability 0." in about_data(scanpath, None)["decision"]
+    assert "Closer look at column 3, row 2: probability 0." in _about_data(scanpath, None)["decision"]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from semfov.detection.darknet import Darknet, read_weights
-from semfov.detection.darknet_config import parse_cfg, read_cfg
+from semfov.detection.darknet_config import _parse_cfg, read_cfg
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, InputError, SemfovError
@@ -44,7 +44,7 @@ def test_too_large_networks_are_refused_before_memory_is_allocated(cfg):
     tracemalloc.start()
     try:
         with pytest.raises(DataError) as caught:
-            Darknet(parse_cfg(cfg))
+            Darknet(_parse_cfg(cfg))
         assert "\n" not in str(caught.value)
         assert len(str(caught.value)) < 400
         assert tracemalloc.get_traced_memory()[1] < 2**26
@@ -58,7 +58,7 @@ def test_pipes_and_too_long_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="at most"):
         read_cfg(path)
     os.mkfifo(tmp_path / "pipe")
-    network = Darknet(parse_cfg(NET + HEAD))
+    network = Darknet(_parse_cfg(NET + HEAD))
     for read in (read_cfg, lambda path: read_weights(network, path), OnnxSession):
         with pytest.raises(DataError, match="expected a file, got a pipe"):
             read(tmp_path / "pipe")
@@ -150,5 +150,5 @@ def test_invalid_or_excessive_metadata_is_refused_in_one_line(tmp_path, metadata
 
 def test_an_ordinary_network_is_accepted(tmp_path):
     with torch.random.fork_rng(devices=[]):
-        network = Darknet(parse_cfg(NET + HEAD))
+        network = Darknet(_parse_cfg(NET + HEAD))
     assert [tuple(each.shape) for each in network(torch.zeros(1, 3, 32, 32))] == [(1, 7, 32, 32)]

@@ -11,7 +11,7 @@ import torch
 from torch.nn import functional as F
 
 from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, read_weights
-from semfov.detection.darknet_config import ARCHITECTURES, Section, parse_cfg, read_cfg, yolov3, yolov3_tiny
+from semfov.detection.darknet_config import ARCHITECTURES, Section, _parse_cfg, _yolov3_tiny, read_cfg, yolov3
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import DataError, InputError
 
@@ -93,7 +93,7 @@ def test_small_network_equals_the_plain_implementation(small_cfg, write_weights,
 
 @pytest.mark.weights
 def test_published_yolov3_tiny_equals_the_plain_implementation(tiny_weights):
-    sections = yolov3_tiny()
+    sections = _yolov3_tiny()
     lines = [f"[{s.kind}]\n" + "".join(f"{key}={value}\n" for key, value in s.options.items()) for s in sections]
     network = Darknet(sections).eval().requires_grad_(False)
     read_weights(network, tiny_weights)
@@ -172,13 +172,13 @@ MAPS = "[convolutional]\nfilters=6\nactivation=linear\n"
 )
 def test_refuses_invalid_cfgs_with_an_error_of_one_line(text, message):
     with pytest.raises(DataError) as caught:
-        Darknet(parse_cfg(text))
+        Darknet(_parse_cfg(text))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_dropout_is_ignored():
-    sections = parse_cfg(NET + "[dropout]\nprobability=.5\n" + MAPS + YOLO)
+    sections = _parse_cfg(NET + "[dropout]\nprobability=.5\n" + MAPS + YOLO)
     network, plain = Darknet(sections), Darknet([s for s in sections if s.kind != "dropout"])
     network.layers[1].load_state_dict(plain.layers[0].state_dict())
     image = torch.rand(1, 3, 4, 4)
@@ -187,7 +187,7 @@ def test_dropout_is_ignored():
 
 def test_mask_defaults_to_all_anchors():
     section = Section("yolo", {"anchors": "1,2, 3,4", "classes": "1"})
-    network = Darknet([*parse_cfg(NET + MAPS.replace("6", "12")), section])
+    network = Darknet([*_parse_cfg(NET + MAPS.replace("6", "12")), section])
     assert network.heads[0].anchors == ((1.0, 2.0), (3.0, 4.0))
 
 
@@ -257,7 +257,7 @@ def test_maxpool_equals_darknets(shape, size, stride, padding):
 
 
 def test_comments_blanks_and_repeated_keys():
-    (section,) = parse_cfg("# net\n ; net\n\n [ net ] \n width = 32 \n width=64\nempty=\n")
+    (section,) = _parse_cfg("# net\n ; net\n\n [ net ] \n width = 32 \n width=64\nempty=\n")
     assert section.kind == "net"
     assert section.options == {"width": "32", "empty": ""}
     assert section.where == "cfg:4"
@@ -283,7 +283,7 @@ def test_values_are_converted_and_checked():
 @pytest.mark.parametrize("text", ["width=3", "[net]\nwidth 3", "[net"])
 def test_refuses_invalid_syntax(text):
     with pytest.raises(DataError, match=r"cfg:\d: expected \[section\] or key=value"):
-        parse_cfg(text)
+        _parse_cfg(text)
 
 
 def test_refuses_unreadable_files(tmp_path):

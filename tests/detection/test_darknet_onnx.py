@@ -11,7 +11,7 @@ import torch
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp
 
-from semfov.detection.darknet_onnx import VERSION, OnnxTwin, exported, network_digest, network_model
+from semfov.detection.darknet_onnx import _VERSION, OnnxTwin, exported, network_digest, network_model
 from semfov.detection.load import load_yolo
 from semfov.errors import InputError
 
@@ -215,7 +215,7 @@ def test_every_network_and_version_has_its_own_export(make_small, folder, monkey
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
     assert exported(network, folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", VERSION + 1)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", _VERSION + 1)
     assert exported(network, folder) != path
     assert network_digest(copy.deepcopy(network).double()) == network_digest(network)
     with torch.no_grad():
@@ -291,4 +291,4 @@ def test_a_change_of_the_graph_needs_a_new_version(make_small):
         f"{node.op_type} {[*node.input]} {[*node.output]} {[(a.name, get_attribute_value(a)) for a in node.attribute]}"
         for node in graph.node
     )
-    assert (VERSION, hashlib.sha256(nodes.encode()).hexdigest()[:12]) == (1, "9f909550f9c2")
+    assert (_VERSION, hashlib.sha256(nodes.encode()).hexdigest()[:12]) == (1, "9f909550f9c2")

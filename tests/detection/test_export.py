@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.darknet_onnx import OUTPUTS
-from semfov.detection.export import export_onnx, largest_difference, main
+from semfov.detection.darknet_onnx import _OUTPUTS
+from semfov.detection.export import _largest_difference, export_onnx, main
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
 from semfov.errors import DataError, InputError
@@ -27,7 +27,7 @@ def test_exported_model_equals_torch(make_small, tmp_path, static):
     torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(theirs.classes, ours.classes, rtol=0, atol=1e-5)
     torch.testing.assert_close(theirs.objectness, ours.objectness, rtol=0, atol=1e-5)
-    assert largest_difference(detector, path) <= 1e-4
+    assert _largest_difference(detector, path) <= 1e-4
     ours, theirs = detector(image), exported(image)
     assert ours.count.min() > 3
     torch.testing.assert_close(theirs.scores, ours.scores, rtol=0, atol=1e-4)
@@ -39,7 +39,7 @@ def test_every_activation_can_be_exported(small_cfg, make_small, tmp_path, activ
     small_cfg.write_text(small_cfg.read_text().replace("activation=leaky", f"activation={activation}"))
     detector = make_small()
     export_onnx(detector, tmp_path / "small.onnx")
-    assert largest_difference(detector, tmp_path / "small.onnx") <= 1e-4
+    assert _largest_difference(detector, tmp_path / "small.onnx") <= 1e-4
 
 
 def test_the_exported_model_contains_its_settings(make_small, tmp_path):
@@ -50,7 +50,7 @@ def test_the_exported_model_contains_its_settings(make_small, tmp_path):
     export_onnx(detector, path)
     model = onnx.load(path)
     onnx.checker.check_model(model, full_check=True)
-    assert [output.name for output in model.graph.output] == list(OUTPUTS)
+    assert [output.name for output in model.graph.output] == list(_OUTPUTS)
     exported = load_onnx(path)
     ours, theirs = (json.loads(json.dumps(each.settings())) for each in (detector, exported))
     shared = (ours.keys() & theirs.keys()) - {"digest"}
@@ -89,4 +89,4 @@ def test_command_line_exports_an_equal_model(tiny_weights, tmp_path, monkeypatch
     detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch"), load_detector(path)
     assert exported.classes == COCO_CLASSES
     assert exported.name == "yolov3-tiny"
-    assert largest_difference(detector, path) <= 1e-4
+    assert _largest_difference(detector, path) <= 1e-4

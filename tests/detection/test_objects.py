@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from semfov import InputError, Objects, merge_boxes
-from semfov.detection.objects import merge_looks, survivors
+from semfov.detection.objects import _survivors, merge_looks
 
 SIZE = (1000, 800)
 
@@ -139,6 +139,6 @@ def test_survivors_are_those_of_removing_one_box_after_the_other(count):
         for box in range(count):
             if not any(one in stays and other == box for one, other in zip(better, worse, strict=True)):
                 stays.append(box)
-        assert survivors(count, better, worse).tolist() == stays
+        assert _survivors(count, better, worse).tolist() == stays
         lengths.add(len(stays))
     assert (len(lengths) > 1) == (count > 1)

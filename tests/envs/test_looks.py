@@ -6,7 +6,7 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief import DirichletBelief, TargetEvidence
 from semfov.belief.observers import Semantic, Target
-from semfov.envs.cells import SceneLooks
+from semfov.envs.cells import _SceneLooks
 from semfov.episode import Memory, StoredLooks, attend, rollout
 from semfov.gaze import Given
 from semfov.gaze.acquisition import Uniform
@@ -48,7 +48,7 @@ OBSERVERS = {
 def test_episodes_in_many_scenes_equal_each_episode_run_alone(kind, dtype):
     """Halfway, two episodes move to other scenes, one of which is new and has more detections per look."""
     observer = OBSERVERS[kind](dtype)
-    looks = SceneLooks(lambda scene: stored(scene, dtype), observer, 4)
+    looks = _SceneLooks(lambda scene: stored(scene, dtype), observer, 4)
     paths = torch.tensor([[0, 4, 2, 1], [5, 1, 0, 3], [3, 2, 4, 5], [1, 0, 5, 2]])
     places = [(0, 1), (1, 2), (0, 3), (1, 2)]
     rows = torch.arange(4)

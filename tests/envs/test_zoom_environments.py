@@ -20,7 +20,7 @@ from semfov.envs import (
     open_zoom_scenery,
 )
 from semfov.envs.registration import IDS
-from semfov.envs.windows import window_of
+from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("kept_scenes")
 def test_an_action_selects_the_nearest_window_and_converts_back(size, place, number):
     """The nearest of its level by the distance between centres, against trying all windows."""
     lattice = Lattice.over(size, (416, 416))
-    window = window_of(lattice, np.array(place))
+    window = _window_of(lattice, np.array(place))
     assert window.level == round(place[2] * (lattice.levels - 1))
     middle = np.array(place[:2]) * size
     actions = lattice.actions[lattice.actions[:, 0] == window.level]
@@ -51,7 +51,7 @@ def test_an_action_selects_the_nearest_window_and_converts_back(size, place, num
     same = on_lattice(lattice, (level, column, row))
     x, y = (np.array(same.fixation[:2]) + 0.5) / size
     share = np.clip([x, y, level / max(lattice.levels - 1, 1)], 0, 1).astype(np.float32)
-    assert window_of(lattice, share.astype(np.float64)) == same
+    assert _window_of(lattice, share.astype(np.float64)) == same
 
 
 @pytest.mark.weights

@@ -28,12 +28,12 @@ from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
-from semfov.fit.detector import seconds_of_looks
-from semfov.fit.detector_report import thin_classes
+from semfov.fit.detector import _seconds_of_looks
+from semfov.fit.detector_report import _thin_classes
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
-from semfov.fit.verification import VerificationFit, VerifiedSearch, scores
+from semfov.fit.verification import VerificationFit, _VerifiedSearch, scores
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
@@ -389,7 +389,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
 def test_decisions_are_scored_by_photograph():
     """Present and absent classes have equal weight, whatever their number."""
     kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
-    searches = [VerifiedSearch(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
+    searches = [_VerifiedSearch(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
     ends = [(right, 2) for _, _, right in kinds]
     np.testing.assert_allclose(scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 
@@ -482,10 +482,10 @@ def test_the_highest_threshold_can_be_limited():
 
 
 def test_classes_with_few_objects_are_reported():
-    report = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
+    report = "\n".join(_thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
     assert "**No object to learn from** (1 classes): cup." in report
     assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in report
-    assert thin_classes({"cat": 20}, 20) == []
+    assert _thin_classes({"cat": 20}, 20) == []
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -542,15 +542,15 @@ def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path
     )
     clock = itertools.count(step=2.0)
     monkeypatch.setattr("semfov.fit.detector.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    assert seconds_of_looks(run) == 2 * 6 * 3
+    assert _seconds_of_looks(run) == 2 * 6 * 3
     run.detections(1)
-    assert seconds_of_looks(run) == 2 * 6 * 2
+    assert _seconds_of_looks(run) == 2 * 6 * 2
     looks = run.store.load(run.digest(1))
     run.store.save(run.digest(1), {cell: looks[cell] for cell in (0, 4)})
-    assert seconds_of_looks(run) == 2 * 6 * 3
+    assert _seconds_of_looks(run) == 2 * 6 * 3
     for index in range(3):
         run.detections(index)
-    assert seconds_of_looks(run) == 1
+    assert _seconds_of_looks(run) == 1
 
 
 @pytest.mark.slow

@@ -11,16 +11,16 @@ from semfov.belief import MapEvidence
 from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.examples import ExampleLooks
+from semfov.fit.examples import _ExampleLooks
 from semfov.fit.map import (
     FitMapConfig,
+    _judge_map,
+    _make_map_examples,
+    _map_report,
+    _train_gain,
+    _train_map,
     frequencies,
-    judge_map,
-    make_map_examples,
     map_objective,
-    map_report,
-    train_gain,
-    train_map,
 )
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
@@ -39,7 +39,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def examples(run):
-    return make_map_examples(run, 6, 2, 0)
+    return _make_map_examples(run, 6, 2, 0)
 
 
 def classes_in(annotation, cell):
@@ -79,27 +79,27 @@ def test_examples_have_all_present_classes_and_some_that_represent_the_others(ru
         # Four classes, present or with the highest scores, represent themselves; two represent the four others.
         assert examples.stands_for[row].tolist() == [1, 1, 1, 1, 2, 2]
         assert float(examples.stands_for[row].sum()) == len(CLASSES)
-    draws = {tuple(make_map_examples(run, 6, 2, seed).targets[0].tolist()) for seed in range(8)}
+    draws = {tuple(_make_map_examples(run, 6, 2, seed).targets[0].tolist()) for seed in range(8)}
     assert len(draws) > 1
-    assert torch.equal(make_map_examples(run, 6, 2, 0).targets, examples.targets)
+    assert torch.equal(_make_map_examples(run, 6, 2, 0).targets, examples.targets)
 
 
 @pytest.mark.parametrize(("classes", "others"), [(8, 3), (9, 3), (12, 3), (20, 5)])
 def test_every_class_represents_itself_when_there_are_few(run, classes, others):
-    made = make_map_examples(run, classes, others, 0)
+    made = _make_map_examples(run, classes, others, 0)
     assert made.targets.shape == (4, 8)
     assert bool((made.stands_for == 1).all())
 
 
 def test_looks_of_examples_match_stored_looks(run):
     """The beliefs about all classes are equal except for the rounding of features to half precision."""
-    examples = make_map_examples(run, 12, 3, 0)
+    examples = _make_map_examples(run, 12, 3, 0)
     torch.manual_seed(1)
     model = MapEvidence(6, 5, components=len(CLASSES) + 1).eval().requires_grad_(False)
     cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
     observer, acquisition = LearnedMap(model), CloserLook(GRID)
     chosen = examples[torch.tensor([0, 3])]
-    steps = rollout(ExampleLooks(chosen, GRID), observer, acquisition, cells[:, 0], Given(cells), most=4)
+    steps = rollout(_ExampleLooks(chosen, GRID), observer, acquisition, cells[:, 0], Given(cells), most=4)
     beliefs = [step.belief for step in steps]
     for row, scene in enumerate(chosen.scene.tolist()):
         path, order = cells[row : row + 1], chosen.targets[row]
@@ -145,9 +145,9 @@ def test_training_is_repeatable(examples):
         torch.manual_seed(0)
         model = MapEvidence(4, 4, components=len(CLASSES) + 1)
         torch.manual_seed(seed)  # random numbers drawn elsewhere change nothing
-        train_map(config, model, examples, GRID)
+        _train_map(config, model, examples, GRID)
         before = {name: value.clone() for name, value in model.state_dict().items()}
-        train_gain(config, model, examples, GRID)
+        _train_gain(config, model, examples, GRID)
         for name, value in model.state_dict().items():
             assert bool(value.isfinite().all()), name
             assert torch.equal(value, before[name]) == (not name.startswith("worth")), name
@@ -158,10 +158,10 @@ def test_training_is_repeatable(examples):
 def test_a_map_is_evaluated_after_each_number_of_looks_and_reported(examples):
     config = FitMapConfig(columns=4, rows=4)
     model = MapEvidence(4, 4, components=len(CLASSES) + 1).requires_grad_(False)
-    judged = judge_map(config, model, examples, GRID)
+    judged = _judge_map(config, model, examples, GRID)
     assert [row["looks"] for row in judged] == [1, 2, 3, 5, 10, 15]
     assert all(math.isfinite(value) for row in judged for value in row.values())
-    report = map_report(judged, 3, 2)
+    report = _map_report(judged, 3, 2)
     assert "Trained on 3 photographs and evaluated on 2 held-out" in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
     for row, cells in zip(judged, rows, strict=True):

@@ -16,17 +16,17 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks, rollout
 from semfov.fit.evidence import (
-    JUDGED,
+    _JUDGED,
     FitSearchConfig,
+    _evidence_report,
+    _judge_evidence,
+    _make_examples,
+    _train_evidence,
     choose_thresholds,
     evidence_objective,
-    evidence_report,
-    judge_evidence,
-    make_examples,
     searches,
-    train_evidence,
 )
-from semfov.fit.examples import ExampleLooks
+from semfov.fit.examples import _ExampleLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.search_protocol import choose_classes
@@ -45,7 +45,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def examples(run):
-    return make_examples(run, 2, 0.5, 0)
+    return _make_examples(run, 2, 0.5, 0)
 
 
 def test_examples_match_looks_from_every_cell(run, examples):
@@ -99,7 +99,7 @@ def test_looks_of_examples_match_stored_looks(run, examples):
     cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
     chosen = torch.tensor([0, len(examples) - 1])
     steps = rollout(
-        ExampleLooks(examples[chosen], GRID), Target(model), TargetPosterior(1), cells[:, 0], Given(cells), most=4
+        _ExampleLooks(examples[chosen], GRID), Target(model), TargetPosterior(1), cells[:, 0], Given(cells), most=4
     )
     beliefs = [step.belief for step in steps]
     for row, example in enumerate(chosen.tolist()):
@@ -256,10 +256,10 @@ def test_training_is_repeatable_and_keeps_the_global_random_state(examples):
     config = FitSearchConfig(columns=4, rows=4, steps=12, batch=4, looks=3)
     torch.manual_seed(5)
     state = torch.random.get_rng_state()
-    first = train_evidence(config, examples, GRID, {"some": "metadata"}, len(CLASSES) + 1)
+    first = _train_evidence(config, examples, GRID, {"some": "metadata"}, len(CLASSES) + 1)
     assert torch.equal(torch.random.get_rng_state(), state)
     torch.manual_seed(6)
-    second = train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
+    second = _train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
     assert not first.training
     assert first.metadata == {"some": "metadata"}
     for name, value in first.state_dict().items():
@@ -274,9 +274,9 @@ def test_more_training_lowers_the_evaluated_loss(examples):
     nll = []
     for steps in (1, 60):
         config = FitSearchConfig(columns=4, rows=4, steps=steps, batch=8, looks=4)
-        model = train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
-        judged, thresholds = judge_evidence(config, model, examples, GRID)
-        assert [row["looks"] for row in judged] == list(JUDGED)
+        model = _train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
+        judged, thresholds = _judge_evidence(config, model, examples, GRID)
+        assert [row["looks"] for row in judged] == list(_JUDGED)
         assert 0.49 < thresholds.confirm <= 1
         assert 0 <= thresholds.give_up <= 0.3
         for row in judged:
@@ -289,8 +289,8 @@ def test_more_training_lowers_the_evaluated_loss(examples):
 
 def test_the_report_has_the_measures_and_the_thresholds():
     names = ("found", "cells_nll", "cells_ece", "visited_ece", "presence_area", "presence_ece")
-    judged = [{"looks": looks, **{name: looks / 20 + n / 100 for n, name in enumerate(names)}} for looks in JUDGED]
-    report = evidence_report(judged, Thresholds(0.7, 0.05, 0.4), 8, 3)
+    judged = [{"looks": looks, **{name: looks / 20 + n / 100 for n, name in enumerate(names)}} for looks in _JUDGED]
+    report = _evidence_report(judged, Thresholds(0.7, 0.05, 0.4), 8, 3)
     assert "presence is at least 0.700 and that of a fixated cell at least 0.40" in report
     assert "no other cell has a probability of at least 0.05" in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]

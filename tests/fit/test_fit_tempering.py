@@ -5,7 +5,7 @@ import torch
 
 from semfov import Detections, Grid
 from semfov.belief.observers import Semantic
-from semfov.fit.tempering import hit_rate, tempering_report
+from semfov.fit.tempering import _tempering_report, hit_rate
 
 
 def looks(count, boxes=3, classes=4):
@@ -51,7 +51,7 @@ def test_there_is_no_hit_rate_when_every_fixation_is_on_the_target():
 
 def test_the_report_has_a_row_for_every_exponent_and_names_the_best():
     """The best one is that of the photographs to choose by."""
-    report = tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
+    report = _tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
     assert "choose by: 0.25." in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
     assert rows == [["0.25", "50.00", "10.00"], ["1", "40.00", "30.00"]]

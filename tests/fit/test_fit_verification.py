@@ -13,19 +13,19 @@ from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
-from semfov.fit.searches import open_photographs, photograph_searches, search_photograph
+from semfov.fit.searches import _search_photograph, open_photographs, photograph_searches
 from semfov.fit.verification import (
+    _STRENGTH,
     LEVELS,
     SHIPPED,
-    STRENGTH,
-    CloserLooks,
     FitVerificationConfig,
-    VerifiedSearch,
+    _CloserLooks,
+    _shipped_mean,
+    _VerifiedSearch,
     choose_confirm,
     examine,
     fit,
     fit_in_folds,
-    shipped_mean,
     verify,
 )
 from semfov.gaze.policies import NonPredictive, Random
@@ -40,7 +40,7 @@ def examined(count=200, seed=0):
     generator = torch.Generator().manual_seed(seed)
     features = 2 * torch.randn(count, 7, generator=generator)
     noise = torch.randn(2, count, generator=generator)
-    return CloserLooks(
+    return _CloserLooks(
         features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4
     )
 
@@ -68,14 +68,14 @@ def test_the_fit_ignores_the_closer_looks_that_are_held_out():
     known = examined()
     other = known.features.clone()
     other[known.fold == 2] = 100.0
-    changed = CloserLooks(other, known.right, known.present, known.fold)
+    changed = _CloserLooks(other, known.right, known.present, known.fold)
     assert torch.equal(fit(known, known.fold != 2).linear.weight, fit(changed, known.fold != 2).linear.weight)
 
 
 def test_the_fit_with_a_prior_minimises_the_cross_entropy_and_the_distance_to_it():
     known = examined(60)
     chosen = known.fold != 1
-    prior = shipped_mean()
+    prior = _shipped_mean()
     model = fit(known, chosen, prior)
     phi = known.features[chosen].double().numpy()
     mean, scale = phi.mean(0), phi.std(0, ddof=1)
@@ -87,7 +87,7 @@ def test_the_fit_with_a_prior_minimises_the_cross_entropy_and_the_distance_to_it
         def loss(parameters, there=there, centre=centre):
             odds = (phi - mean) / scale @ parameters[:7] + parameters[7]
             distance = ((parameters - centre) ** 2).sum()
-            return np.logaddexp(0, np.where(there, -odds, odds)).mean() + STRENGTH / len(phi) * distance
+            return np.logaddexp(0, np.where(there, -odds, odds)).mean() + _STRENGTH / len(phi) * distance
 
         best = minimize(loss, np.zeros(8), tol=1e-12).x
         weight = best[:7] / scale
@@ -96,7 +96,7 @@ def test_the_fit_with_a_prior_minimises_the_cross_entropy_and_the_distance_to_it
 
 
 def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without():
-    prior, distances = shipped_mean(), []
+    prior, distances = _shipped_mean(), []
     for count in (8, 80, 800, 8000):
         known = examined(count)
         near, far = fit(known, known.fold >= 0, prior), fit(known, known.fold >= 0)
@@ -110,12 +110,12 @@ def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without(
 def test_a_single_closer_look_is_not_enough():
     known = examined(4)
     with pytest.raises(DataError, match=r"expected closer looks in all folds but one, got 1; give more photographs"):
-        fit(known, known.fold == 0, shipped_mean())
+        fit(known, known.fold == 0, _shipped_mean())
 
 
 def test_the_prior_is_the_mean_of_the_shipped_models():
     files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in SHIPPED]
-    for name, tensor in shipped_mean().state_dict().items():
+    for name, tensor in _shipped_mean().state_dict().items():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
 
@@ -132,7 +132,7 @@ def verified_in(seen, models, evidence, config):
 
 def searched(present, places, ends, presence, looks):
     """A search of a photograph without the search that makes no closer looks."""
-    return VerifiedSearch(0, present, False, places, ends, presence, looks, (None, looks))
+    return _VerifiedSearch(0, present, False, places, ends, presence, looks, (None, looks))
 
 
 PLACES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=3)
@@ -186,9 +186,9 @@ def seen():
 def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
     found, evidence = seen
     photograph = found[0]
-    first = list(search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
+    first = list(_search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
     count = len(photograph.looks.looks)
-    again = list(search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
+    again = list(_search_photograph(photograph, photograph.targets[0], Target(evidence), 3))
     assert len(photograph.looks.looks) == count == 3
     view = photograph.eye.open(photograph.image)
     for one, other in zip(first, again, strict=True):
@@ -216,7 +216,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
         for one, other in zip(live, found, strict=True):
             for sought in one.targets:
                 pairs = zip(
-                    *(search_photograph(each, sought, Target(evidence), 5) for each in (one, other)), strict=True
+                    *(_search_photograph(each, sought, Target(evidence), 5) for each in (one, other)), strict=True
                 )
                 for first, second in pairs:
                     torch.testing.assert_close(first.belief.probability(1), second.belief.probability(1))
@@ -235,7 +235,7 @@ def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
     assert any(each.spare for photograph in many for each in photograph.targets)
     first, second = examined_in(few, evidence, config), examined_in(many, evidence, config)
     assert torch.equal(first.features, second.features)
-    searches = list(verified_in(many, 2 * [shipped_mean()], evidence, config))
+    searches = list(verified_in(many, 2 * [_shipped_mean()], evidence, config))
     assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.targets]
 
 
@@ -244,7 +244,7 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     """The agent looks by itself and with other code, with closer looks and without."""
     found, evidence = seen
     evidence.thresholds = Thresholds(0.55, 0.3, 0.3)
-    model = shipped_mean()
+    model = _shipped_mean()
     config = FitVerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
     model.thresholds = Thresholds(confirm, config.give_up, config.place)
     searching, exploring = (Target(evidence), NonPredictive()), (Semantic(4), Random())

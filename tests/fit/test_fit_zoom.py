@@ -19,7 +19,7 @@ from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.fit.verification import unverified, verify
 from semfov.fit.windows import FitZoomConfig, fit_zoom
 from semfov.fit.windows_evidence import example_of
-from semfov.fit.windows_verification import fit_closer, mosaic_searches
+from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
@@ -172,7 +172,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
     config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
-    searches = list(mosaic_searches(model, scenes, opened, config, "test"))
+    searches = list(_mosaic_searches(model, scenes, opened, config, "test"))
     names = "background", *scenes.classes
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())

@@ -8,10 +8,10 @@ import torch
 from semfov import ActivePerception
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.detector import manifest_of
+from semfov.fit.detector import _manifest_of
 from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.folder import FolderFit
-from semfov.fit.parts.windows import RECALL_PASSES, WindowsFit, in_raw_order, photograph_recalls
+from semfov.fit.parts.windows import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
 from semfov.fit.windows import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
@@ -78,7 +78,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
     folder.results["windows"] = replace(fitted, part=part)
-    manifest_of(folder.config, folder.inputs.run, folder).write(home / "models")
+    _manifest_of(folder.config, folder.inputs.run, folder).write(home / "models")
     agent = ActivePerception.from_pretrained(home / "models")
     assert all(torch.equal(tensor, model.state_dict()[name]) for name, tensor in agent.windows.state_dict().items())
     picture = torch.full((3, 192, 256), 0.49)
@@ -118,14 +118,14 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
     shares = {}
     for index, glances in enumerate(opened):
         tiles = mosaics.tiles(index)
-        looks = [turn.glance for turn in in_raw_order(glances)]
+        looks = [turn.glance for turn in _in_raw_order(glances)]
         found = torch.stack([found_in(looks[:n], mosaics.annotation(index)) for n in range(1, len(looks) + 1)], -1)
         # When all slices were looked at, recall stays the same.
-        assert len(looks) < RECALL_PASSES[-1]
-        found = torch.cat([found, found[:, -1:].expand(-1, RECALL_PASSES[-1] - len(looks))], -1).double()
+        assert len(looks) < _RECALL_PASSES[-1]
+        found = torch.cat([found, found[:, -1:].expand(-1, _RECALL_PASSES[-1] - len(looks))], -1).double()
         counts = [len(scenes.annotation(tile.index).boxes) for tile in tiles]
         for tile, part in zip(tiles, found.split(counts), strict=True):
             shares.setdefault(tile.index, []).append(part.mean(0))
     expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
     assert expected.amax() > 0
-    torch.testing.assert_close(torch.from_numpy(photograph_recalls(mosaics, opened, in_raw_order)), expected)
+    torch.testing.assert_close(torch.from_numpy(_photograph_recalls(mosaics, opened, _in_raw_order)), expected)

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from semfov import DirichletBelief, FovealObservationModel, Grid
 from semfov.errors import InputError
 from semfov.gaze.acquisition import CorrectLocalisation, EntropyLimit, TargetPosterior
-from semfov.gaze.acquisition.ideal import correct_localisation
+from semfov.gaze.acquisition.ideal import _correct_localisation
 from semfov.observation import visibility
 
 GRID = Grid(4, 3, (80, 60))
@@ -82,7 +82,7 @@ def test_localisation_equals_the_adaptive_integral(seed):
     place /= place.sum()
     exact = integral(place, signal)
     for nodes, tolerance in ((64, 2e-4), (256, 1e-5)):
-        got = correct_localisation(torch.tensor(place), torch.tensor(signal), nodes=nodes)
+        got = _correct_localisation(torch.tensor(place), torch.tensor(signal), nodes=nodes)
         assert float(got) == pytest.approx(exact, abs=tolerance)
 
 
@@ -95,15 +95,15 @@ def test_localisation_equals_a_simulation_of_responses():
     answer[np.arange(count), target] += 1
     posterior = np.log(place) + signal**2 * answer
     share = (posterior.argmax(1) == target).mean()
-    got = float(correct_localisation(torch.tensor(place), torch.tensor(signal)))
+    got = float(_correct_localisation(torch.tensor(place), torch.tensor(signal)))
     assert got == pytest.approx(share, abs=5 * (0.25 / count) ** 0.5)
 
 
 def test_without_a_signal_accuracy_is_the_largest_prior():
     place = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
-    assert float(correct_localisation(place, torch.zeros(3, dtype=torch.float64))) == pytest.approx(0.5, abs=1e-6)
+    assert float(_correct_localisation(place, torch.zeros(3, dtype=torch.float64))) == pytest.approx(0.5, abs=1e-6)
     even = torch.full((50,), 0.02, dtype=torch.float64)
-    assert float(correct_localisation(even, torch.zeros(50, dtype=torch.float64))) == pytest.approx(0.02, abs=1e-4)
+    assert float(_correct_localisation(even, torch.zeros(50, dtype=torch.float64))) == pytest.approx(0.02, abs=1e-4)
 
 
 class Sharp:
@@ -173,7 +173,7 @@ def test_values_are_finite_where_the_target_has_probability_zero():
 def test_gradients_of_localisation():
     place = make_belief().probability(1).softmax(-1)[:1, :5].requires_grad_()
     signal = torch.linspace(0.3, 2, 5, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p, d: correct_localisation(p, d, nodes=24), (place, signal))
+    assert torch.autograd.gradcheck(lambda p, d: _correct_localisation(p, d, nodes=24), (place, signal))
 
 
 def test_values_use_the_given_number_of_integration_nodes():
@@ -182,7 +182,7 @@ def test_values_use_the_given_number_of_integration_nodes():
     for nodes in (8, 16):
         got = CorrectLocalisation(1, make_model(), GRID, nodes=nodes).values(place, signal)
         expected = [
-            [float(correct_localisation(p, d, nodes=nodes)) for d in s] for p, s in zip(place, signal, strict=True)
+            [float(_correct_localisation(p, d, nodes=nodes)) for d in s] for p, s in zip(place, signal, strict=True)
         ]
         torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64))
     usual = CorrectLocalisation(1, make_model(), GRID).values(place, signal)
@@ -207,5 +207,5 @@ def test_localisation_is_a_sum_over_equidistant_noise(nodes):
                 right *= norm.cdf(ahead / (2 * signal[y]))
             total += place[x] * right * norm.pdf(w) / sum(norm.pdf(noise))
     told = {} if nodes == 64 else {"nodes": nodes}
-    got = correct_localisation(torch.tensor(place), torch.tensor(signal), **told)
+    got = _correct_localisation(torch.tensor(place), torch.tensor(signal), **told)
     assert float(got) == pytest.approx(total, rel=1e-12)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.agents import HeadAgent
-from semfov.agents.head import decide_look
+from semfov.agents.head import _decide_look
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Detections
 from semfov.errors import InputError
@@ -143,7 +143,7 @@ def test_without_a_find_the_rule_of_all_searches_decides(agent, panorama, examin
     nothing = torch.zeros(1, cells)
     belief = SceneBelief(values, nothing, nothing.long(), fixated, torch.ones(1), (None,) * len(views))
     step = HeadStep(5, 0.2, belief, Detections.empty(1, 4))
-    decision = decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
+    decision = _decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
     assert decision.outcome == outcome
     assert decision.cell == (here if outcome == "found" else None)
 

@@ -11,7 +11,7 @@ from semfov.episode import rollout
 from semfov.errors import InputError
 from semfov.gaze.choice import Given
 from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
-from semfov.head.episode import HeadLooks, live, look_around
+from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT
 
 
@@ -21,7 +21,7 @@ def views(panorama):
 
 
 def episode(views, eye, observer, actions, target=None):
-    looks = HeadLooks(views, live(eye, views), target)
+    looks = _HeadLooks(views, live(eye, views), target)
     gain = SearchGain(views)
     steps = rollout(
         looks, observer, lambda _, cell: PerSecond(gain, None, int(cell)), torch.tensor(actions[:1]),

@@ -8,7 +8,7 @@ import torch
 from eval.search import main as search
 from semfov import EmbeddedScenes, load_detector
 from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_config import yolov3_tiny
+from semfov.detection.darknet_config import _yolov3_tiny
 from semfov.errors import InputError
 from semfov.gaze import ClassTemplates
 from tests.small import Fixed
@@ -19,7 +19,7 @@ from train.templates import TemplateSums, objects_of
 def test_features_are_the_input_of_the_last_convolution():
     """Read by a hook on that layer."""
     torch.manual_seed(0)
-    network = Darknet(yolov3_tiny()).eval()
+    network = Darknet(_yolov3_tiny()).eval()
     head = list(network.layers).index(network.heads[0])
     seen = []
     network.layers[head - 1].register_forward_pre_hook(lambda _, read: seen.append(read[0]))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
 from semfov.errors import InputError
-from semfov.metrics.presence import area_under_roc, hits_at, roc, threshold_for
+from semfov.metrics.presence import _threshold_for, area_under_roc, hits_at, roc
 
 # Few values, so that many are tied.
 scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)
@@ -41,7 +41,7 @@ def test_present_and_absent_cases_are_both_needed(present):
 @given(scores, shares)
 def test_threshold_is_the_smallest_that_keeps_the_allowed_false_alarms(misses, share):
     values = torch.tensor(misses, dtype=torch.float64)
-    got = threshold_for(values, share)
+    got = _threshold_for(values, share)
 
     def alarms(threshold):
         return sum(value >= threshold for value in misses)
@@ -58,9 +58,9 @@ def test_the_allowed_false_alarms_are_those_of_exact_fractions():
         misses = torch.arange(count, dtype=torch.float64)
         for percent in (0, 1, 2, 5, 7, 29, 57, 58, 99):
             allowed = Fraction(percent, 100) * count // 1
-            assert int((misses >= threshold_for(misses, percent / 100)).sum()) == allowed
+            assert int((misses >= _threshold_for(misses, percent / 100)).sum()) == allowed
         for alarms in range(count):
-            assert int((misses >= threshold_for(misses, alarms / count)).sum()) == alarms
+            assert int((misses >= _threshold_for(misses, alarms / count)).sum()) == alarms
 
 
 @given(scores, scores, shares)
@@ -79,7 +79,7 @@ def test_a_single_precision_score_equal_to_a_false_alarm_is_no_hit():
 
 def test_a_threshold_needs_at_least_one_case():
     with pytest.raises(InputError, match="absent: expected at least one case"):
-        threshold_for(torch.zeros(0), 0.1)
+        _threshold_for(torch.zeros(0), 0.1)
 
 
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]), st.booleans()), min_size=2, max_size=30))
@@ -107,5 +107,5 @@ def test_the_next_number_above_a_false_alarm_is_a_hit():
 
 def test_every_target_is_a_hit_if_all_false_alarms_are_allowed():
     score = torch.tensor([0.5, 0.7, 0.1], dtype=torch.float64)
-    assert threshold_for(score, 1.0) == -math.inf
+    assert _threshold_for(score, 1.0) == -math.inf
     assert hits_at(score, torch.tensor([False, True, True]), 1.0) == 1

@@ -17,7 +17,7 @@ import torch
 from semfov.errors import InputError
 from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
-from semfov.observation.fitting import estimate_prior, expected_table, fit_table
+from semfov.observation.fitting import _estimate_prior, _expected_table, _fit_table
 
 CLASSES = ["cup", "cat", "dog"]
 EDGES = [0.1, 0.25]
@@ -195,7 +195,7 @@ def test_a_fit_without_shrinkage_maximises_the_likelihood():
     statistics = DirichletStatistics((4, 3), 4)
     here = torch.ones(60, dtype=torch.int64)
     statistics.update(torch.from_numpy(rows), (here * 2, here))
-    alpha, _ = fit_table(statistics, shrinkage=1e-9, minimum=0)
+    alpha, _ = _fit_table(statistics, shrinkage=1e-9, minimum=0)
 
     def loss(x):
         return -scipy.stats.dirichlet(np.exp(x)).logpdf(rows.T).mean()
@@ -209,7 +209,7 @@ def test_cells_with_few_samples_follow_their_class():
     counts = torch.full((4, 3), 3000)
     counts[2, 1] = 0
     counts[3] = 0
-    fitted, fallback = fit_table(draw(alpha, counts), shrinkage=10.0)
+    fitted, fallback = _fit_table(draw(alpha, counts), shrinkage=10.0)
     assert fallback == {}
     np.testing.assert_allclose(fitted[2, 1], alpha[2, 1], rtol=0.15)
     torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
@@ -228,7 +228,7 @@ def test_identical_samples_and_zeros_give_finite_parameters():
     statistics = DirichletStatistics((4, 3), 4)
     rows = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).repeat(500, 1)
     statistics.update(rows, (torch.ones(500).long(), torch.zeros(500).long()))
-    alpha, _ = fit_table(statistics, minimum=0)
+    alpha, _ = _fit_table(statistics, minimum=0)
     assert bool(alpha.isfinite().all())
     assert bool((alpha > 0).all())
     assert alpha[1, 0].argmax() == 1
@@ -250,13 +250,13 @@ def test_levels_with_few_samples_copy_their_inner_neighbour_and_warn():
 
 def test_empirical_expected_scores_are_the_means_of_the_data():
     statistics = draw(table(), torch.full((4, 3), 500))
-    got = expected_table(statistics, {}, shrinkage=1e-6)
+    got = _expected_table(statistics, {}, shrinkage=1e-6)
     torch.testing.assert_close(got, statistics.mean, rtol=0, atol=1e-6)
 
 
 def test_prior_is_the_frequency_of_the_classes():
     count = torch.tensor([[9000, 900], [1000, 100], [0, 0]])
-    prior = estimate_prior(count).exp()
+    prior = _estimate_prior(count).exp()
     torch.testing.assert_close(prior.sum(0), torch.ones(2, dtype=torch.float64))
     np.testing.assert_allclose(prior[0], [0.9, 0.9], atol=2e-3)
     assert bool((prior > 0).all())

@@ -14,7 +14,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects
 from semfov.errors import InputError
 from semfov.report import episode_data, page_html, zoom_data
-from semfov.report.zoom import LISTED, MOST_DETECTIONS
+from semfov.report.zoom import _MOST_DETECTIONS, LISTED
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -137,7 +137,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     )
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
-    assert f"<p>{many - MOST_DETECTIONS} less confident detections are left out.</p>" in page
+    assert f"<p>{many - _MOST_DETECTIONS} less confident detections are left out.</p>" in page
     assert page.count("0.90</td>") == 1
     one = replace(zoom_path, decision=None, candidates=objects[torch.arange(LISTED + 1)])
     page = page_html("crowd", [zoom_data(one, large_picture, name="crowd")])

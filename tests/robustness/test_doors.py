@@ -18,7 +18,7 @@ from semfov import (
     as_image,
     foveate,
 )
-from semfov.data.classes import SYNONYMS, class_index
+from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector
@@ -265,7 +265,7 @@ def test_unknown_names_are_refused_with_a_suggested_class(name, meant):
 
 
 def test_synonyms_are_no_class_names_and_suggest_only_known_classes():
-    for word, classes in SYNONYMS.items():
+    for word, classes in _SYNONYMS.items():
         assert set(classes) <= set(COCO_CLASSES)
         assert word not in {name.replace(" ", "") for name in COCO_CLASSES}
     with pytest.raises(SemfovError, match=r"^target: unknown class 'mug'; known: person, dog"):

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from semfov import load_detector
-from semfov.data.download import _ANNOTATIONS, SPLITS
-from semfov.detection.weights import WEIGHTS, Address, SourceDistribution
+from semfov.data.download import _ANNOTATIONS, _SPLITS
+from semfov.detection.weights import WEIGHTS, _Address, _SourceDistribution
 from semfov.errors import DataError
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +69,7 @@ def test_sources_have_no_unsafe_calls():
 
 
 def test_every_download_is_pinned():
-    assert isinstance(WEIGHTS["yolov3-tiny"].sources[0], SourceDistribution)
+    assert isinstance(WEIGHTS["yolov3-tiny"].sources[0], _SourceDistribution)
     assert len({entry.file for entry in WEIGHTS.values()}) == len(WEIGHTS)
     for name, entry in WEIGHTS.items():
         assert len(bytes.fromhex(entry.sha256)) == 32, name
@@ -77,12 +77,12 @@ def test_every_download_is_pinned():
         assert entry.licence
         assert entry.sources or "https://" in entry.remark
         for source in entry.sources:
-            assert isinstance(source, Address | SourceDistribution)
-            if isinstance(source, Address):
+            assert isinstance(source, _Address | _SourceDistribution)
+            if isinstance(source, _Address):
                 assert source.url.startswith("https://")
             else:
                 assert len(bytes.fromhex(source.sha256)) == 32
-    for archive in (*SPLITS.values(), _ANNOTATIONS):
+    for archive in (*_SPLITS.values(), _ANNOTATIONS):
         assert len(bytes.fromhex(archive.sha256)) == 32
 
 
@@ -135,7 +135,7 @@ def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
 @pytest.mark.parametrize("target", ["../../../../etc/passwd", "/etc/passwd", "p-1/other"])
 def test_nothing_is_extracted_from_archives_with_links_or_outside_paths(tmp_path, monkeypatch, target):
     """Members with outside paths are not extracted, and a link is not followed."""
-    source = SourceDistribution("p", "1", "0" * 64, 100, "p-1/weights")
+    source = _SourceDistribution("p", "1", "0" * 64, 100, "p-1/weights")
 
     def download(self, folder: Path) -> None:
         (folder / "archives").mkdir()
@@ -144,7 +144,7 @@ def test_nothing_is_extracted_from_archives_with_links_or_outside_paths(tmp_path
             ("../../escaped", b"out", ""), ("/tmp/semfov-escaped", b"out", ""), ("p-1/weights", None, target),
         )  # fmt: skip
 
-    monkeypatch.setattr(SourceDistribution, "_download", download)
+    monkeypatch.setattr(_SourceDistribution, "_download", download)
     destination = tmp_path / "weights"
     with pytest.raises(DataError, match="lacks"):
         source.fetch(destination)

@@ -20,9 +20,9 @@ from semfov.gaze.acquisition import (
     TargetPosterior,
 )
 from semfov.runs import candidates
-from semfov.runs.candidates import Candidate, Models, belief_settings, load_models, make_strategy, needs_observation
+from semfov.runs.candidates import Candidate, _Models, _needs_observation, belief_settings, load_models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
-from semfov.runs.presets import presets, resolve, valid_policies
+from semfov.runs.presets import _valid_policies, presets, resolve
 from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (40, 30))
@@ -36,7 +36,7 @@ def model():
 
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
     """The strategy of a policy for two classes, made with the given models."""
-    return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, Models(**models), fovea)
+    return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, _Models(**models), fovea)
 
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
@@ -63,7 +63,7 @@ def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(nam
 
 
 def needs_model(belief=None, *choices, task="search"):
-    return needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
+    return _needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
 
 
 def test_prediction_calibration_and_misses_need_an_observation_model():
@@ -78,7 +78,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
     assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
     without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
-    for name in valid_policies("exploration"):
+    for name in _valid_policies("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
         assert needs_model(None, given, task="exploration") == (name not in without)
@@ -90,7 +90,7 @@ def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model)
     for task in ("search", "exploration"):
         for preset in presets(task).values():
             assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
-            if needs_observation([preset], BeliefConfig()):
+            if _needs_observation([preset], BeliefConfig()):
                 with pytest.raises(InputError, match="observation model"):
                     strategy(preset, task, **others)
             else:
@@ -118,11 +118,11 @@ def loaded(monkeypatch):
 
 def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     eye = SimpleNamespace()
-    assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == Models()
-    assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
+    assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == _Models()
+    assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == _Models()
     assert loaded == []
     learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
-    assert load_models(learned, "exploration", eye) == Models(map=MapEvidence)
+    assert load_models(learned, "exploration", eye) == _Models(map=MapEvidence)
     assert loaded == [(MapEvidence, "everything")]
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2")
@@ -131,7 +131,7 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
         belief=BeliefConfig(model="mine", target_model="sought"),
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", TargetEvidence)
+    assert models == _Models("observation", TargetEvidence)
     assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
 
 

@@ -12,7 +12,7 @@ from semfov.errors import InputError
 from semfov.gaze.policies import Task, policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
-from semfov.runs.presets import WORDS, label, presets, resolve, valid_policies
+from semfov.runs.presets import WORDS, _valid_policies, label, presets, resolve
 
 TASKS = get_args(Task)
 ALIASES = {
@@ -41,7 +41,7 @@ CHANGES = [
 @pytest.mark.parametrize("task", TASKS)
 def test_every_policy_has_a_preset(task):
     made = {preset.policy for preset in presets(task).values()}
-    assert made == set(valid_policies(task)) >= set(policy_names(task))
+    assert made == set(_valid_policies(task)) >= set(policy_names(task))
     for name, preset in presets(task).items():
         assert resolve(name, task) == resolve(preset, task) == preset
 

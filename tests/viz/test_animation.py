@@ -14,7 +14,7 @@ from PIL import Image
 
 from semfov import Detections, Grid, InputError
 from semfov.viz import animate, plot_fixation
-from semfov.viz.animation import episode_frames, in_one_palette, render, save_animation
+from semfov.viz.animation import _episode_frames, _in_one_palette, _save_animation, render
 from semfov.viz.fixation import FixationFigure
 from tests import small
 
@@ -43,7 +43,7 @@ def frames():
 
 
 def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
-    save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3
         for number, (shade, duration) in enumerate([(0, 500), (100, 500), (200, 2000)]):
@@ -54,7 +54,7 @@ def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
 def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
-    _, path = save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    _, path = _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
     command = ["ffmpeg", "-loglevel", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(command, capture_output=True, check=True).stdout, np.uint8)
     shown = pixels.reshape(-1, 32, 42, 3)[:, 10, 10, 0]
@@ -64,13 +64,13 @@ def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
 
 def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
+    assert _save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
 
 
 def test_frames_equal_figures_drawn_one_by_one(searched):
     """All frames are drawn with one figure, but each equals the figure of `plot_fixation`."""
     scanpath, image, views = searched
-    frames = episode_frames(scanpath, image, views)
+    frames = _episode_frames(scanpath, image, views)
     assert len(frames) == len(scanpath)
     for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
         (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
@@ -114,7 +114,7 @@ def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_pa
 
 def test_frames_share_their_colours(searched):
     """Parts that do not change must not flicker."""
-    first, *others = in_one_palette(episode_frames(*searched))
+    first, *others = _in_one_palette(_episode_frames(*searched))
     assert all(frame.getpalette() == first.getpalette() for frame in others)
 
 

@@ -10,7 +10,7 @@ import scipy.ndimage
 import torch
 
 from semfov import Grid
-from semfov.cli.text import regions_lines
+from semfov.cli.text import _regions_lines
 from semfov.viz import cell_entropy, plot_semantic_map
 from semfov.viz.semantic import borders, named_regions, regions
 from tests import small
@@ -154,14 +154,14 @@ def test_entropy_is_that_of_normalised_probabilities():
 
 def test_an_exploration_is_told_as_classes_and_their_cells():
     """One line for each class: its number of cells, its highest probability and the middle of its cell."""
-    assert regions_lines(marginal_map()) == [
+    assert _regions_lines(marginal_map()) == [
         "  map: cat in 4 cells, p up to 0.95 around (34, 14)",
         "  map: dog in 2 cells, p up to 0.55 around (54, 34)",
     ]
     cats = replace(marginal_map(), targets=(marginal_map().classes.index("cat"),))
-    assert regions_lines(cats) == ["  map: cat in 4 cells, p up to 0.95 around (34, 14)"]
+    assert _regions_lines(cats) == ["  map: cat in 4 cells, p up to 0.95 around (34, 14)"]
     empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
-    assert regions_lines(scanpath_of(empty, 6)) == []
+    assert _regions_lines(scanpath_of(empty, 6)) == []
     one = empty.clone()
     one[-1, 5, 2] = 0.97
-    assert len(regions_lines(scanpath_of(one, 6))) == 1
+    assert len(_regions_lines(scanpath_of(one, 6))) == 1

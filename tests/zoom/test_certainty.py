@@ -14,7 +14,7 @@ from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects, unlike
 from semfov.errors import InputError
-from semfov.fit.windows_certainty import fit_certainty, fit_unseen
+from semfov.fit.windows_certainty import _fit_certainty, _fit_unseen
 from semfov.io.storage import read, write_file
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
@@ -174,7 +174,7 @@ def test_what_further_looks_show_is_fitted_by_the_number_in_all():
         def outcome(self, certainty, number):
             return self.sums[0], self.sums[number - 1]
 
-    fitted = fit_unseen(
+    fitted = _fit_unseen(
         Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]
     )
     for clear, faint in ((10.0, 30.0), (4.0, 5.0)):
@@ -187,7 +187,7 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
     generator = torch.Generator().manual_seed(0)
     facts = torch.randn(500, len(FACTS), generator=generator)
     right = torch.rand(500, generator=generator) < facts[:, 0].sigmoid()
-    fitted = fit_certainty(facts, right)
+    fitted = _fit_certainty(facts, right)
     parameters = torch.tensor([fitted.offset, *fitted.weights], dtype=torch.float64, requires_grad=True)
     inputs = torch.cat([torch.ones(500, 1), facts], -1).double()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(inputs @ parameters, right.double(), reduction="sum")
@@ -195,7 +195,7 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
     loss = loss + 0.5 * parameters[1:].square().sum() - 0.5 * (empty * (1 - empty)).log()
     (gradient,) = torch.autograd.grad(loss, parameters)
     assert gradient.abs().max() < 1e-3
-    everywhere = fit_certainty(facts, torch.ones(500, dtype=torch.bool))
+    everywhere = _fit_certainty(facts, torch.ones(500, dtype=torch.bool))
     assert math.isfinite(everywhere.offset)
 
 

@@ -14,7 +14,7 @@ from semfov.errors import InputError
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import pool_all
-from semfov.zoom.export import LOOK_METADATA_KEY, export_look
+from semfov.zoom.export import _LOOK_METADATA_KEY, export_look
 from semfov.zoom.glances import LiveGlances, on_lattice
 
 ort = pytest.importorskip("onnxruntime")
@@ -168,7 +168,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
 def test_the_file_records_classes_input_size_and_cells(network, tmp_path):
     export_look(WindowEye(network), tmp_path / "look.onnx", cells=16)
     session = ort.InferenceSession(tmp_path / "look.onnx", providers=["CPUExecutionProvider"])
-    metadata = json.loads(session.get_modelmeta().custom_metadata_map[LOOK_METADATA_KEY])
+    metadata = json.loads(session.get_modelmeta().custom_metadata_map[_LOOK_METADATA_KEY])
     assert metadata == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
 
 

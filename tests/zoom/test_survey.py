@@ -6,7 +6,7 @@ from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
 from semfov.fit.windows_evidence import WindowResult, ZoomExample
-from semfov.fit.windows_survey import LookCounts, SurveyExample, fit_survey, judge_survey
+from semfov.fit.windows_survey import SurveyExample, _LookCounts, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import half_steps, on_lattice
@@ -114,7 +114,7 @@ def test_loss_equals_the_poisson_loss_window_by_window(survey):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
         terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
-    counted = LookCounts.of(mosaic, overview, overview.found)
+    counted = _LookCounts.of(mosaic, overview, overview.found)
     torch.testing.assert_close(counted.loss(survey, logs), torch.stack(terms).mean())
 
 
@@ -122,7 +122,7 @@ def test_objects_that_were_seen_before_are_not_new():
     mosaic = example(lambda look, window: 3)
     overview = mosaic.looks[0]
     for seen, new in ((0, 3), (2, 1), (12, 0)):
-        counts = LookCounts.of(mosaic, overview, torch.arange(12) < seen).counts
+        counts = _LookCounts.of(mosaic, overview, torch.arange(12) < seen).counts
         assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
 
 

@@ -7,11 +7,11 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.observation import count_misses
+from semfov.fit.observation import _count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.samples import SampleSettings
-from semfov.runs.zoom_samples import HeldOutMosaics, MosaicSampler, choose_windows
+from semfov.runs.zoom_samples import MosaicSampler, _choose_windows, _HeldOutMosaics
 from semfov.zoom.lattice import Lattice
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
@@ -25,19 +25,19 @@ def test_octaves_are_logarithms_of_the_magnifications():
 
 
 def test_windows_are_of_all_magnifications():
-    windows = choose_windows(LATTICE, 5, 0, "scene")
+    windows = _choose_windows(LATTICE, 5, 0, "scene")
     assert windows[0].tolist() == [0, 0, 0]
     assert torch.bincount(windows[:, 0]).tolist() == [1, *[5] * (LATTICE.levels - 1)]
     actions = set(map(tuple, LATTICE.actions.tolist()))
     assert all(tuple(window) in actions for window in windows.tolist())
-    assert torch.equal(windows, choose_windows(LATTICE, 5, 0, "scene"))
-    assert not torch.equal(windows, choose_windows(LATTICE, 5, 1, "scene"))
+    assert torch.equal(windows, _choose_windows(LATTICE, 5, 0, "scene"))
+    assert not torch.equal(windows, _choose_windows(LATTICE, 5, 1, "scene"))
 
 
 @pytest.mark.slow
 def test_every_nth_mosaic_is_made_of_held_out_photographs():
     kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
-    both = HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
+    both = _HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
     assert len(both) == 6
     for index in range(6):
         own = Mosaics(held if index % 3 == 0 else kept, 2, 2, tile=(64, 48), count=6)
@@ -74,7 +74,7 @@ def test_samples_are_detections_with_octaves(sampler):
 @pytest.mark.slow
 def test_misses_are_counted_in_the_cells_that_a_window_shows(sampler):
     samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
-    counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
+    counts = _count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
     size = sampler.scenes.annotation(1).size
     cells = torch.zeros(3, dtype=torch.long)
     for x, y, magnification in samples.fixations.tolist():

@@ -145,31 +145,12 @@ def _with(belief: AnyBelief, inner: tuple[Belief, ...]) -> AnyBelief:
 
 
 def class_meant(belief: Belief, target: int) -> int:
-    """The class that a search is about: the likeliest one of several (`AnyBelief.likeliest`), otherwise the target.
-
-    Args:
-        belief: belief of one episode.
-        target: class 1..K that was asked for.
-
-    Returns:
-        The class.
-    """
+    """The class that a search is about: the likeliest one of several (`AnyBelief.likeliest`), otherwise the target."""
     return int(belief.likeliest()) if isinstance(belief, AnyBelief) else target
 
 
 def weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
-    """Weights by class index for a target that is any of several classes.
-
-    Args:
-        target: weights by class name or index 1..K; names are looked up by `class_index`.
-        classes: names of the K classes.
-
-    Returns:
-        Weights by class index 1..K.
-
-    Raises:
-        InputError: a class is unknown or given twice, or no class is given.
-    """
+    """Weights by class index for a target that is any of several classes."""
     check(len(target) > 0, "target", "a class, or several classes with weights", "none")
     weights: dict[int, float] = {}
     for name, weight in target.items():

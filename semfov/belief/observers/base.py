@@ -14,7 +14,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
-Kind = TypeVar("Kind")
+_Kind = TypeVar("_Kind")
 
 
 class Look:
@@ -164,15 +164,8 @@ class Observer(nn.Module, ABC):
         return self.update(belief, self.weigh(detections, fixation, grid, target))
 
 
-def own(value: object, kind: type[Kind], argument: str) -> Kind:
-    """Check that a belief or a look is of the kind that an observer makes.
-
-    Returns:
-        The belief or the look.
-
-    Raises:
-        InputError: it comes from another observer.
-    """
+def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
+    """Check that a belief or a look is of the kind that an observer makes."""
     if not isinstance(value, kind):
         raise InputError(
             f"{argument}: expected {kind.__name__}, got {type(value).__name__}; use the belief and the looks of one "

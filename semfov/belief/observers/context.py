@@ -15,14 +15,10 @@ from semfov.errors import InputError
 
 
 @dataclass(frozen=True)
-class ContextLook(Look):
+class _ContextLook(Look):
     """Evidence of looks about the target, and the classes that they show in each cell.
 
-    Attributes:
-        inner: looks of the inner observer.
-        presence: `(B, X·Y, K+1)`, highest score of each class in each cell (`presence_of`).
-        target: `(B,)`, the class that is searched for.
-        grid: the cells.
+    Shapes: presence `(B, X·Y, K+1)`, target `(B,)`.
     """
 
     inner: Look
@@ -110,7 +106,7 @@ class Context(Observer):
         nothing = like.new_zeros(batch, len(grid), len(self.prior.classes) + 1)
         return ContextBelief(even, even, inner.closest, inner, nothing)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> ContextLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _ContextLook:
         """Evidence for the target, and the classes that are shown in each cell.
 
         Returns:
@@ -123,17 +119,17 @@ class Context(Observer):
             raise InputError("target: expected a class to search for, got None")
         inner = self.observer.weigh(detections, fixation, grid, target)
         targets = torch.full((len(fixation),), target, device=fixation.device)
-        return ContextLook(inner, presence_of(detections, grid), targets, grid)
+        return _ContextLook(inner, presence_of(detections, grid), targets, grid)
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> ContextBelief:
         """Fade the belief of the inner observer and the scores of the shown classes."""
-        belief, look = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
+        belief, look = own(belief, ContextBelief, "belief"), own(look, _ContextLook, "look")
         inner = self.observer.fade(belief.inner, look.inner, keep, visited)
         return replace(belief, inner=inner, closest=inner.closest, scores=keep * belief.scores)
 
     def update(self, belief: Belief, look: Look) -> ContextBelief:
         """Update the inner belief and the shown classes, and add the context."""
-        belief, look = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
+        belief, look = own(belief, ContextBelief, "belief"), own(look, _ContextLook, "look")
         grid, targets = look.grid, look.target
         inner = self.observer.update(belief.inner, look.inner)
         presence = torch.maximum(belief.scores, look.presence)

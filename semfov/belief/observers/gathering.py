@@ -15,7 +15,7 @@ from semfov.belief.evidence import Evidence, farther, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
 
-READ = ("closest", "score", "looks", "visited")
+_READ = ("closest", "score", "looks", "visited")
 """Gathered values that the networks read without change, in the order of `Gathered`."""
 
 
@@ -23,13 +23,7 @@ READ = ("closest", "score", "looks", "visited")
 class EvidenceLook(Look):
     """Evidence of looks about one class in every cell, or about T classes at once.
 
-    Attributes:
-        evidence: `(B, X·Y)` or `(B, T, X·Y)`, log odds.
-        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
-        score: `(B,)` or `(B, T)`, highest score of each class in any detection.
-        fixated: `(B,)`, the cell that holds the fixation.
-        target: `(B,)` or `(B, T)`, the classes.
-        columns: X, cells in a row.
+    Shapes: evidence `(B, X·Y)`, distance `(B, X·Y)`, score `(B,)`, fixated `(B,)`, target `(B,)`.
     """
 
     evidence: Tensor
@@ -44,15 +38,7 @@ class EvidenceLook(Look):
 class GatheredBelief(Belief, ABC):
     """Base of beliefs that are computed from the evidence of all looks, about one class or about each of K classes.
 
-    Attributes:
-        closest: `(B, X·Y)`, see `Belief`.
-        nearest: `(B, X·Y)` or `(B, K, X·Y)`, evidence of the closest look at each cell.
-        best: in the same shape, strongest evidence of any look.
-        total: in the same shape, sum of the evidence of all looks, weighted by their nearness.
-        weight: `(B, X·Y)`, sum of the nearness of all looks.
-        score: `(B,)` or `(B, K)`, highest score of each class in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
+    Shapes: closest `(B, X·Y)`, nearest `(B, X·Y)`, weight `(B, X·Y)`, score `(B,)`, looks `(B,)`, visited `(B, X·Y)`.
     """
 
     closest: Tensor
@@ -66,11 +52,7 @@ class GatheredBelief(Belief, ABC):
 
 
 class Gatherer(Observer):
-    """Base of the observers with learned evidence.
-
-    Args:
-        together: compute all episodes of a batch at once; faster, but the rounding then depends on the batch.
-    """
+    """Base of the observers with learned evidence."""
 
     model: Evidence
 
@@ -133,7 +115,7 @@ class Gatherer(Observer):
         """Inputs of the networks: the attributes of `Gathered` up to the class, for one class or several."""
         total, weight = gathered["total"], gathered["weight"]
         mean = total / (weight if total.ndim == weight.ndim else weight[:, None])
-        return [gathered["nearest"], gathered["best"], mean, *(gathered[name] for name in READ)]
+        return [gathered["nearest"], gathered["best"], mean, *(gathered[name] for name in _READ)]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
         r"""Discount the gathered evidence, and count the closest look as one from farther away; see `Observer.fade`.

@@ -20,7 +20,7 @@ from semfov.errors import check, lookup
 CellMemory = Literal["all", "closest"]
 
 
-class MissLikelihood(Protocol):
+class _MissLikelihood(Protocol):
     """Protocol of a model of miss rates, as `semfov.FovealObservationModel` is one."""
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class Semantic(Observer):
     """
 
     observation: Observation | None
-    misses: MissLikelihood | None
+    misses: _MissLikelihood | None
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Semantic(Observer):
         footprint: Footprint = "overlap",
         tempering: float = 1.0,
         memory: CellMemory = "all",
-        misses: MissLikelihood | None = None,
+        misses: _MissLikelihood | None = None,
     ) -> None:
         super().__init__()
         check(prior > 0, "prior", "a positive number", prior)

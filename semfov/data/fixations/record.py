@@ -96,26 +96,20 @@ class Letterbox:
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
-def resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
+def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
     """Convert points to pixels of the same frame at another size.
-
-    Args:
-        points: `(n, 2)`.
-        size: `(width, height)` of the frame that the points refer to.
-        new: the other `(width, height)` of the frame.
-
-    Returns:
-        `(n, 2)` in pixels of the frame at the other size.
 
     The centre of the first cell has coordinate 0 in cells. With cells of 50 pixels it is at 24.5 in pixels:
 
     >>> resized_points(np.array([[0.0, 1.0]]), (32, 24), (1600, 1200))
     array([[24.5, 74.5]])
+
+    Shapes: points `(n, 2)`, size `(width, height)`, new `(width, height)` → `(n, 2)`.
     """
     return np.asarray((points + 0.5) * (np.array(new) / np.array(size)) - 0.5)
 
 
-def resized_box(box: tuple[float, ...], size: _Size, new: _Size) -> tuple[float, float, float, float]:
+def _resized_box(box: tuple[float, ...], size: _Size, new: _Size) -> tuple[float, float, float, float]:
     """A box `(x1, y1, x2, y2)`, pixel edges, in pixels of the same frame at another size."""
     return _box(np.array(box).reshape(2, 2) * (np.array(new) / np.array(size)))
 
@@ -128,7 +122,7 @@ def _box(corners: _Array) -> tuple[float, float, float, float]:
 FixationValues = NDArray[np.float64]
 ObjectBox = tuple[float, float, float, float]
 
-FAR = 0.5
+_FAR = 0.5
 """Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
 
 
@@ -183,8 +177,8 @@ class Fixations:
         Returns:
             The converted record.
         """
-        box = None if self.box is None else resized_box(self.box, self.size, size)
-        return replace(self, points=resized_points(self.points, self.size, size), size=size, box=box)
+        box = None if self.box is None else _resized_box(self.box, self.size, size)
+        return replace(self, points=_resized_points(self.points, self.size, size), size=size, box=box)
 
     def in_picture(self, size: tuple[int, int]) -> Fixations:
         """Convert the fixations to pixels of a picture that was shown letterboxed on the frame.
@@ -218,8 +212,8 @@ class Fixations:
 
 
 def warn_outside(source: str | PathLike[str], fixations: list[Fixations]) -> list[Fixations]:
-    """Warn of fixations that lie farther than `FAR` outside their frame, with their share; returns the records."""
-    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > FAR * max(each.size) for each in fixations]
+    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share; returns the records."""
+    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > _FAR * max(each.size) for each in fixations]
     count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
     if count:
         first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())

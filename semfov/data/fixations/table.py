@@ -14,19 +14,21 @@ from semfov.data.fixations.record import Fixations, ObjectBox, warn_outside
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, write_text
 
-COLUMNS = ("picture", "subject", "x", "y", "width", "height")
+_COLUMNS = ("picture", "subject", "x", "y", "width", "height")
 """Columns that a table must have."""
-MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found")
+_MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found")
 """Further columns that a table may have; their fields may be empty."""
 
 
 def read_table(path: str | PathLike[str]) -> list[Fixations]:
     r"""Read fixations from a table.
 
-    The first line holds the names of the columns (`COLUMNS` and `MORE`). The lines of one scanpath follow each other in
-    order, and a new scanpath begins where picture, subject or target change. `x` and `y` are in pixels of a frame of
-    `width` × `height`, pixel centres at integers. `duration` is in milliseconds. `x1`, `y1`, `x2` and `y2` are the
-    target's box. `found` is `true` or `false`. pandas writes such a table by `frame.to_csv(path, index=False)`.
+    The first line holds the names of the columns: `picture`, `subject`, `x`, `y`, `width` and `height`, and perhaps
+    `target`, `duration`, `x1`, `y1`, `x2`, `y2` and `found`, whose fields may be empty. The lines of one scanpath
+    follow each other in order, and a new scanpath begins where picture, subject or target change. `x` and `y` are in
+    pixels of a frame of `width` × `height`, pixel centres at integers. `duration` is in milliseconds. `x1`, `y1`, `x2`
+    and `y2` are the target's box. `found` is `true` or `false`. pandas writes such a table by
+    `frame.to_csv(path, index=False)`.
 
     Args:
         path: the file.
@@ -51,9 +53,9 @@ def read_table(path: str | PathLike[str]) -> list[Fixations]:
         lines = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
-    missing = [name for name in COLUMNS if lines and name not in lines[0]]
+    missing = [name for name in _COLUMNS if lines and name not in lines[0]]
     if missing:
-        raise DataError(f"{path}: expected the columns {', '.join(COLUMNS)}, got none named {', '.join(missing)}")
+        raise DataError(f"{path}: expected the columns {', '.join(_COLUMNS)}, got none named {', '.join(missing)}")
     groups: list[list[tuple[int, Mapping[str, str]]]] = []
     previous = None
     for number, line in enumerate(lines, start=2):
@@ -81,7 +83,7 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     """
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow([*COLUMNS, *MORE])
+    rows.writerow([*_COLUMNS, *_MORE])
     for each in fixations:
         times = [""] * len(each) if each.durations is None else each.durations.tolist()
         box = [""] * 4 if each.box is None else each.box

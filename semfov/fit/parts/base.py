@@ -24,7 +24,7 @@ from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
 
-FEW = 8
+_FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
@@ -38,13 +38,7 @@ _LONGEST = 15
 
 @dataclass(frozen=True)
 class PartResult:
-    """A fitted part with its report.
-
-    Attributes:
-        part: the part's entry in the manifest of the folder.
-        report: report in Markdown.
-        figures: names of its figures in the folder.
-    """
+    """A fitted part with its report."""
 
     part: Part
     report: str
@@ -52,12 +46,7 @@ class PartResult:
 
 
 class PartInputs:
-    """The looks that all parts are fitted to, and the parts that are finished.
-
-    Args:
-        config: the settings.
-        run: the finished looks from every cell of all photographs.
-    """
+    """The looks that all parts are fitted to, and the parts that are finished."""
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.config, self.run = config.sized(len(run.scenes)), run
@@ -75,7 +64,7 @@ class PartInputs:
     @property
     def absent(self) -> int | None:
         """Number of absent classes to learn from in a photograph; None for as many as present ones."""
-        return 2 if self.components <= FEW else None
+        return 2 if self.components <= _FEW else None
 
     @property
     def judged(self) -> Sequence[int]:
@@ -121,14 +110,7 @@ class PartInputs:
 
 
 class PartFit(ABC):
-    """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it.
-
-    Args:
-        inputs: the looks and the finished parts.
-
-    Attributes:
-        name: name of the part, one of `semfov.io.manifest.PARTS`.
-    """
+    """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it."""
 
     name: ClassVar[str]
 

@@ -28,12 +28,7 @@ FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, Ve
 
 
 class FolderFit:
-    """Fit the parts to a detector.
-
-    Args:
-        config: the settings.
-        run: the finished looks from every cell of all photographs.
-    """
+    """Fit the parts to a detector."""
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.inputs = PartInputs(config, run)

@@ -40,9 +40,9 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances
 from semfov.zoom.slices import ranked, usual_slices
 
-ENOUGH = 16
+_ENOUGH = 16
 """Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
-RECALL_PASSES = (4, 8, 16)
+_RECALL_PASSES = (4, 8, 16)
 """Passes of the detector after which recall is reported."""
 _OF_INPUT = 1.15
 """Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
@@ -51,17 +51,13 @@ _FOR_MOSAICS = 360
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
-Way = Callable[[Glances], Iterator[WindowStep[Any]]]
+_Way = Callable[[Glances], Iterator[WindowStep[Any]]]
 """A way of looking for all objects of a picture."""
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """Settings of evidence that is not fitted.
-
-    Attributes:
-        why: the reason, in a sentence.
-    """
+class _LeftOut:
+    """Settings of evidence that is not fitted."""
 
     why: str
 
@@ -72,14 +68,14 @@ class WindowsFit(PartFit):
     name: ClassVar[str] = "windows"
 
     @property
-    def settings(self) -> FitZoomConfig | LeftOut:
+    def settings(self) -> FitZoomConfig | _LeftOut:
         """The settings of the fit."""
         if not self.config.windows:
-            return LeftOut("not fitted, since the setting `windows` is false")
+            return _LeftOut("not fitted, since the setting `windows` is false")
         photographs, held_out = len(self.run.scenes), len(self.inputs.held_out)
-        if held_out < ENOUGH:
-            return LeftOut(
-                f"not fitted, since mosaics need at least {ENOUGH} held-out photographs, and {held_out} of the "
+        if held_out < _ENOUGH:
+            return _LeftOut(
+                f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
         return self.mosaics(photographs)
@@ -121,7 +117,7 @@ class WindowsFit(PartFit):
     def tasks(self) -> dict[str, float]:
         """The tasks and their seconds."""
         config = self.settings
-        if isinstance(config, LeftOut):
+        if isinstance(config, _LeftOut):
             return {}
         sets = {"searched": config.searched, "judged": config.judged}
         return {
@@ -139,7 +135,7 @@ class WindowsFit(PartFit):
     def fit(self) -> PartResult:
         """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
         config = self.settings
-        if isinstance(config, LeftOut):
+        if isinstance(config, _LeftOut):
             return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
         with one_thread():
             return self._fit(config)
@@ -152,24 +148,24 @@ class WindowsFit(PartFit):
         judged = mosaics["judged"]
         opened = open_all(eye, judged, store)
         curves = {
-            "fitted": photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
-            "raw": photograph_recalls(judged, opened, in_raw_order),
+            "fitted": _photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
+            "raw": _photograph_recalls(judged, opened, _in_raw_order),
         }
         gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
-        at = RECALL_PASSES[-1] - 1
+        at = _RECALL_PASSES[-1] - 1
         why = (
-            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {RECALL_PASSES[-1]} passes, "
+            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {_RECALL_PASSES[-1]} passes, "
             f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
             f"passes {in_words(gain, 'points gained', 100)}"
         )
-        rows = [["looks", *(f"after {n} passes" for n in RECALL_PASSES), "mean"]]
+        rows = [["looks", *(f"after {n} passes" for n in _RECALL_PASSES), "mean"]]
         rows += [
-            [name, *(mean_percent(curve[:, n - 1]) for n in RECALL_PASSES), mean_percent(curve.mean(1))]
+            [name, *(mean_percent(curve[:, n - 1]) for n in _RECALL_PASSES), mean_percent(curve.mean(1))]
             for name, curve in curves.items()
         ]
         text = section(
             f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
-            f"objects of each photograph, and the mean over 1 to {RECALL_PASSES[-1]} passes. `raw` looks at slices in "
+            f"objects of each photograph, and the mean over 1 to {_RECALL_PASSES[-1]} passes. `raw` looks at slices in "
             "the order of the sums of the overview's raw scores, as the agent does without this part.",
             rows,
         )
@@ -179,17 +175,7 @@ class WindowsFit(PartFit):
 def fit_mosaics(
     config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, str]:
-    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers.
-
-    Args:
-        config: the settings.
-        eye: the eye that looks.
-        mosaics: the mosaics (`make_mosaics`).
-        store: store of the looks.
-
-    Returns:
-        The model and a report in Markdown.
-    """
+    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
     examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
     model = fit_looks(config, eye, mosaics["near"], examples)
     survey_again(config, model, examples)
@@ -200,24 +186,15 @@ def fit_mosaics(
     return model, "\n".join(lines)
 
 
-def in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
+def _in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
     """Look at slices in the order of the overview's scores, as an agent without evidence does."""
     return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
 
 
 @torch.inference_mode()
-def photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: Way) -> FloatArray:
-    """Measure the recall in each photograph of some mosaics after each pass.
-
-    Args:
-        mosaics: the mosaics.
-        opened: the looks at each of them.
-        way: the way of looking.
-
-    Returns:
-        `(P, 16)`, the share of its objects that were found, for each photograph with objects in any mosaic.
-    """
-    hits, there = np.zeros((len(mosaics.scenes), RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
+def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: _Way) -> FloatArray:
+    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`."""
+    hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
         photograph = np.repeat(
@@ -226,7 +203,7 @@ def photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: W
         np.add.at(there, photograph, 1)
         history: list[Glance] = []
         turns = way(glances)
-        for number in range(RECALL_PASSES[-1]):
+        for number in range(_RECALL_PASSES[-1]):
             turn = next(turns, None)
             if turn is not None:
                 history.append(turn.glance)

@@ -245,14 +245,10 @@ def divergence(outlook: Outlook) -> Tensor:
 def lead(mean: Tensor) -> Tensor:
     """Margin of the most probable class: its probability minus the second largest one.
 
-    Args:
-        mean: `(..., K+1)`, probabilities.
-
-    Returns:
-        `(...)`.
-
     >>> lead(torch.tensor([0.2, 0.5, 0.3]))
     tensor(0.2000)
+
+    Shapes: mean `(..., K+1)`.
     """
     first, place = mean.max(-1, keepdim=True)
     return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)

@@ -24,19 +24,13 @@ class SignalModel(ScoringModel, Protocol):
         ...
 
 
-class SignalSearch(AcquisitionFunction):
+class _SignalSearch(AcquisitionFunction):
     """Base of the ideal searchers of Najemnik and Geisler: there is one target, and it is seen through Gaussian noise.
 
     The prior of the target's place is its probability in every cell by the belief, scaled to sum to 1 over the cells
     not yet fixated: in a search that continues, no fixated cell held the target.
 
-    Args:
-        target: class 1..K, or a tensor `(B,)` with one for each episode.
-        model: the observation model, with miss rates (`semfov.observation.visibility`).
-        grid: the cells of one image.
-
-    Attributes:
-        signal: `(..., f, x)`, d' of a target in cell x seen from cell f, for each target.
+    Shapes: target `(B,)`, signal `(..., f, x)`.
     """
 
     target: Tensor
@@ -59,7 +53,7 @@ class SignalSearch(AcquisitionFunction):
         """Values `(B, X·Y)` for the prior of the place `(B, X·Y)` and d' `(B, f, x)`."""
 
 
-class EntropyLimit(SignalSearch):
+class EntropyLimit(_SignalSearch):
     r"""Entropy limit minimisation: the limit of the expected decrease of the entropy of the target's place by a look.
 
     .. math:: a(f) = \frac{1}{2} \sum_x q(x) \, d'^2(x, f), \qquad q \propto P(t \in x)
@@ -87,7 +81,7 @@ class EntropyLimit(SignalSearch):
         return (signal.square() @ place[..., None])[..., 0] / 2
 
 
-class CorrectLocalisation(SignalSearch):
+class CorrectLocalisation(_SignalSearch):
     r"""Probability that the most probable cell after a look is that of the target: the Bayesian ideal searcher.
 
     The cell x of the target gives a response :math:`W_x \sim N(1/2, 1/d'^2)`, and every other cell one of
@@ -126,27 +120,21 @@ class CorrectLocalisation(SignalSearch):
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
         """The integral, computed for one fixation at a time."""
-        return torch.stack([correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
+        return torch.stack([_correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
 
     def extra_repr(self) -> str:
         """The number of nodes."""
         return f"nodes={self.nodes}"
 
 
-def correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
+def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
     """Probability that the most probable cell after a look is that of the target; see `CorrectLocalisation`.
-
-    Args:
-        place: `(..., X·Y)`, prior q.
-        signal: `(..., X·Y)`, d' of every cell from the fixation, not negative.
-        nodes: number of nodes of the integral.
-
-    Returns:
-        `(...)`, probabilities.
 
     >>> even = torch.full((4,), 0.25)
     >>> correct_localisation(even, torch.zeros(4)), correct_localisation(even, torch.full((4,), 9.0))
     (tensor(0.2500), tensor(1.0000))
+
+    Shapes: place `(..., X·Y)`, signal `(..., X·Y)`.
     """
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
     weight = (-noise.square() / 2).softmax(0)

@@ -35,11 +35,7 @@ class Outlook:
     The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
     and N M in place of N below.
 
-    Attributes:
-        beta: β, `(..., X·Y, K+1)`, Dirichlet parameters.
-        total: T = Σ β, `(..., X·Y)`.
-        mean: p = β / T, `(..., X·Y, K+1)`.
-        evidence: r = λ / Σ p λ, `(..., X·Y, N, K+1)`, the likelihoods λ of the expected look, as factors on the mean.
+    Shapes: beta `(..., X·Y, K+1)`, total `(..., X·Y)`, mean `(..., X·Y, K+1)`, evidence `(..., X·Y, N, K+1)`.
     """
 
     beta: Tensor
@@ -135,16 +131,8 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     return Outlook(beta, total, mean, evidence)
 
 
-def mean_over_samples(values: Tensor, likelihoods: Tensor) -> Tensor:
-    """Mean over the looks of each level.
-
-    Args:
-        values: `(..., N M)`, a value for each belief of `look_ahead_by_samples`.
-        likelihoods: `(K+1, N, M, K+1)`, the likelihoods that were given to it.
-
-    Returns:
-        `(..., N)`.
-    """
+def _mean_over_samples(values: Tensor, likelihoods: Tensor) -> Tensor:
+    """Mean over the looks of each level; values `(..., N M)`, likelihoods `(K+1, N, M, K+1)` → `(..., N)`."""
     return values.unflatten(-1, likelihoods.shape[1:3]).mean(-1)
 
 
@@ -154,12 +142,7 @@ class Lookahead(AcquisitionFunction):
     The update of a cell depends on the fixation only through the level of the distance between them. Every cell is
     therefore updated N times instead of X·Y times, and `forward` looks up the level that applies to each fixation.
 
-    Args:
-        model: the observation model (`semfov.FovealObservationModel`).
-        grid: the cells, of one image or of a batch.
-        likelihoods: `(K+1, N, M, K+1)`, likelihoods of drawn looks
-            (`semfov.gaze.acquisition.samples.sampled_likelihoods`); the value of a cell is then
-            its mean over them. None takes the value after the expected scores, as published.
+    Shapes: likelihoods `(K+1, N, M, K+1)`.
     """
 
     levels: Tensor
@@ -184,7 +167,7 @@ class Lookahead(AcquisitionFunction):
                 cells = self.cell_values(look_ahead(maps, expected))
             else:
                 assert drawn is not None
-                cells = mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
+                cells = _mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
             return self.pool(at_levels(cells, self.levels))
 
         if beta.ndim == 2 or self.levels.ndim > 2:
@@ -205,11 +188,6 @@ class Lookahead(AcquisitionFunction):
 def at_levels(values: Tensor, levels: Tensor) -> Tensor:
     """Select the value of every cell at its level of distance from each fixation.
 
-    Args:
-        values: `(..., X·Y, N)`, for every cell and level.
-        levels: `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, level of the distance between every two cells.
-
-    Returns:
-        `(..., seen cell, fixation)`.
+    Shapes: values `(..., X·Y, N)`, levels `(X·Y, X·Y)` → `(..., seen cell, fixation)`.
     """
     return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))

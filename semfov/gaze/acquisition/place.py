@@ -22,19 +22,10 @@ class MissModel(Protocol):
         ...
 
 
-class TargetVisibility(AcquisitionFunction):
+class _TargetVisibility(AcquisitionFunction):
     """Base of the acquisition functions that use the probability of detecting the target from each fixation.
 
-    Args:
-        target: class 1..K, or a tensor `(B,)` with one for each episode.
-        model: the observation model, with miss rates.
-        grid: the cells of one image.
-
-    Attributes:
-        visibility: `(..., f, x)`, probability that a target in cell x is detected from cell f, for each target.
-
-    Raises:
-        InputError: the model has no miss rates.
+    Shapes: target `(B,)`, visibility `(..., f, x)`.
     """
 
     target: Tensor
@@ -59,7 +50,7 @@ class TargetVisibility(AcquisitionFunction):
         """Values `(B, X·Y)` for the target's probability `(B, X·Y)` and its visibility `(B, f, x)`."""
 
 
-class FovealHit(TargetVisibility):
+class FovealHit(_TargetVisibility):
     r"""Probability that a look detects the target in any cell, if cells are independent.
 
     .. math:: a(f) = 1 - \prod_x \bigl(1 - p_t(x) \, v_t(d(x, f))\bigr), \qquad v_t = 1 - m_t
@@ -84,7 +75,7 @@ class FovealHit(TargetVisibility):
         return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
 
 
-class PlaceInformation(TargetVisibility):
+class PlaceInformation(_TargetVisibility):
     r"""Expected information that the next look gives about the target's place, in nats.
 
     The place is distributed as :math:`q(x) \propto p_t(x)`. If the target is at x, a look from f detects it with

@@ -12,7 +12,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.lookahead import LevelledModel, at_levels, look_ahead, look_ahead_by_samples
 
 
-class ExpectingModel(Protocol):
+class _ExpectingModel(Protocol):
     """The part of an observation model that the prediction needs (`semfov.FovealObservationModel`)."""
 
     def expected_scores(self) -> Tensor:
@@ -82,7 +82,7 @@ class PredictedTargetPosterior(AcquisitionFunction):
     target: Tensor
     likelihoods: Tensor | None
 
-    def __init__(self, target: int | Tensor, model: ExpectingModel, *, likelihoods: Tensor | None = None) -> None:
+    def __init__(self, target: int | Tensor, model: _ExpectingModel, *, likelihoods: Tensor | None = None) -> None:
         super().__init__()
         self.model = model
         self.register_buffer("target", torch.as_tensor(target))

@@ -52,7 +52,7 @@ class SaliencyMaximum(TablePolicy):
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
     ) -> AcquisitionFunction:
         """The saliency of all cells, seen from the fixated one."""
-        return Static(salient_from(required_table(table, self), cell))
+        return Static(salient_from(_required_table(table, self), cell))
 
 
 class TemplateSearch(TablePolicy):
@@ -84,10 +84,10 @@ class TemplateSearch(TablePolicy):
         self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
     ) -> AcquisitionFunction:
         """The attention to the target, accumulated over the fixated cells."""
-        return TemplateAttention(required_target(target, self.name), required_table(table, self), grid, self.fovea)
+        return TemplateAttention(required_target(target, self.name), _required_table(table, self), grid, self.fovea)
 
 
-def required_table(table: Tensor | None, policy: Policy) -> Tensor:
+def _required_table(table: Tensor | None, policy: Policy) -> Tensor:
     """Return the table that a policy needs, or raise an error where there is none."""
     if table is None:
         raise InputError(f"policy {policy.name!r}: expected the {policy.table} of the scene, got none")
@@ -97,11 +97,6 @@ def required_table(table: Tensor | None, policy: Policy) -> Tensor:
 def salient_from(saliency: Tensor, cell: Tensor) -> Tensor:
     """Saliency of all cells in the view from the fixated `cell` of each episode.
 
-    Args:
-        saliency: `(X·Y, X·Y)`, a row for the view from each cell, or `(1, X·Y)`, the same for all of them.
-        cell: `(B,)`.
-
-    Returns:
-        `(B, X·Y)`.
+    Shapes: saliency `(X·Y, X·Y)`, cell `(B,)` → `(B, X·Y)`.
     """
     return saliency[cell if len(saliency) > 1 else torch.zeros_like(cell)]

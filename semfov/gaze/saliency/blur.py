@@ -41,19 +41,10 @@ def gaussian_kernel(sigma: float) -> Tensor:
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
     """Blur with a Gaussian, where the border pixels are repeated: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
 
-    Args:
-        image: `(B, C, H, W)`.
-        sigma: standard deviation in pixels (`gaussian_kernel`).
-        halve: keep only the first of every two pixels, `floor(n / 2)` of n (at least 1) along each axis.
-
-    Returns:
-        `(B, C, H, W)`, or about half of H and W with `halve`.
-
-    Raises:
-        InputError: the image is empty or of another shape, or σ is not positive.
-
     >>> gaussian_blur(torch.ones(1, 3, 5, 7), 2.0, halve=True).shape
     torch.Size([1, 3, 2, 3])
+
+    Shapes: image `(B, C, H, W)` → `(B, C, H, W)`.
     """
     check_shape(image, "image", None, None, None, None)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
@@ -65,15 +56,10 @@ def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Enlarge an image by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
 
-    Args:
-        image: `(..., h, w)`.
-        size: `(height, width)` of the result in pixels.
-
-    Returns:
-        `(..., height, width)`.
-
     >>> enlarge(torch.rand(1, 2, 3), (4, 5)).shape
     torch.Size([1, 4, 5])
+
+    Shapes: image `(..., h, w)`, size `(height, width)` → `(..., height, width)`.
     """
     check_shape(image, "image", None, None)
     if tuple(image.shape[-2:]) == tuple(size):

@@ -17,19 +17,10 @@ def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion =
 
     Fusion within and then across features gives the same result, because all features have the same number of maps.
 
-    Args:
-        maps: one tensor `(B, N, h, w)` for each size of map, all with the same N.
-        size: `(height, width)` of the result.
-        fusion: `mean` or `max`.
-
-    Returns:
-        `(B, height, width)`.
-
-    Raises:
-        InputError: there is no map, their shapes do not fit together, or there is no such `fusion`.
-
     >>> combine_maps([torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 3)], (4, 6)).mean()
     tensor(0.5000)
+
+    Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
     """
     lookup(fusion, get_args(Fusion), "fusion")
     check(len(maps) > 0, "maps", "at least one tensor", 0)
@@ -45,16 +36,11 @@ def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion =
 def rescale(saliency: Tensor, flat: float = 0.0) -> Tensor:
     """Shift and scale maps to [0, 1].
 
-    Args:
-        saliency: `(..., H, W)`.
-        flat: a map whose range is at most `flat` becomes 0 everywhere.
-
-    Returns:
-        The same shape.
-
     >>> rescale(torch.tensor([[1.0, 3.0], [2.0, 1.0]]))
     tensor([[0.0000, 1.0000],
             [0.5000, 0.0000]])
+
+    Shapes: saliency `(..., H, W)`.
     """
     low, high = saliency.amin((-2, -1), keepdim=True), saliency.amax((-2, -1), keepdim=True)
     span = high - low

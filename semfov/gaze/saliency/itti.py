@@ -13,8 +13,8 @@ from semfov.gaze.saliency.opponent import anchor, double_opponency
 from semfov.sensor.pyramid import pyrdown
 
 CENTRES = (2, 3, 4)
-DELTAS = (3, 4)
-ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
+_DELTAS = (3, 4)
+_ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
 
 # Itti, Koch and Niebur (1998) print no sizes of their Gabor filters; these are the SaliencyToolbox's (Walther and
 # Koch, 2006).
@@ -28,21 +28,13 @@ _PEAK = 0.1
 _FLAT = 32
 
 
-def dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
+def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     """Dyadic Gaussian pyramid (`cv2.pyrDown`).
-
-    Args:
-        channels: `(B, C, H, W)`.
-        levels: number of the last level, 0 or more.
-
-    Returns:
-        Levels 0 to `levels`; level 0 is `channels`.
-
-    Raises:
-        InputError: `levels` is negative.
 
     >>> [tuple(level.shape[-2:]) for level in dyadic_pyramid(torch.rand(1, 3, 9, 12), 3)]
     [(9, 12), (5, 6), (3, 3), (2, 2)]
+
+    Shapes: channels `(B, C, H, W)`.
     """
     check(levels >= 0, "levels", "0 or more", levels)
     pyramid = [channels]
@@ -51,7 +43,7 @@ def dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     return pyramid
 
 
-def gabor_kernels(orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
+def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     r"""Even and odd Gabor filters without response to a uniform image.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
@@ -79,33 +71,28 @@ def gabor_kernels(orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
     return kernels / kernels.abs().sum((-2, -1), keepdim=True)
 
 
-def orientation_energy(intensity: Tensor, orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
+def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
-
-    Args:
-        intensity: `(B, 1, h, w)`.
-        orientations: n angles in degrees.
-
-    Returns:
-        `(B, n, h, w)`, not negative.
 
     >>> orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
     tensor(3)
+
+    Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
     check_shape(intensity, "intensity", None, 1, None, None)
-    kernels = gabor_kernels(orientations).to(intensity)
+    kernels = _gabor_kernels(orientations).to(intensity)
     reach = _TAPS // 2
     answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels[:, None])
     return answers.abs().unflatten(1, (-1, 2)).sum(2)
 
 
-def across_scales(centre: Tensor, surround: Tensor) -> Tensor:
+def _across_scales(centre: Tensor, surround: Tensor) -> Tensor:
     """Difference of two scales, `|centre - surround|`, after bilinear enlargement of the coarser to the finer."""
     size = (centre.shape[-2], centre.shape[-1])
     return (centre - F.interpolate(surround, size, mode="bilinear", align_corners=False)).abs()
 
 
-def promote(maps: Tensor) -> Tensor:
+def _promote(maps: Tensor) -> Tensor:
     r"""Map normalisation of Itti, Koch and Niebur (1998): promote maps with one strong peak, suppress those with many.
 
     .. math:: N(M) = M \, (1 - \bar m)^2
@@ -134,15 +121,11 @@ def promote(maps: Tensor) -> Tensor:
 def local_maxima(maps: Tensor) -> Tensor:
     """Local maxima: pixels above their earlier neighbours and no less than their later ones, in row-major order.
 
-    Args:
-        maps: `(..., h, w)`.
-
-    Returns:
-        The same shape, boolean.
-
     >>> local_maxima(torch.tensor([[1.0, 3.0, 3.0], [0.0, 2.0, 1.0]])).int()
     tensor([[0, 1, 0],
             [0, 0, 0]], dtype=torch.int32)
+
+    Shapes: maps `(..., h, w)`.
     """
     height, width = maps.shape[-2:]
     padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
@@ -172,18 +155,18 @@ def conspicuity(image: Tensor) -> Tensor:
     Returns:
         `(B, 3, h, w)`.
     """
-    levels = max(CENTRES) + max(DELTAS)
-    pyramid = dyadic_pyramid(anchor(double_opponency(image)), levels)
-    features = [torch.cat([level, orientation_energy(level[:, :1])], 1) for level in pyramid[min(CENTRES) :]]
+    levels = max(CENTRES) + max(_DELTAS)
+    pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
+    features = [torch.cat([level, _orientation_energy(level[:, :1])], 1) for level in pyramid[min(CENTRES) :]]
     total = torch.zeros((), dtype=image.dtype, device=image.device)
     for centre in CENTRES:
         here = features[centre - min(CENTRES)]
-        around = [features[centre - min(CENTRES) + delta] for delta in DELTAS]
-        maps = promote(torch.stack([across_scales(here, surround) for surround in around], 1)).sum(1)
+        around = [features[centre - min(CENTRES) + delta] for delta in _DELTAS]
+        maps = _promote(torch.stack([_across_scales(here, surround) for surround in around], 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
-        total = total + dyadic_pyramid(maps, max(CENTRES) - centre)[-1]
-    intensity, colour, orientation = total.split([1, 2, len(ORIENTATIONS)], 1)
-    channels = [intensity, colour.sum(1, keepdim=True), promote(orientation).sum(1, keepdim=True)]
+        total = total + _dyadic_pyramid(maps, max(CENTRES) - centre)[-1]
+    intensity, colour, orientation = total.split([1, 2, len(_ORIENTATIONS)], 1)
+    channels = [intensity, colour.sum(1, keepdim=True), _promote(orientation).sum(1, keepdim=True)]
     return torch.cat(channels, 1)
 
 
@@ -192,7 +175,7 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
 
     .. math:: S = \tfrac{1}{3} (N(\bar I) + N(\bar C) + N(\bar O))
 
-    It is computed at scale 4 and enlarged bilinearly to the size of the image; see `conspicuity` and `promote`.
+    It is computed at scale 4 and enlarged bilinearly to the size of the image; see `conspicuity`.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
@@ -212,7 +195,7 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
     """
     # Peaks depend on the last digits of a map: in half precision nearly every pixel is one, and no saliency remains.
     with torch.autocast(image.device.type, enabled=False):
-        saliency = promote(conspicuity(image)).mean(1, keepdim=True)
+        saliency = _promote(conspicuity(image)).mean(1, keepdim=True)
     size = (image.shape[-2], image.shape[-1])
     saliency = F.interpolate(saliency, size, mode="bilinear", align_corners=False)[:, 0]
     return rescale(saliency) if normalise else saliency

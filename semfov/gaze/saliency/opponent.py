@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from semfov.errors import check, check_shape
 
 
-def check_image(image: Tensor) -> None:
+def _check_image(image: Tensor) -> None:
     """Raise `InputError` unless `image` is a floating-point `(B, 3, H, W)` with at least one pixel."""
     check_shape(image, "image", 3, None, None)
     check(image.ndim == 4, "image", "a tensor of shape (B, 3, any, any)", tuple(image.shape))
@@ -29,7 +29,7 @@ def opponent_colours(image: Tensor) -> Tensor:
     >>> opponent_colours(torch.tensor([1.0, 0.0, 0.5]).reshape(1, 3, 1, 1)).flatten().tolist()
     [0.5, 1.0, 0.0]
     """
-    check_image(image)
+    _check_image(image)
     red, green, blue = image.unbind(1)
     return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
 
@@ -54,7 +54,7 @@ def lab_colours(image: Tensor) -> Tensor:
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.color import rgb_to_lab
 
-    check_image(image)
+    _check_image(image)
     return rgb_to_lab(image) / image.new_tensor([100.0, 255.0, 255.0])[:, None, None]
 
 
@@ -75,7 +75,7 @@ def double_opponency(image: Tensor) -> Tensor:
     >>> double_opponency(torch.tensor([0.5, 0.0, 0.0]).reshape(1, 3, 1, 1)).flatten().tolist()
     [0.1666666716337204, 3.0, 0.0]
     """
-    check_image(image)
+    _check_image(image)
     intensity = image.mean(1)
     visible = intensity > intensity.amax((-2, -1), keepdim=True) / 10
     gain = visible / torch.where(visible, intensity, 1.0)
@@ -91,10 +91,6 @@ def anchor(channels: Tensor) -> Tensor:
 
     Contrasts do not depend on it. The contrasts of a uniform image are then exactly 0, without rounding errors.
 
-    Args:
-        channels: `(B, C, H, W)`.
-
-    Returns:
-        The same shape.
+    Shapes: channels `(B, C, H, W)`.
     """
     return channels - channels[..., :1, :1]

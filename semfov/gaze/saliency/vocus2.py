@@ -11,27 +11,22 @@ from semfov.gaze.saliency.blur import gaussian_blur
 from semfov.gaze.saliency.conspicuity import Fusion, combine_maps, rescale
 from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
-ColorSpace = Literal["opponent", "lab"]
+_ColorSpace = Literal["opponent", "lab"]
 
 # Maps of `lab` with a smaller range, in units of the rounding error at 1, hold rounding errors alone.
 _FLAT = 8
 
 
-class Twin(NamedTuple):
-    """One scale of the twin pyramids.
-
-    Attributes:
-        centre: `(B, C, h, w)`.
-        surround: the same, blurred further.
-    """
+class _Twin(NamedTuple):
+    """One scale of the twin pyramids; centre `(B, C, h, w)`."""
 
     centre: Tensor
     surround: Tensor
 
 
-def twin_pyramids(
+def _twin_pyramids(
     channels: Tensor, centre_sigma: float = 2.0, surround_sigma: float = 6.0, layers: int = 5, scales: int = 2
-) -> list[list[Twin]]:
+) -> list[list[_Twin]]:
     r"""Centre and surround pyramids (Frintrop, Werner and Martin García, CVPR 2015, section 3.2).
 
     Each layer has half the size of the one before. A layer has S scales, each computed by further blur of the one
@@ -65,30 +60,23 @@ def twin_pyramids(
     # From one scale to the next the variance grows by this factor.
     growth = 2 ** (2 / scales)
     centre = gaussian_blur(channels, centre_sigma)
-    pyramids: list[list[Twin]] = []
+    pyramids: list[list[_Twin]] = []
     for layer in range(min(layers, min(channels.shape[-2:]).bit_length())):
         if layer > 0:
             centre = gaussian_blur(
                 centre, 2 ** ((scales - 1) / scales) * centre_sigma * (growth - 1) ** 0.5, halve=True
             )
-        twins = [Twin(centre, gaussian_blur(centre, wider))]
+        twins = [_Twin(centre, gaussian_blur(centre, wider))]
         for scale in range(1, scales):
             step = 2 ** ((scale - 1) / scales) * centre_sigma * (growth - 1) ** 0.5
             centre = gaussian_blur(centre, step)
-            twins.append(Twin(centre, gaussian_blur(centre, 2 ** (scale / scales) * wider)))
+            twins.append(_Twin(centre, gaussian_blur(centre, 2 ** (scale / scales) * wider)))
         pyramids.append(twins)
     return pyramids
 
 
-def on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
+def _on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
     """Contrasts of bright on dark and of dark on bright.
-
-    Args:
-        centre: any shape.
-        surround: the same shape.
-
-    Returns:
-        `max(centre - surround, 0)` and `max(surround - centre, 0)`.
 
     >>> on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
     (tensor([0., 2.]), tensor([2., 0.]))
@@ -104,7 +92,7 @@ def vocus2_saliency(
     layers: int = 5,
     scales: int = 2,
     fusion: Fusion = "mean",
-    color_space: ColorSpace = "opponent",
+    color_space: _ColorSpace = "opponent",
     normalise: bool = True,
 ) -> Tensor:
     """Saliency by VOCUS2 (Frintrop, Werner and Martin García, "Traditional saliency reloaded", CVPR 2015).
@@ -140,11 +128,11 @@ def vocus2_saliency(
     True
     """
     lookup(fusion, ("mean", "max"), "fusion")
-    lookup(color_space, get_args(ColorSpace), "color space")
+    lookup(color_space, get_args(_ColorSpace), "color space")
     # Contrasts are small differences, so half precision is not enough.
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
-        pyramids = twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
+        pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
         saliency = combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
@@ -179,19 +167,19 @@ class VOCUS2(nn.Module):
         layers: int = 5,
         scales: int = 2,
         fusion: Fusion = "mean",
-        color_space: ColorSpace = "opponent",
+        color_space: _ColorSpace = "opponent",
         normalise: bool = True,
     ) -> None:
         super().__init__()
         _check_settings(centre_sigma, surround_sigma, layers, scales)
         lookup(fusion, ("mean", "max"), "fusion")
-        lookup(color_space, get_args(ColorSpace), "color space")
+        lookup(color_space, get_args(_ColorSpace), "color space")
         self.centre_sigma = centre_sigma
         self.surround_sigma = surround_sigma
         self.layers = layers
         self.scales = scales
         self.fusion: Fusion = fusion
-        self.color_space: ColorSpace = color_space
+        self.color_space: _ColorSpace = color_space
         self.normalise = normalise
 
     def forward(self, image: Tensor) -> Tensor:
@@ -221,12 +209,12 @@ class VOCUS2(nn.Module):
         return f"{sigmas}, {settings}, color_space={self.color_space!r}"
 
 
-def _contrasts(twin: Twin, fusion: Fusion) -> Tensor:
+def _contrasts(twin: _Twin, fusion: Fusion) -> Tensor:
     """Contrasts to be fused `(B, N, h, w)`."""
     if fusion == "mean":
         # One of the two contrasts is 0, so their mean is half the difference. The mean over channels is taken as well.
         return (twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2
-    return torch.cat(on_off_contrasts(*twin), 1)
+    return torch.cat(_on_off_contrasts(*twin), 1)
 
 
 def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:

@@ -74,15 +74,10 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
 def share_below(ordered: _Array, values: _Array) -> _Array:
     """Fraction of ascending numbers that are lower than each of `values`; ties count half.
 
-    Args:
-        ordered: numbers in ascending order.
-        values: `(n,)`, numbers to compare with them.
-
-    Returns:
-        `(n,)`, from 0 to 1.
-
     >>> share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
     array([0.5])
+
+    Shapes: values `(n,)` → `(n,)`.
     """
     twice = np.searchsorted(ordered, values) + np.searchsorted(ordered, values, side="right")
     return np.asarray(twice / (2 * len(ordered)))
@@ -165,19 +160,10 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
 def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
     """Read maps at the pixels of fixations.
 
-    Args:
-        maps: `(..., H, W)`.
-        x: `(..., n)`, of fixations, in pixels of the map.
-        y: `(..., n)`, of the same fixations.
-
-    Returns:
-        The maps as float64, and their values `(..., n)`.
-
-    Raises:
-        InputError: the shapes do not fit together, or a fixation lies outside its map.
-
     >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
     array([1.])
+
+    Shapes: maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`.
     """
     values = np.asarray(maps, dtype=np.float64)
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)

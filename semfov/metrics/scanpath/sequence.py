@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import InputError, check
 
-Labels = NDArray[np.int64]
+_Labels = NDArray[np.int64]
 
 
-def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, float]) -> Labels:
+def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, float]) -> _Labels:
     """The grid cell of each fixation: the letters of ScanMatch (Cristino et al., 2010).
 
     Args:
@@ -39,7 +39,7 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     return np.asarray(row * columns + column)
 
 
-def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None = None) -> Labels:
+def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None = None) -> _Labels:
     """The cluster of each fixation, where mean shift has clustered all fixations of a picture.
 
     These are the letters of Borji and Itti's sequence score (2013) as Yang et al. (2020) compute it: scikit-learn's
@@ -66,18 +66,10 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
     """The clusters of `cluster_labels` as a fitted `sklearn.cluster.MeanShift`, to label fixations more than once.
 
-    Args:
-        others: `(m, 2)`, fixations to cluster.
-        bandwidth: bandwidth of the mean shift, in the unit of the points; None takes scikit-learn's estimate.
-
-    Returns:
-        The fitted `sklearn.cluster.MeanShift`; `labels_by` takes it.
-
-    Raises:
-        InputError: scikit-learn is not installed.
-
     >>> len(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5).cluster_centers_)
     2
+
+    Shapes: others `(m, 2)`.
     """
     try:
         from sklearn.cluster import MeanShift
@@ -90,19 +82,14 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
         return shift.fit(np.asarray(others, dtype=np.float64))
 
 
-def labels_by(clusters: Any, points: ArrayLike) -> Labels:
+def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
     """Label fixations by fitted clusters.
-
-    Args:
-        clusters: as `fitted_clusters` returns them.
-        points: `(n, 2)`, fixations in the same unit.
-
-    Returns:
-        `(n,)`, numbers of clusters from 0.
 
     >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
     >>> bool(labels[0] == labels[1] != labels[2])
     True
+
+    Shapes: points `(n, 2)` → `(n,)`.
     """
     return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 

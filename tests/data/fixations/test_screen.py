@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data.fixations import Fixations, Letterbox, coco_name, read_ruarte
-from semfov.data.fixations.record import resized_box, resized_points
+from semfov.data.fixations.record import _resized_box, _resized_points
 from semfov.errors import InputError
 
 sides = st.integers(1, 3000)
@@ -36,8 +36,8 @@ def test_letterbox_equals_values_computed_by_hand():
 
 
 def test_resizing_keeps_centres_of_cells_and_edges():
-    assert resized_box((0, 0, 32, 24), (32, 24), (1680, 1050)) == (0, 0, 1680, 1050)
-    np.testing.assert_allclose(resized_points(np.array([[0.0, 23.0]]), (32, 24), (1680, 1050)), [[25.75, 1027.625]])
+    assert _resized_box((0, 0, 32, 24), (32, 24), (1680, 1050)) == (0, 0, 1680, 1050)
+    np.testing.assert_allclose(_resized_points(np.array([[0.0, 23.0]]), (32, 24), (1680, 1050)), [[25.75, 1027.625]])
 
 
 def test_a_size_of_zero_is_refused():

@@ -8,11 +8,11 @@ import torch
 from semfov.errors import InputError
 from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
 from semfov.gaze.saliency.itti import (
-    across_scales,
-    dyadic_pyramid,
-    gabor_kernels,
-    orientation_energy,
-    promote,
+    _across_scales,
+    _dyadic_pyramid,
+    _gabor_kernels,
+    _orientation_energy,
+    _promote,
 )
 
 
@@ -97,7 +97,7 @@ def test_saliency_equals_the_steps_in_opencv(photograph: np.ndarray, dtype: torc
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
 def test_pyramid_equals_opencv(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
     image = np.random.default_rng(1).random((*size, 3))
-    levels = dyadic_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
+    levels = _dyadic_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
     assert len(levels) == 9
     for level in levels:
         np.testing.assert_allclose(level[0].permute(1, 2, 0).numpy(), image, atol=tolerance)
@@ -105,7 +105,7 @@ def test_pyramid_equals_opencv(size: tuple[int, int], dtype: torch.dtype, tolera
 
 
 def test_gabor_kernels_equal_opencv() -> None:
-    kernels = gabor_kernels().unflatten(0, (4, 2))
+    kernels = _gabor_kernels().unflatten(0, (4, 2))
     for angle, pair in zip((0, 45, 90, 135), kernels, strict=True):
         for phase, kernel in zip((0, np.pi / 2), pair, strict=True):
             np.testing.assert_allclose(kernel.numpy(), opencv_gabor(angle, phase), atol=1e-12)
@@ -113,7 +113,7 @@ def test_gabor_kernels_equal_opencv() -> None:
 
 def test_orientation_energy_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
     image = np.random.default_rng(2).random((19, 26))
-    energy = orientation_energy(torch.from_numpy(image)[None, None].to(dtype))
+    energy = _orientation_energy(torch.from_numpy(image)[None, None].to(dtype))
     for angle, answer in zip((0, 45, 90, 135), energy[0], strict=True):
         np.testing.assert_allclose(answer.numpy(), opencv_energy(image, angle), atol=tolerance)
 
@@ -121,7 +121,7 @@ def test_orientation_energy_equals_opencv(dtype: torch.dtype, tolerance: float) 
 def test_difference_across_scales_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
     rng = np.random.default_rng(3)
     centre, surround = rng.random((31, 44)), rng.random((4, 6))
-    difference = across_scales(*(torch.from_numpy(each)[None, None].to(dtype) for each in (centre, surround)))
+    difference = _across_scales(*(torch.from_numpy(each)[None, None].to(dtype) for each in (centre, surround)))
     expected = np.abs(centre - cv2.resize(surround, (44, 31), interpolation=cv2.INTER_LINEAR))
     np.testing.assert_allclose(difference[0, 0].numpy(), expected, atol=tolerance)
 
@@ -130,14 +130,14 @@ def test_difference_across_scales_equals_opencv(dtype: torch.dtype, tolerance: f
 def test_promotion_equals_a_loop(steps: int, dtype: torch.dtype, tolerance: float) -> None:
     # With few grey levels there are plateaus: of equal neighbours only the first counts as a peak.
     maps = torch.randint(steps, (2, 3, 9, 11)).to(dtype)
-    promoted = promote(maps)
+    promoted = _promote(maps)
     for image, result in zip(maps.flatten(0, 1), promoted.flatten(0, 1), strict=True):
         np.testing.assert_allclose(result.numpy(), numpy_promote(image.double().numpy()), atol=tolerance)
 
 
 def test_rounding_errors_are_not_promoted(dtype: torch.dtype) -> None:
     noise = 0.3 + torch.finfo(dtype).eps * torch.rand(1, 16, 16, dtype=dtype)
-    assert promote(noise).abs().max() == 0
+    assert _promote(noise).abs().max() == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (20, 33), (64, 64)])
@@ -173,6 +173,6 @@ def test_bad_input() -> None:
     with pytest.raises(InputError, match="image"):
         IttiKoch()(torch.zeros(1, 4, 8, 8))
     with pytest.raises(InputError, match="levels"):
-        dyadic_pyramid(torch.zeros(1, 3, 8, 8), -1)
+        _dyadic_pyramid(torch.zeros(1, 3, 8, 8), -1)
     with pytest.raises(InputError, match="intensity"):
-        orientation_energy(torch.zeros(1, 3, 8, 8))
+        _orientation_energy(torch.zeros(1, 3, 8, 8))

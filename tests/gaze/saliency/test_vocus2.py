@@ -10,7 +10,7 @@ from skimage import color
 
 from semfov.errors import InputError
 from semfov.gaze.saliency import VOCUS2, vocus2_saliency
-from semfov.gaze.saliency.vocus2 import twin_pyramids
+from semfov.gaze.saliency.vocus2 import _twin_pyramids
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
@@ -67,7 +67,7 @@ def opencv_vocus2(
 def test_pyramids_equal_opencv(centre: float, surround: float, scales: int, dtype: torch.dtype) -> None:
     channels = np.random.default_rng(scales).random((41, 75, 3))
     tensor = torch.from_numpy(channels).permute(2, 0, 1)[None].to(dtype)
-    pyramids = twin_pyramids(tensor, centre, surround, layers=5, scales=scales)
+    pyramids = _twin_pyramids(tensor, centre, surround, layers=5, scales=scales)
     for c in range(3):
         expected = opencv_pyramids(channels[..., c], centre, surround, 5, scales)
         assert [len(layer) for layer in pyramids] == [len(layer) for layer in expected]
@@ -170,4 +170,4 @@ def test_bad_image() -> None:
     with pytest.raises(InputError, match="image"):
         VOCUS2()(torch.zeros(3, 8, 8))
     with pytest.raises(InputError, match="channels"):
-        twin_pyramids(torch.zeros(1, 3, 0, 8))
+        _twin_pyramids(torch.zeros(1, 3, 0, 8))
