@@ -13,11 +13,9 @@ from xml.etree import ElementTree as XML
 from semfov.errors import DataError
 from semfov.io.files import check_regular, inside
 
-DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
-"""Driver of GDAL by the end of a file's name."""
+_DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
 
-MOST_SIDE = 2**20
-"""Longest side of a raster in pixels."""
+_MOST_SIDE = 2**20  # pixels
 
 _BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
 # Files beside a raster (.ovr, .aux.xml) may be rasters of any driver themselves, or name others. Threads of a mosaic
@@ -63,13 +61,13 @@ def open_raster(path: str | PathLike[str]) -> Any:
 
     path = Path(path)
     path.stat()  # GDAL has many messages for a file that is not there
-    driver = DRIVERS[path.suffix.lower()]
+    driver = _DRIVERS[path.suffix.lower()]
     source = io.BytesIO(mosaic_text(path)) if driver == "VRT" else path.absolute()
     file = _without_others(rasterio.open(source, driver=driver), path)
-    if max(file.width, file.height) > MOST_SIDE:
+    if max(file.width, file.height) > _MOST_SIDE:
         got = f"{file.width} × {file.height}"
         file.close()
-        raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}; divide it")
+        raise DataError(f"{path}: expected at most {_MOST_SIDE:,} pixels along a side, got {got}; divide it")
     return file
 
 
@@ -124,10 +122,10 @@ def _source(path: Path, name: str) -> str:
     kind = next((kind for start, kind in _SIGNATURES.items() if head.startswith(start)), None)
     if kind is None:
         raise DataError(f"{path}: expected sources that are TIFF, JPEG 2000, PNG or JPEG files, got {name!a:.200}")
-    if kind in DRIVERS:
+    if kind in _DRIVERS:
         import rasterio
 
-        with rasterio.open(file, driver=DRIVERS[kind]) as raster:
+        with rasterio.open(file, driver=_DRIVERS[kind]) as raster:
             _without_others(raster, file)
     return str(file)
 
