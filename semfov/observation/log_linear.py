@@ -10,8 +10,7 @@ from semfov.observation.dirichlet import log_normaliser
 def linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights and constants of the log likelihoods, level by level; alpha `(K+1, N, K+1)` → `(N (K+1), K+1)`."""
     by_level = alpha.transpose(0, 1)
-    # ln Γ of large parameters is much larger than the differences between likelihoods: compute it in float64.
-    constant = -log_normaliser(by_level.to(torch.float64)).to(alpha.dtype)
+    constant = -log_normaliser(by_level)
     return (by_level - 1).flatten(0, 1), constant.flatten()
 
 
