@@ -175,7 +175,7 @@ class ContextPrior(Pretrained):
 
     def _tensors(self) -> dict[str, Tensor]:
         """Both tables in half precision."""
-        return {name: tensor.half() for name, tensor in self.state_dict().items()}
+        return {name: tensor.half() for name, tensor in super()._tensors().items()}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
