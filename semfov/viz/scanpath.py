@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
+from semfov.data.inputs import ImageLike, as_image
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
 from semfov.viz.belief import draw_belief
@@ -38,7 +39,7 @@ MOST_BOXES = 6
 @styled
 def plot_scanpath(
     scanpath: Scanpath | Fixations,
-    image: Tensor | None = None,
+    image: ImageLike | None = None,
     *,
     boxes: Tensor | None = None,
     objects: bool = True,
@@ -51,7 +52,8 @@ def plot_scanpath(
 
     Args:
         scanpath: the episode, or the fixations of a person (`semfov.data.fixations`).
-        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own. Fixations of people need it.
+        image: the picture, of any common type (`semfov.as_image`); None takes the scanpath's own. Fixations of people
+            need it.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
         objects: whether to draw the objects of the scanpath.
         ax: axes to draw in; None makes a figure.
@@ -67,6 +69,7 @@ def plot_scanpath(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_scanpath(scanpath), "scanpath.pdf")
     """
+    image = None if image is None else as_image(image)
     if isinstance(scanpath, Fixations):
         return _plot_person(scanpath, image, boxes, ax)
     image = photograph_of(scanpath, image)
