@@ -76,7 +76,7 @@ def as_images(
 
     Shapes: → `(B, 3, H, W)`.
     """
-    pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
+    pixels = channels_first(pixels_of(images, argument), argument, choose=not isinstance(images, np.ndarray))
     pixels = in_rgb(pixels, images, color)
     pixels = _in_unit(pixels, like, argument)
     check_pixels(pixels, argument)
