@@ -83,6 +83,13 @@ def as_images(
     return pixels
 
 
+def as_batch(images: ImageLike) -> Tensor:
+    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
+    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
+        return images
+    return as_images(images)
+
+
 def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
     """Pixels `(B, 3, H, W)` in the order red, green, blue; files and Pillow images are RGB already."""
     swap = lookup(color, get_args(Color), "order of channels") == "bgr"
