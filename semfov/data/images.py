@@ -77,8 +77,8 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
         try:
             with open_pillow(path) as image:
-                _check_pixels(image.size, name)
                 check_proportion(image, path)
+                _check_pixels(image.size, name)
                 array = _pixels(image, name, upright=oriented)
         except DataError:
             raise
@@ -121,8 +121,8 @@ def check_proportion(image: Any, path: str | PathLike[str]) -> None:
     """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
     pixels, size = math.prod(image.size), Path(path).stat().st_size
     if pixels > _SMALL and pixels > _MOST_A_BYTE * size:
-        got = f"{pixels:,} pixels in {size:,} bytes"
-        raise DataError(f"image {Path(path)}: expected a file in proportion, got {got}; replace it")
+        expected, got = f"at most {MAX_PIXELS:,} pixels, in proportion to the file", f"{pixels:,} in {size:,} bytes"
+        raise DataError(f"image {Path(path)}: expected {expected}, got {got}; replace it")
 
 
 def check_tile(size: int, stored: int, name: str) -> None:

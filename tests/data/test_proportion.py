@@ -40,7 +40,7 @@ def test_a_jpeg_that_claims_more_than_its_file_may_hold(tmp_path):
     path = claims(tmp_path / "a.jpg", 9000, 9000)
     tracemalloc.start()
     for read in (read_image, as_image, lambda path: open_large(path).size):
-        with pytest.raises(DataError, match=r"expected a file in proportion, got 81,000,000 pixels in [\d,]+ bytes"):
+        with pytest.raises(DataError, match=r"in proportion to the file, got 81,000,000 in [\d,]+ bytes"):
             read(path)
     assert tracemalloc.get_traced_memory()[1] < 5e6
     tracemalloc.stop()
