@@ -22,7 +22,7 @@ from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import ZoomPath
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import look_closely
+from semfov.zoom.closer import candidates, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
@@ -209,7 +209,8 @@ class ZoomAgent(nn.Module):
         glances, evidence = self._open(picture), self._evidence()
         one = targets[0] if len(targets) == 1 else None
         turns: Iterator[WindowStep[Any]]
-        if evidence is None:
+        slicing = evidence is None or glances.lattice.levels == 1
+        if evidence is None or slicing:
             turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
         else:
             turns = find_everything(glances, evidence, one, batch=batch, worth=worth)
@@ -221,7 +222,7 @@ class ZoomAgent(nn.Module):
                 ending = limits.reached(len(path.looks), path.record)
                 if ending is not None:
                     break
-        return path.record(ending or ("windows" if evidence is None else "worth"))
+        return path.record(ending or ("windows" if slicing else "worth"))
 
     def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
         """Find all objects of all classes.
@@ -285,7 +286,7 @@ def search_windows(
 
     def close_up(box: Tensor) -> Detections:
         looks.append(look_closely(glances, box))
-        return looks[-1].detections
+        return candidates(looks[-1])
 
     deciding = WindowDecisions(evidence, target, close_up, confirm=confirm, give_up=give_up, closer=closer)
     ending: Ending | None = None
@@ -359,7 +360,7 @@ class _Windows:
         least: float | None = None,
     ) -> None:
         self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
-        self.certainty = None if evidence is None else evidence.certainty
+        self.certainty = None if evidence is None else evidence.certainty_in(glances.lattice)
         self.least = least_of(self.certainty) if least is None else least
         self.belief: ZoomBelief | None = None
         self.promised = 0.0

@@ -16,7 +16,7 @@ from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.live.base import FramePerception
 from semfov.paths import WindowMoment, reduced_copy
-from semfov.zoom.closer import closer_window, look_closely
+from semfov.zoom.closer import candidates, closer_window, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.glances import Glance, LiveGlances, Window
@@ -116,7 +116,7 @@ class WindowPerception(FramePerception):
     def _begin(self, glances: LiveGlances) -> Iterator[WindowStep[Any]]:
         """Start the episode, which never ends."""
         targets = (self.target,) if self.target is not None else self.targets
-        if self.evidence is None:
+        if self.evidence is None or (glances.lattice.levels == 1 and not self.searches):
             return look_by_look(
                 glances, ranked(usual_slices(glances.lattice), targets), None, forgetting=self.forgetting
             )
@@ -141,14 +141,14 @@ class WindowPerception(FramePerception):
         assert self._glances is not None
         glance = look_closely(self._glances, box)
         self._looks.append(_Look(self._number, glance, 0.0, closely=True))
-        return glance.detections
+        return candidates(glance)
 
     def _moment(self, glances: LiveGlances, picture: LargePicture) -> WindowMoment:
         history = [look.glance for look in self._looks]
         places = {look.frame: place for place, look in enumerate(self._looks)}
         closer = () if self._decisions is None else self._decisions.looks
         current = without_replaced(history, glances.lattice) if self.forgetting.rate else history
-        certainty = None if self.evidence is None else self.evidence.certainty
+        certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         objects, unseen = window_objects(
             current,
             glances.lattice,
