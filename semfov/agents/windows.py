@@ -32,7 +32,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects
 from semfov.zoom.slices import ranked, usual_slices
 
-_USUAL_PASSES = 24
+USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
 
 LIKELY = 0.5
@@ -152,7 +152,7 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_thresholds(confirm, give_up)
         check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
@@ -201,7 +201,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:

@@ -41,7 +41,7 @@ from semfov.io.files import inside
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count, Range, Share
+from semfov.runs.settings import Count, Range, Share, Whole
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.window_looking import TileSize
@@ -82,7 +82,8 @@ class FitZoomConfig(FitConfig):
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because the search gives up.
         place: least probability that the target is at a place, for a closer look there when no other look follows.
-        photographs: number of photographs that are looked at by themselves, to fit the evidence for photographs.
+        photographs: number of photographs that are looked at by themselves, to fit the evidence for photographs; 0
+            leaves it out.
         worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
         refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
@@ -120,7 +121,7 @@ class FitZoomConfig(FitConfig):
     surest: Share = 0.9
     lost: Share = 0.02
     place: Share = 0.2
-    photographs: Count = 320
+    photographs: Whole = 320
     worth: Share = 0.15
     evidence: Path | None = None
     refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
@@ -263,7 +264,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
         lines += fit_closer_looks(config, model, eye, pictures, store)
     if "certainty" in refit:
         lines += fit_counts(config, model, eye, pictures, store)
-    if "photograph" in refit:
+    if "photograph" in refit and config.photographs:
         scenes = make_scenes(config.data, eye.detector.classes)
         lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config)]
     path = inside(config.out, f"{eye.detector.name}.safetensors")
