@@ -492,7 +492,7 @@ class ActivePerception(nn.Module):
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
             how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
             rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1 for a fovea and 0.03 for
-                windows (`semfov.live.FovealPerception`, `semfov.live.WindowPerception`).
+                windows (`semfov.agents.FoveaEpisode`, `semfov.agents.WindowEpisode`).
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.

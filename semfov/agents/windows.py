@@ -438,6 +438,11 @@ class WindowEpisode(Episode[ZoomPath]):
         return decide_by_score(self.glances, self.target, self._confirm)
 
     @property
+    def belief(self) -> ZoomBelief | None:
+        """The belief after the last look; None without evidence, and before the first look."""
+        return None if self._last is None else self._last.belief
+
+    @property
     def glances(self) -> list[Glance]:
         """The looks that count, in their order."""
         return [look.glance for look in self._looks]
@@ -490,7 +495,7 @@ class WindowEpisode(Episode[ZoomPath]):
         target = self.targets or self.target
         if self.certainty is None:
             return merge(glances, target), None
-        belief = None if self._last is None or self.searches else self._last.belief
+        belief = None if self.searches else self.belief
         # A belief about objects of any class says nothing about those of several.
         remaining = (0.0, 0.0) if belief is None or self.targets else belief.remaining()
         further = [look.value for look in self._looks[1:] if not look.closely and isfinite(look.value)]
