@@ -16,7 +16,7 @@ import torch
 from semfov import ActivePerception, EmbeddedScenes, Scanpath, ZoomAgent
 from semfov.data.mosaics import Mosaics
 from semfov.io.files import replacing
-from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_zoom_path
+from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_scanpath
 from semfov.viz.animation import Frame, in_palette, render
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
@@ -40,7 +40,7 @@ def make_zoom_picture(path: Path, weights: str | None) -> None:
     agent = ZoomAgent.recommended("yolox-nano", weights=weights)
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     mosaic = Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image
-    figure = plot_zoom_path(agent.find_all(mosaic, "person", passes=10), mosaic)
+    figure = plot_scanpath(agent.find_all(mosaic, "person", passes=10), mosaic)
     write_picture(render([figure], dpi=110)[0], path)
 
 

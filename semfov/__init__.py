@@ -31,7 +31,6 @@ from semfov.gaze import acquisition, policies, saliency
 from semfov.head import Flat, Panorama
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.paths import Scanpath
-from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__
 from semfov.zoom import WindowEye

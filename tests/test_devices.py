@@ -167,7 +167,6 @@ def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
         "compare_scanpath": ((path, [person, person]), {}),
         "episode_data": ((path, image, [image] * 3), {"name": "a.jpg"}),
         "merge_boxes": ((torch.tensor([[4.0, 4, 9, 9]]), torch.rand(1), torch.ones(1, dtype=torch.long)), {}),
-        "plot_zoom_path": ((record(), small.rand(3, 120, 160)), {}),
         "required_target": ((torch.tensor(2), "a policy"), {}),
         "rollout": (episode, {"most": 3}),
         "trace": ((Steps(*episode), small.GRID, ("background", "cat", "cup"), 1, None), {}),

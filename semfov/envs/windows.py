@@ -18,7 +18,7 @@ from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.paths import ZoomPath
 from semfov.viz.animation import render
-from semfov.viz.zoom import plot_zoom_path
+from semfov.viz.scanpath import plot_scanpath
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.glances import Glance, Window, on_lattice, overview
@@ -143,7 +143,7 @@ class WindowGaze(Gazes):
         image = self.scenery.image(episode.scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
         size = [max(1, round(n * share)) for n in image.shape[-2:]]
-        return render([plot_zoom_path(path, interpolate(image, size, mode="bilinear", antialias=True)[0])])[0]
+        return render([plot_scanpath(path, interpolate(image, size, mode="bilinear", antialias=True)[0])])[0]
 
     def _enter(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         (episode,) = episodes

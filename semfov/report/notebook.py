@@ -1,23 +1,14 @@
-"""What a notebook shows of a record: the photograph with windows and objects, or the page of a scanpath in a frame.
-
-Functions that draw records are registered here.
-"""
+"""What a notebook shows of a record: the photograph with windows and objects, or the page of a scanpath in a frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
 
-from semfov.metrics.scanpath.beside import compare_scanpath
-from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Scanpath, ZoomPath
-from semfov.paths.drawing import draws
+from semfov.paths import Record, Scanpath
 from semfov.report.episode import episode_data, jpeg_uri
-from semfov.report.page import page_html, write_record, write_scanpath
-from semfov.viz.animation import animate
-from semfov.viz.head import animate_head, plot_head_path
-from semfov.viz.scanpath import plot_scanpath
+from semfov.report.page import page_html
 from semfov.viz.style import FOUND, GAZE, TARGET
-from semfov.viz.zoom import animate_looks, plot_moment, plot_zoom_path
 
 MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
@@ -39,7 +30,7 @@ _MOST = 500  # largest number of objects that are drawn; the most confident ones
 _QUALITY = 75  # of the photograph, a JPEG
 
 
-def _record_html(record: Record) -> str:
+def record_html(record: Record) -> str:
     """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML.
 
     Objects that were confirmed are green, others orange. A grey rectangle stands for a photograph that was not kept.
@@ -76,7 +67,7 @@ def _rect(box: Sequence[float], colour: str, line: float, inside: str = "") -> s
     return f'<rect {side} fill="none" stroke="{colour}" stroke-width="{line:.1f}" pointer-events="all">{inside}</rect>'
 
 
-def _notebook_html(scanpath: Scanpath) -> str:
+def scanpath_html(scanpath: Scanpath) -> str:
     """The page to step through in a frame; a short text where the page would be too large.
 
     The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
@@ -112,17 +103,3 @@ def _classes_that_fit(scanpath: Scanpath) -> int:
     bytes_of_map, bytes_of_values = 4 * look / 3, 8 * look
     room = _MAPS - bytes_of_values - 2 * bytes_of_map
     return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
-
-
-draws("notebook", Record, _record_html)
-draws("notebook", Scanpath, _notebook_html)
-draws("report", Record, write_record)
-draws("report", Scanpath, write_scanpath)
-draws("plot", Scanpath, plot_scanpath)
-draws("plot", ZoomPath, plot_zoom_path)
-draws("plot", HeadPath, plot_head_path)
-draws("plot", FoveaMoment, plot_moment)
-draws("animate", Record, animate_looks)
-draws("animate", Scanpath, animate)
-draws("animate", HeadPath, animate_head)
-draws("compare", GazeRecord, compare_scanpath)
