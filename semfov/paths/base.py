@@ -506,6 +506,10 @@ class GazeRecord(Record):
 
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
+    def __len__(self) -> int:
+        """Number of looks, the first included."""
+        return len(self.detections)
+
     @property
     def closer_looks(self) -> Sequence[CloseUp]:
         """The closer looks."""

@@ -102,10 +102,10 @@ class LookFigure:
         axes: Sequence[Axes] | None = None,
     ) -> None:
         self.record, believed = record, record.belief_map(0)
-        panels, height = 2 if believed is None else 3, 4 * image.shape[-2] / image.shape[-1] + 0.3
-        self.figure, self.axes = make_figure(
-            1, panels, width=4.2 * panels, height=height, layout="compressed", axes=axes
-        )
+        panels, aspect = 2 if believed is None else 3, image.shape[-2] / image.shape[-1]
+        wide = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
+        height = wide * aspect / 1.05 + 0.3
+        self.figure, self.axes = make_figure(1, panels, wide * panels, height, layout="compressed", axes=axes)
         path_axes, view_axes, *others = self.axes
         if axes is None:
             # Hidden axes save the layout of ticks, a tenth of the time.

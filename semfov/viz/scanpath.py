@@ -71,7 +71,7 @@ def plot_scanpath(
     """
     image, (width, height) = photograph_of(scanpath, image), scanpath.size
     figure, (axes,) = make_figure(
-        1, 1, width=6.4, height=6.4 * height / width + 0.6, layout="compressed", axes=only(ax)
+        1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", axes=only(ax)
     )
     if isinstance(scanpath, Fixations):
         boxes = Tensor([scanpath.box]) if boxes is None and scanpath.box is not None else boxes

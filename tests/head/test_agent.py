@@ -14,7 +14,6 @@ from semfov.head import Flat, Panorama
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
-from semfov.viz.head import plot_head_path
 
 
 @pytest.fixture
@@ -80,15 +79,6 @@ def test_boxes_of_a_flat_scene_lie_around_the_object(agent):
 def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama):
     path = agent.explore(Panorama(panorama, fields=(40.0, 80.0)), passes=4)
     assert {float(path.views.poses[action // 100, 2]) for action in path.actions} <= {40.0, 80.0}
-
-
-def test_a_plot_shows_at_most_the_looks_of_the_path(agent, panorama):
-    path = agent.explore(Panorama(panorama), passes=2)
-    for looks, more in ((1, ["0"]), (2, ["0", "1"])):
-        texts = [text.get_text() for text in plot_head_path(path, panorama, looks=looks).axes[0].texts]
-        assert [text for text in texts if text.isdigit()] == more
-    with pytest.raises(InputError, match="looks: expected a number from 1 to 2"):
-        plot_head_path(path, panorama, looks=3)
 
 
 def test_arguments_are_checked(agent, panorama):

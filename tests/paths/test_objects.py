@@ -141,9 +141,8 @@ def test_boxes_of_a_head_are_in_pixels_of_the_picture_and_meet_across_the_seam()
     assert 0 <= x1 < 256 < x2
     assert (x1 + x2) / 2 == pytest.approx(253, abs=1.0)
     assert (y1 + y2) / 2 == pytest.approx(64, abs=0.5)
-    first, second = path
     assert [each.seconds for each in path] == [0.5, 1.25]
-    assert first.region[2] - first.region[0] == pytest.approx(256 / 6, rel=0.05)
+    assert path.looks[0].region[2] - path.looks[0].region[0] == pytest.approx(256 / 6, rel=0.05)
 
 
 def test_boxes_of_a_flat_scene_are_scaled():

@@ -14,8 +14,8 @@ from PIL import Image
 
 from semfov import Detections, Grid, InputError
 from semfov.viz import animate, plot_fixation
-from semfov.viz.animation import _episode_frames, _in_one_palette, _save_animation, render
-from semfov.viz.fixation import FixationFigure
+from semfov.viz.animation import _in_one_palette, _look_frames, _save_animation, render
+from semfov.viz.fixation import LookFigure, views_of
 from tests import small
 
 
@@ -70,7 +70,7 @@ def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
 def test_frames_equal_figures_drawn_one_by_one(searched):
     """All frames are drawn with one figure, but each equals the figure of `plot_fixation`."""
     scanpath, image, views = searched
-    frames = _episode_frames(scanpath, image, views)
+    frames = _look_frames(scanpath, image, views)
     assert len(frames) == len(scanpath)
     for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
         (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
@@ -83,11 +83,12 @@ def test_frames_equal_figures_drawn_one_by_one(searched):
 
 def test_frames_do_not_depend_on_earlier_frames(searched):
     scanpath, image, views = searched
-    figure = FixationFigure(scanpath, image, views[0])
-    (last,) = render([figure.show(2, views[2])])
+    seen = views_of(scanpath, image, views)
+    figure = LookFigure(scanpath, image, seen[0])
+    (last,) = render([figure.show(2, seen[2])])
     for number in (0, 1):
-        figure.show(number, views[number])
-    (again,) = render([figure.show(2, views[2])])
+        figure.show(number, seen[number])
+    (again,) = render([figure.show(2, seen[2])])
     np.testing.assert_array_equal(last, again)
 
 
@@ -114,7 +115,7 @@ def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_pa
 
 def test_frames_share_their_colours(searched):
     """Parts that do not change must not flicker."""
-    first, *others = _in_one_palette(_episode_frames(*searched))
+    first, *others = _in_one_palette(_look_frames(*searched))
     assert all(frame.getpalette() == first.getpalette() for frame in others)
 
 
