@@ -18,7 +18,7 @@ from semfov.errors import check
 from semfov.io.schema import Field, Number, Object
 from semfov.paths.base import Record
 from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
-from semfov.paths.look import RecordedLook, cell_columns
+from semfov.paths.look import Box, RecordedLook, cell_columns
 from semfov.paths.windows import TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
 from semfov.zoom.glances import Window
 
@@ -77,7 +77,7 @@ class Moment(Record):
         """`(x, y)` in pixels, the point that the next look is at."""
 
     @property
-    def next_region(self) -> tuple[float, float, float, float] | None:
+    def next_region(self) -> Box | None:
         """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
         return None
 
@@ -233,7 +233,7 @@ class WindowMoment(ZoomPath, Moment):
         return self.next_window.centre(self.lattice)
 
     @property
-    def next_region(self) -> tuple[float, float, float, float]:
+    def next_region(self) -> Box:
         """`(x1, y1, x2, y2)` in pixels, what the next window shows."""
         return self.next_window.region(self.lattice)
 

@@ -23,7 +23,7 @@ from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns
-from semfov.paths.stimulus import Stimulus, sensor_in_words
+from semfov.paths.stimulus import Stimulus
 
 _SENSOR = {
     "sigma": POSITIVE,
@@ -211,10 +211,6 @@ class Scanpath(GazeRecord):
             return
         for look, view in zip(self, self.views(), strict=True):
             yield LookView(view, self.size, look.detections.boxes[0], look.fixation)
-
-    def sensor_in_words(self) -> str | None:
-        """Describe the fovea; None if the stimulus was not kept."""
-        return None if self.stimulus is None else sensor_in_words(self.stimulus.settings["sensor"])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
         """Data of the scanpath for a page (`semfov.report.episode_data`)."""

@@ -13,7 +13,7 @@ from semfov.viz.style import FOUND, GAZE, TARGET
 MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
 
-HEIGHT = 760
+_HEIGHT = 760
 """Height of the frame in pixels; the page scrolls in it."""
 
 _FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
@@ -23,7 +23,7 @@ _MAPS = MOST_CHARACTERS // 4
 """Largest number of bytes of the probability maps."""
 
 
-WIDTH = 640
+_WIDTH = 640
 """Width of the drawing in pixels of the screen."""
 
 _MOST = 500  # largest number of objects that are drawn; the most confident ones are
@@ -36,11 +36,11 @@ def record_html(record: Record) -> str:
     Objects that were confirmed are green, others orange. A grey rectangle stands for a photograph that was not kept.
     """
     width, height = record.size
-    unit = max(width, height) / WIDTH
+    unit = max(width, height) / _WIDTH
     shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
     if record.image is not None:
         size = f'width="{width}" height="{height}" preserveAspectRatio="none"'
-        shapes = [f'<image href="{jpeg_uri(record.image, WIDTH, _QUALITY)}" {size}/>']
+        shapes = [f'<image href="{jpeg_uri(record.image, _WIDTH, _QUALITY)}" {size}/>']
     for look in record:
         if record.is_whole(look.region):
             continue
@@ -55,7 +55,7 @@ def record_html(record: Record) -> str:
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
-    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
+    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     green = ", and confirmed ones green" if record.confirmable else ""
     key = f"Objects from {record.measure} {record.least:g} are orange{green}."
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
@@ -73,33 +73,20 @@ def scanpath_html(scanpath: Scanpath) -> str:
     The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
     outside.
     """
-    classes = _classes_that_fit(scanpath)
-    if classes >= 1:
-        views = None if scanpath.stimulus is None else scanpath.views()
-        across, down = scanpath.grid.extent.tolist()
-        name = f"{across:.0f} × {down:.0f} px"
-        for width, quality in _FINENESS:
-            data = episode_data(
-                scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality
-            )
-            frame = framed(page_html(f"semfov: {scanpath.describe()}", [data]), scanpath.describe())
-            if len(frame.encode()) <= MOST_CHARACTERS:
-                return frame
-    words = escape(repr(scanpath))
-    return f"<pre>{words}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"
-
-
-def framed(page: str, title: str) -> str:
-    """A page in a sandboxed frame that may run scripts and nothing else."""
-    return (
-        f'<iframe title="{escape(title)}" sandbox="allow-scripts" loading="lazy" srcdoc="{escape(page)}" '
-        f'style="width:100%;height:{HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
-    )
-
-
-def _classes_that_fit(scanpath: Scanpath) -> int:
-    """Number of classes whose maps fit, beside the maps of background and entropy and the acquisition values."""
-    look = len(scanpath) * len(scanpath.grid)
-    bytes_of_map, bytes_of_values = 4 * look / 3, 8 * look
-    room = _MAPS - bytes_of_values - 2 * bytes_of_map
-    return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
+    # Maps of classes fit beside those of background and entropy, and the acquisition values.
+    cells = len(scanpath) * len(scanpath.grid)
+    room, bytes_of_map = _MAPS - 8 * cells, 4 * cells / 3
+    classes, words = min(len(scanpath.classes) - 1, int(room / bytes_of_map - 2)), scanpath.describe()
+    views = None if scanpath.stimulus is None or classes < 1 else scanpath.views()
+    name = "{} × {} px".format(*scanpath.size)
+    for width, quality in _FINENESS if classes >= 1 else ():
+        data = episode_data(scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality)
+        frame = (
+            f'<iframe title="{escape(words)}" sandbox="allow-scripts" loading="lazy" '
+            f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
+            f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
+        )
+        if len(frame.encode()) <= MOST_CHARACTERS:
+            return frame
+    text = escape(repr(scanpath))
+    return f"<pre>{text}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"

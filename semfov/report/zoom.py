@@ -79,7 +79,15 @@ def zoom_data(
     reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    objects = _objects(path)
+    objects = [
+        {
+            "box": [round(row[side], 1) for side in ("x1", "y1", "x2", "y2")],
+            "label": row["class"],
+            "score": rounded(row["score"]),
+            **{name: row[name] for name in ("look", "confirmed")},
+        }
+        for row in path.object_rows()
+    ]
     image = read_region(source, (0, 0, wide, high), path.size, min(width, wide))
     return {
         "name": name,
@@ -113,20 +121,6 @@ def _outcome_in_words(path: Record) -> str:
         what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"
         text = f"“{path.target_name}” {outcome}, {what}: {probability:.2f}."
     return f"{text} {reason}".rstrip()
-
-
-def _objects(path: Record) -> list[Data]:
-    """The objects, most confident first."""
-    return [
-        {
-            "box": [round(row[side], 1) for side in ("x1", "y1", "x2", "y2")],
-            "label": row["class"],
-            "score": rounded(row["score"]),
-            "look": row["look"],
-            "confirmed": row["confirmed"],
-        }
-        for row in path.object_rows()
-    ]
 
 
 def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:

@@ -47,7 +47,13 @@ class Film:
 
     def save(self, path: str | PathLike[str]) -> list[Path]:
         """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""
-        return _save_animation(self.frames, Path(path), seconds=self.seconds, hold=self.hold)
+        path = Path(path)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            _write_gif(self.frames, file, self.seconds, self.hold)
+        ffmpeg = shutil.which("ffmpeg")
+        if ffmpeg is None:
+            return [path]
+        return [path, _save_mp4(ffmpeg, self.frames, path.with_suffix(".mp4"), self.seconds, self.hold)]
 
     def _repr_html_(self) -> str:
         """The film as a GIF inside the notebook's file."""
@@ -123,22 +129,6 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return frames
-
-
-def in_palette(frame: Frame, refine: int = 0) -> Any:
-    """A frame as a Pillow image of 256 colours of its own, with dithering; each round of refinement takes seconds."""
-    from PIL import Image
-
-    image = Image.fromarray(frame)
-    return image.quantize(palette=image.quantize(256, kmeans=refine))
-
-
-def _save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:
-    """Write frames as a GIF and, where ffmpeg is installed, as an MP4 beside it; frames `(H, W, 3)`."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        _write_gif(frames, file, seconds, hold)
-    ffmpeg = shutil.which("ffmpeg")
-    return [path] if ffmpeg is None else [path, _save_mp4(ffmpeg, frames, path.with_suffix(".mp4"), seconds, hold)]
 
 
 def _write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:

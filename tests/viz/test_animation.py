@@ -14,7 +14,7 @@ from PIL import Image
 
 from semfov import Detections, Grid, InputError
 from semfov.viz import animate, plot_fixation
-from semfov.viz.animation import _in_one_palette, _look_frames, _save_animation, render
+from semfov.viz.animation import Film, _in_one_palette, _look_frames, render
 from semfov.viz.fixation import LookFigure, views_of
 from tests import small
 
@@ -43,7 +43,7 @@ def frames():
 
 
 def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
-    _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    Film(frames, 0.5, 1.5).save(tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3
         for number, (shade, duration) in enumerate([(0, 500), (100, 500), (200, 2000)]):
@@ -54,7 +54,7 @@ def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
 def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
-    _, path = _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    _, path = Film(frames, 0.5, 1.5).save(tmp_path / "a.gif")
     command = ["ffmpeg", "-loglevel", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(command, capture_output=True, check=True).stdout, np.uint8)
     shown = pixels.reshape(-1, 32, 42, 3)[:, 10, 10, 0]
@@ -64,7 +64,7 @@ def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
 
 def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert _save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
+    assert Film(frames).save(tmp_path / "a.gif") == [tmp_path / "a.gif"]
 
 
 def test_frames_equal_figures_drawn_one_by_one(searched):
