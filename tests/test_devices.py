@@ -20,15 +20,11 @@ import torch
 from torch import Tensor, nn
 
 from docs.api import entries
-from semfov import Detections, Objects
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
 from semfov.episode import Step, StoredLooks, rollout
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
-from semfov.paths import ZoomPath
-from semfov.zoom.glances import Glance, on_lattice
-from semfov.zoom.lattice import Lattice
 from tests import small
 from tests.pretended import PretendedGpu
 from tests.test_modules import find_testers
@@ -142,16 +138,6 @@ class Steps:
 
     def __iter__(self) -> Iterator[Step]:
         return rollout(*self.episode, most=3)
-
-
-def record() -> ZoomPath:
-    """A record of one look at a picture of 160 × 120 px."""
-    lattice, nothing = Lattice.over((160, 120), (40, 40)), torch.zeros(0)
-    look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
-    return ZoomPath(
-        lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
-        candidates=Objects.none(), ending="passes",
-    )  # fmt: skip
 
 
 def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:

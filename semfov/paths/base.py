@@ -238,7 +238,14 @@ class Record(Conversion):
         return []
 
     def outline(self, look: RecordedLook) -> Tensor | None:
-        """Border of what a look shows, `(P, 2)` in picture pixels, its first point last again; None for all of it."""
+        """The border of what a look shows.
+
+        Args:
+            look: the look.
+
+        Returns:
+            `(P, 2)`, points in picture pixels, the first one again at the end; None for the whole picture.
+        """
         x1, y1, x2, y2 = look.region
         corners = [(x1, y1), (x2, y1), (x2, y2), (x1, y2), (x1, y1)]
         return None if self.is_whole(look.region) else torch.tensor(corners)
@@ -249,11 +256,26 @@ class Record(Conversion):
         return None
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor] | None:
-        """The probability of the target, or of any object, in each cell after a look, `(cells,)`; None without one."""
+        """The belief after a look.
+
+        Args:
+            number: number of the look.
+
+        Returns:
+            The cells, and the probability `(cells,)` that each of them holds the target, or any object; None for
+            windows.
+        """
         return None
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """What the looks showed, from a picture in any size, as sharp as the detector saw it."""
+        """What the looks showed, as sharp as the detector saw it.
+
+        Args:
+            source: the opened picture, in any size.
+
+        Yields:
+            Pixels, boxes and gaze of each look.
+        """
         for look in self:
             x1, y1, x2, y2 = whole_pixels(look.region, self.size)
             across = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
@@ -267,7 +289,11 @@ class Record(Conversion):
         return ""
 
     def sensor_in_words(self) -> str | None:
-        """Describe through what was looked; None if it is not known."""
+        """Describe through what was looked.
+
+        Returns:
+            The description; None if it is not known.
+        """
         return None
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
@@ -327,7 +353,19 @@ class Record(Conversion):
         return write_page(Path(path), f"semfov: {self.describe()}", [self.page_data(**options)])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
-        """Data of the record for a page (`semfov.report.zoom_data`)."""
+        """Collect the data of the record for a page (`semfov.report.zoom_data`, for a scanpath `episode_data`).
+
+        Args:
+            picture: the picture in full size; None takes the one that the record keeps.
+            name: name of the picture; None takes that of its file, or its size.
+            options: further arguments of the function.
+
+        Returns:
+            The data, for `semfov.report.write_page`.
+
+        Raises:
+            InputError: the picture is not that of the record, or was not kept.
+        """
         from semfov.report.zoom import zoom_data
 
         return zoom_data(self, picture, name=name or self._picture_name, **options)
@@ -377,33 +415,6 @@ class Record(Conversion):
                 }
             )
         return rows
-
-    def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as a table of plain values, one row for each object, most confident first.
-
-        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
-        number of the look that shows it most sharply.
-
-        Returns:
-            One dictionary for each object.
-        """
-        objects = self.objects
-        columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
-        return [
-            {
-                "object": number,
-                "class": self.classes[label],
-                "score": score,
-                "confirmed": sure,
-                "x": (box[0] + box[2]) / 2,
-                "y": (box[1] + box[3]) / 2,
-                **dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
-                "look": look,
-            }
-            for number, (label, score, sure, look, box) in enumerate(
-                zip(*(column.tolist() for column in columns), strict=True)
-            )
-        ]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the record to a safetensors file, atomically.
