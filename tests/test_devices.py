@@ -20,15 +20,11 @@ import torch
 from torch import Tensor, nn
 
 from docs.api import entries
-from semfov import Detections, Objects
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
 from semfov.episode import Step, StoredLooks, rollout
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
-from semfov.paths import ZoomPath
-from semfov.zoom.glances import Glance, on_lattice
-from semfov.zoom.lattice import Lattice
 from tests import small
 from tests.pretended import PretendedGpu
 from tests.test_modules import find_testers
@@ -144,16 +140,6 @@ class Steps:
         return rollout(*self.episode, most=3)
 
 
-def record() -> ZoomPath:
-    """A record of one look at a picture of 160 × 120 px."""
-    lattice, nothing = Lattice.over((160, 120), (40, 40)), torch.zeros(0)
-    look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
-    return ZoomPath(
-        lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
-        candidates=Objects.none(), ending="passes",
-    )  # fmt: skip
-
-
 def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
     """Arguments and options of functions that have no example with tensors that runs."""
     path = small.scanpath(small.GRID, torch.tensor([0, 6, 11]), target=2)
@@ -167,7 +153,6 @@ def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
         "compare_scanpath": ((path, [person, person]), {}),
         "episode_data": ((path, image, [image] * 3), {"name": "a.jpg"}),
         "merge_boxes": ((torch.tensor([[4.0, 4, 9, 9]]), torch.rand(1), torch.ones(1, dtype=torch.long)), {}),
-        "plot_zoom_path": ((record(), small.rand(3, 120, 160)), {}),
         "required_target": ((torch.tensor(2), "a policy"), {}),
         "rollout": (episode, {"most": 3}),
         "trace": ((Steps(*episode), small.GRID, ("background", "cat", "cup"), 1, None), {}),

@@ -352,4 +352,8 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     left = belief.chance(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), looked, left, thresholds))
     decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
-    return replace(decision, cell=int(cell)) if decision.outcome == "found" else decision
+    if decision.outcome != "found":
+        return decision
+    pose = views.poses[step.action // views.cells]
+    box = None if decision.box is None else views.world.boxes(decision.box[None], pose)[0]
+    return replace(decision, cell=int(cell), box=box)

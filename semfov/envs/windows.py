@@ -18,7 +18,7 @@ from semfov.envs.gazes import Gazes, Score
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
-from semfov.viz.zoom import plot_zoom_path
+from semfov.viz.scanpath import plot_scanpath
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Window, on_lattice, overview
 from semfov.zoom.lattice import Lattice
@@ -142,9 +142,8 @@ class WindowGaze(Gazes):
         image = self.scenery.image(self.episodes[0].scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
         size = [max(1, round(n * share)) for n in image.shape[-2:]]
-        return render(
-            [plot_zoom_path(self.looking.record(), interpolate(image, size, mode="bilinear", antialias=True)[0])]
-        )[0]
+        small = interpolate(image, size, mode="bilinear", antialias=True)[0]
+        return render([plot_scanpath(self.looking.record(), small)])[0]
 
     def _enter(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         (episode,) = episodes
