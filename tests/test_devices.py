@@ -185,7 +185,6 @@ def run(name: str, folder: Path) -> OnGpu:
 
 def test_every_module_runs_on_a_gpu_or_is_named():
     ran = {name for name, tester in find_testers().items() if tester.test_device is not None}
-    assert len(MODULES) > 70
     assert {name for name in MODULES if f"Test{name}" not in ran} == LEFT_OUT.keys() & MODULES.keys()
 
 
@@ -196,11 +195,8 @@ def test_a_function_runs_on_a_gpu(name, tmp_path):
     assert {tensor.device.type for tensor in on_gpu.results} <= {"cpu" if name in ON_CPU else "cuda"}
 
 
-def test_the_page_on_testing_counts_what_runs_on_a_gpu():
+def test_the_page_on_testing_names_what_is_left_out():
     page = (Path(__file__).parents[1] / "docs/testing.md").read_text(encoding="utf-8")
-    counts = [("modules", MODULES), ("functions of tensors", FUNCTIONS)]
     assert LEFT_OUT.keys() <= MODULES.keys() | FUNCTIONS.keys()
-    rows = [f"| {kind} | {len(named)} | {len(named.keys() - LEFT_OUT.keys())} |" for kind, named in counts]
-    for table in (rows, [f"| `{name}` | {reason} |" for name, reason in LEFT_OUT.items()]):
-        expected = "|---|\n" + "\n".join(table) + "\n\n"
-        assert expected in page, f"docs/testing.md must have the table\n{expected}"
+    expected = "|---|\n" + "\n".join(f"| `{name}` | {reason} |" for name, reason in LEFT_OUT.items()) + "\n\n"
+    assert expected in page, f"docs/testing.md must have the table\n{expected}"
