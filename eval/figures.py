@@ -48,7 +48,7 @@ from semfov.viz.drawing import (
     draw_look,
     draw_tags,
 )
-from semfov.viz.path import GazePath, path_of
+from semfov.viz.path import GazePath, LookPath
 from semfov.viz.style import FOUND, GAZE, OTHER, lay_out, make_figure, save_figure, styled
 
 if TYPE_CHECKING:
@@ -329,7 +329,7 @@ def search_in_steps(example: Example) -> Figure:
     plot_belief_bars(scanpath, most=count, axes=below)
     lay_out(figure)
     for panel, fixation in zip(above, choose_fixations(scanpath, count), strict=True):
-        path_of(panel, scanpath).show(fixation)
+        LookPath(panel, scanpath).show(fixation)
     return figure
 
 

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import skimage
 import torch
+from PIL import Image
 
 from semfov import ActivePerception, EmbeddedScenes, Scanpath, ZoomAgent
 from semfov.data.mosaics import Mosaics
 from semfov.io.files import replacing
-from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_zoom_path
-from semfov.viz.animation import Frame, in_palette, render
+from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_scanpath
+from semfov.viz.animation import Frame, render
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 PHOTOGRAPH = Path(skimage.__file__).parent / "data" / "coffee.png"  # by Rachel Michetti, CC0
@@ -40,14 +41,16 @@ def make_zoom_picture(path: Path, weights: str | None) -> None:
     agent = ZoomAgent.recommended("yolox-nano", weights=weights)
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     mosaic = Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image
-    figure = plot_zoom_path(agent.find_all(mosaic, "person", passes=10), mosaic)
+    figure = plot_scanpath(agent.find_all(mosaic, "person", passes=10), mosaic)
     write_picture(render([figure], dpi=110)[0], path)
 
 
 def write_picture(frame: Frame, path: Path) -> None:
     """Write a picture as a small PNG, atomically."""
     with replacing(path) as temporary:
-        in_palette(frame, refine=3).save(temporary, format="PNG", optimize=True)
+        image = Image.fromarray(frame)
+        # 256 colours of its own; each round of refinement takes seconds.
+        image.quantize(palette=image.quantize(256, kmeans=3)).save(temporary, format="PNG", optimize=True)
 
 
 def stacked(frames: list[Frame]) -> Frame:

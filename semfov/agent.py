@@ -1,35 +1,32 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
-from typing import Any, Literal, Self, cast, get_args
+from typing import Any, Self, get_args
 
 from torch import Tensor, nn
 
+from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook, only_for, without_none
-from semfov.agents.windows import ZoomAgent, pays
+from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, open_picture
+from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
-from semfov.data.classes import class_index, class_numbers
-from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.data.classes import class_numbers
+from semfov.data.inputs import Color
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, SemfovError, check, check_number, check_options, check_whole, lookup
+from semfov.errors import InputError, check, check_number, check_options, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
-from semfov.head.camera import PanTiltCamera, is_scene, open_scene
-from semfov.head.world import World
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
 from semfov.live import LivePerception
@@ -39,16 +36,6 @@ from semfov.paths import GazeRecord
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
-
-_KindOfLook = Literal["fovea", "windows", "head"]
-"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
-
-How = Literal["auto", "fovea", "windows", "head"]
-"""Kind of look, or `auto` for the one that suits the picture."""
-
-PictureLike = ImageLike | LargePicture | World | PanTiltCamera
-"""A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
-`semfov.Panorama`, a `semfov.Flat`, or a camera that turns."""
 
 _Targets = str | int | Sequence[str | int] | None
 """A class by name or index, several of them, or None for all classes."""
@@ -253,7 +240,7 @@ class ActivePerception(nn.Module):
             )
         return HeadAgent(self.eye, search.model, explore.model)
 
-    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> _KindOfLook:
+    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> KindOfLook:
         """How the agent looks at a picture.
 
         Args:
@@ -267,19 +254,7 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        how = lookup(how, get_args(How), "kind of look")
-        if is_scene(picture):
-            check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
-            return "head"
-        if how != "auto":
-            return how
-        if every:
-            return "windows"
-        # What cannot be opened is refused where it is read.
-        with suppress(SemfovError):
-            size = picture_size(cast(ImageLike | LargePicture, picture))
-            return "windows" if pays(size, self.eye.detector.input_size) else "fovea"
-        return "fovea"
+        return open_picture(picture).kind(how, self.eye.detector.input_size, every=every)
 
     def search(
         self,
@@ -354,13 +329,11 @@ class ActivePerception(nn.Module):
         """
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        kind = self.kind_of_look(picture, how)
-        only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration)
+        only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
             return self.fovea.search(
-                self._photograph(picture, color),
+                opened.image(self.eye.sensor.like),
                 target,
                 EpisodeLimits(**limits),
                 shifts=shifts,
@@ -371,14 +344,16 @@ class ActivePerception(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
             )
-        index = _one_class(target, self.classes)
+        targets = [target] if isinstance(target, str | int) else list(target)
+        check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
+              target)  # fmt: skip
+        arguments = without_none(confirm=confirm, give_up=give_up, **limits)
         if kind == "head":
-            arguments = without_none(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
             only_for(kind, "fovea", "confirm", closer=closer)
-            return self.head.search(open_scene(picture, color), index, seed=seed, **arguments)
+            arguments |= without_none(start=start, duration=duration)
+            return self.head.search(opened.world, targets[0], seed=seed, **arguments)
         only_for(kind, "fovea", "none", start=start)
-        arguments = without_none(confirm=confirm, give_up=give_up, closer=closer, **limits)
-        return self.zoom.search(_large(picture, color), index, **arguments)
+        return self.zoom.search(opened.large, targets[0], **without_none(closer=closer), **arguments)
 
     def find_all(
         self,
@@ -425,22 +400,18 @@ class ActivePerception(nn.Module):
                 kind of look.
             DataError: the file of the picture cannot be read.
         """
-        kind = self.kind_of_look(picture, how, every=True)
         targets = class_numbers(target, self.classes[1:], "target")
-        only_for(kind, "fovea", "passes", shifts=shifts)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration, every=True)
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
-            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             return _counting(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
+        arguments = without_none(worth=worth, **limits)
         if kind == "head":
-            arguments = without_none(worth=worth, duration=duration, **limits)
-            return _counting(self.head.find_all(open_scene(picture, color), targets, **arguments), least)
+            arguments |= without_none(duration=duration)
+            return _counting(self.head.find_all(opened.world, targets, **arguments), least)
         aim = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(
-            _large(picture, color), aim, batch=batch, **without_none(worth=worth, least=least, **limits)
-        )
+        return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
 
     def explore(
         self,
@@ -488,19 +459,17 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        kind = self.kind_of_look(picture, how)
-        only_for(kind, "fovea", "passes", shifts=shifts)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration)
         if kind == "fovea":
-            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
             return _counting(record, least)
+        arguments = without_none(worth=worth, **limits)
         if kind == "head":
-            arguments = without_none(start=start, duration=duration, worth=worth, **limits)
-            return _counting(self.head.explore(open_scene(picture, color), seed=seed, **arguments), least)
+            arguments |= without_none(start=start, duration=duration)
+            return _counting(self.head.explore(opened.world, seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
-        return self.zoom.explore(_large(picture, color), **without_none(worth=worth, least=least, **limits))
+        return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
     def live(
         self,
@@ -523,7 +492,7 @@ class ActivePerception(nn.Module):
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
             how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
             rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1 for a fovea and 0.03 for
-                windows (`semfov.live.FovealPerception`, `semfov.live.WindowPerception`).
+                windows (`semfov.agents.FoveaEpisode`, `semfov.agents.WindowEpisode`).
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
@@ -558,13 +527,25 @@ class ActivePerception(nn.Module):
             color=color,
         )
 
-    def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
-        """The picture of a fovea, `(1, 3, H, W)`."""
-        like = self.eye.sensor.like
-        if isinstance(picture, LargePicture):
-            pixels = picture.read((0, 0, *picture.size))
-            return as_image(pixels, like=like, argument="picture")[None]
-        return as_image(cast(ImageLike, picture), like=like, argument="picture", color=color)[None]
+    def _begin(
+        self,
+        picture: PictureLike,
+        color: Color,
+        how: How,
+        passes: int | None,
+        seconds: float | None,
+        on_look: OnLook | None,
+        shifts: int | None,
+        duration: float | None,
+        *,
+        every: bool = False,
+    ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
+        """Open the picture, choose the kind of look, and check the limits that suit it."""
+        opened = open_picture(picture, color)
+        kind = opened.kind(how, self.eye.detector.input_size, every=every)
+        only_for(kind, "fovea", "passes", shifts=shifts)
+        only_for(kind, "head", "seconds", duration=duration)
+        return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}
 
     def _check_parts(self) -> None:
         """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
@@ -582,15 +563,3 @@ def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
         return record
     check_number(least, "least", 0, 1)
     return replace(record, least=least)
-
-
-def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
-    """Number of the only class of a target."""
-    targets = [target] if isinstance(target, str | int) else list(target)
-    check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
-    return class_index(targets[0], classes[1:], "target")
-
-
-def _large(picture: PictureLike, color: Color) -> LargePicture:
-    """The picture of windows."""
-    return open_large(cast(ImageLike | LargePicture, picture), color=color)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid
+from semfov.agents import FoveaEpisode
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, nothing_seen
 from semfov.belief.observers import Context, LearnedMap, Semantic, Target
@@ -16,7 +17,7 @@ from semfov.detection import Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
-from semfov.live import FovealPerception, FrameRate
+from semfov.live import FrameRate
 from tests.small import Coloured, tensors
 
 SIZE = (160, 120)
@@ -206,7 +207,7 @@ def test_each_frame_has_a_decision():
     assert gone[-1].outcome != "found"
     assert gone[-1].probability < 0.5
     assert agent_with(Semantic(3)).live("green").step(scene(8)).decision is None
-    assert FovealPerception(agent_with(Deciding(3)).fovea, 2, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+    assert FoveaEpisode(agent_with(Deciding(3)).fovea, 2, rate=0.1, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
 
 
 def test_frames_may_have_any_type_but_must_have_the_same_size():

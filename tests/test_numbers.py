@@ -18,16 +18,15 @@ import pytest
 import torch
 
 from semfov import FovealObservationModel
+from semfov.agents.fovea import RATE
 from semfov.agents.head import _CONFIRM
-from semfov.agents.windows import LIKELY
+from semfov.agents.windows import LIKELY, WINDOW_RATE
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
-from semfov.live.fovea import RATE
-from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.export import OPSET

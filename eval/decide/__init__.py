@@ -18,7 +18,7 @@ from eval.decide.run import DecideConfig, DecisionRun
 from semfov.errors import DataError
 from semfov.runs.command import command
 from semfov.runs.scene_run import finish, gather
-from semfov.viz.presence import plot_roc
+from semfov.viz.curves import plot_roc
 from semfov.viz.style import save_figure
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
-from semfov.agents.limits import EpisodeLimits
-from semfov.agents.windows import USUAL_PASSES, search_windows
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import USUAL_PASSES, WindowEpisode
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
@@ -178,17 +178,19 @@ class DecisionRun(PolicyLooking):
         """What the agent that looks at windows makes of a search."""
         config, target = self.config, search.target
         assert self.windows is not None
-        with torch.inference_mode():
-            path = search_windows(
-                glances,
-                self.windows,
+        path = (
+            WindowEpisode(
                 ("background", *self.eye.detector.classes),
+                self.windows,
                 target,
-                EpisodeLimits(USUAL_PASSES),
+                limits=EpisodeLimits(USUAL_PASSES),
                 confirm=config.confirm,
                 give_up=config.give_up,
                 closer=CLOSER if config.closer else 0,
             )
+            .open(glances)
+            .run()
+        )
         decision = path.decision
         assert decision is not None
         found = decision.outcome == "found" and decision.box is not None

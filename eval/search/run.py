@@ -12,7 +12,7 @@ from semfov.gaze.policies import Task
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
 
@@ -78,7 +78,7 @@ class SearchRun(PolicyLooking):
             records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
         return records, watch.seconds
 
-    def _record(self, policy: str, episode: Episode, outcome: EpisodeOutcome) -> ResultRecord:
+    def _record(self, policy: str, episode: Trial, outcome: EpisodeOutcome) -> ResultRecord:
         return {
             "policy": policy,
             **vars(episode),

@@ -12,7 +12,7 @@ from semfov.cli.options import LiveOptions, start_of
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.live import FrameRate, LivePerception
-from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
+from semfov.paths import Moment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
@@ -75,20 +75,15 @@ def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | Non
 
 def _moment_line(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
-    if isinstance(moment, WindowMoment):
-        x, y = moment.window.centre(moment.lattice)
-        look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {moment.window.fixation[2]:.2f}: "
-        if moment.examined is None:
-            look += detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)
-        else:
-            look += f"closely, p {moment.examined.place:.2f} there"
-        return f"{look:60s}  {moment.describe()}"
-    assert isinstance(moment, FoveaMoment)
-    best = int(moment.probability.argmax())
-    row, column = divmod(moment.cell, moment.grid.columns)
-    detections = detections_in_words(moment.detections, moment.classes, 2, CONFIDENT)
-    look = f"{moment.number:4d}  at ({column}, {row}): {detections}"
-    if moment.closer is not None:
-        look = f"{moment.number:4d}  closely at ({column}, {row}): p {moment.closer.place:.2f} there"
-    row, column = divmod(best, moment.grid.columns)
-    return f"{look:60s}  {moment.describe()}, most likely at ({column}, {row})"
+    row, believed = moment.rows()[-1], moment.belief_map(len(moment) - 1)
+    if believed is None:
+        at, likely = f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}", ""
+    else:
+        columns = believed[0].columns
+        at = f"({row['column']}, {row['row']})"
+        likely = f", most likely at ({row['highest_cell'] % columns}, {row['highest_cell'] // columns})"
+    if moment.examined is None:
+        look = f"at {at}: {detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)}"
+    else:
+        look = f"closely at {at}: p {moment.examined.place:.2f} there"
+    return f"{f'{moment.number:4d}  {look}':60s}  {moment.describe()}{likely}"

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli import help as texts
-from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
-from semfov.runs.command import GOES_ON, make_parser, run_command
 from semfov.version import __version__
 
 
@@ -26,7 +24,19 @@ class _Subcommand:
     options: Callable[[], type[Any]]
     run: Callable[[Any], int | None]
     positional: tuple[str, str]
-    goes_on: str = ""
+    goes_on: bool = False
+
+
+def _named(name: str) -> Callable[[], type[Any]]:
+    """The options with this name, imported when they are asked for: help and mistakes need no tensors."""
+
+    def options() -> type[Any]:
+        from semfov.cli import options
+
+        found: type[Any] = getattr(options, name)
+        return found
+
+    return options
 
 
 def _pictures(options: Any) -> int:
@@ -63,13 +73,13 @@ _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none:
 _MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
 _SUBCOMMANDS: dict[str, _Subcommand] = {
-    "search": _Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
-    "find": _Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
-    "explore": _Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
-    "live": _Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
-    "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
+    "search": _Subcommand(texts.SEARCH, _named("SearchOptions"), _pictures, _PICTURES),
+    "find": _Subcommand(texts.FIND, _named("FindOptions"), _pictures, _PICTURES),
+    "explore": _Subcommand(texts.EXPLORE, _named("ExploreOptions"), _pictures, _PICTURES),
+    "live": _Subcommand(texts.LIVE, _named("LiveOptions"), _live, ("source", "video file, or address")),
+    "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, goes_on=True),
     "detectors": _Subcommand(
-        texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")
+        texts.LIST_DETECTORS, _named("DetectorsOptions"), _detectors, ("name", "detector, or folder of models")
     ),
 }
 """The subcommands by name. What they need is imported when they run."""
@@ -89,21 +99,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("--help", "-h", "--help-all"):
         print(texts.OVERVIEW, end="")
         return 0
+    if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
+        print(_SUBCOMMANDS[name].text, end="")
+        return 0
     refused = _of_other_commands(_SUBCOMMANDS[name], rest) if name in _SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
+    from semfov.runs.command import make_parser, run_command
+
     command = _SUBCOMMANDS[name]
-    if "--help" in rest or "-h" in rest:
-        print(command.text, end="")
-        return 0
     options, program = command.options(), f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
         usage = command.text.partition("\nusage:")[0]
         make_parser(options, usage, command.positional, program).print_help()
         return 0
     words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
-    names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
+    names: dict[str, Any] = {"positional": command.positional, "program": program}
+    if not command.goes_on:
+        names["goes_on"] = ""
     with _plain_warnings(words):
         return run_command(command.run, options, command.text, rest, words=words, **names)
 

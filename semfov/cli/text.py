@@ -95,7 +95,7 @@ def _regions_lines(scanpath: Scanpath) -> list[str]:
 
 
 def looks_text(record: GazeRecord) -> str:
-    """The looks as a table: where, which part of the picture, what was detected, and how long it took."""
+    """The looks as a table: where, which part of the picture, what was detected, and when it ended."""
     rows = [
         [
             str(look.number),
@@ -103,11 +103,11 @@ def looks_text(record: GazeRecord) -> str:
             "the whole picture" if record.is_whole(look.region) else _box_text(look.region),
             detections_in_words(look.detections, record.classes, score=CONFIDENT),
             "" if look.value is None else f"{look.value:.3f}",
-            "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
+            "" if look.seconds is None else f"{look.seconds:.2f}",
         ]
         for look in record
     ]
-    head = ["look", "at (x, y)", "shows", "detections", "value", "ms"]
+    head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
     if not any(row[-1] for row in rows):  # windows have no times
         rows, head = [row[:-1] for row in rows], head[:-1]
     lines = [f"  {line}" for line in table_lines([head, *rows])]

@@ -18,7 +18,7 @@ from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.windows import action_of
 from semfov.errors import InputError, check
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.runs.search_protocol import Episode
+from semfov.runs.search_protocol import Trial
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 
@@ -207,7 +207,7 @@ def _run(envs: Any, agent: Agent, episodes: list[Any]) -> list[Ran]:
         for row in np.flatnonzero(going):
             cells[row].append(int(actions[row]))
             results[row].append(float(infos["result"][row]))
-            if terminated[row] and isinstance(episodes[row], Episode):
+            if terminated[row] and isinstance(episodes[row], Trial):
                 found_at[row] = len(cells[row]) - 1
         going &= ~(terminated | truncated)
     return [Ran(tuple(path), at, tuple(each)) for path, at, each in zip(cells, found_at, results, strict=True)]

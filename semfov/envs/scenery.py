@@ -32,7 +32,7 @@ from semfov.runs.config import (
 )
 from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.search_protocol import Episode, episodes_of, tie_noise
+from semfov.runs.search_protocol import Trial, episodes_of, tie_noise
 from semfov.sensor.named import SensorName
 
 Source = Scenes | str | Path | None
@@ -158,7 +158,7 @@ class Scenery:
 
     def _open(self, scene: int) -> StoredLooks:
         """Stored looks from every cell of a scene."""
-        cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
+        cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
 
@@ -166,7 +166,7 @@ class Scenery:
         """Correct classes of each cell of a scene, `(X·Y, K+1)`."""
         return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
 
-    def noise(self, episode: Episode | Exploration) -> Tensor:
+    def noise(self, episode: Trial | Exploration) -> Tensor:
         """Random numbers that break the ties of an episode, the same as in `eval.search` and `eval.explore`.
 
         Args:
@@ -176,7 +176,7 @@ class Scenery:
             `(shifts+1, X·Y)`, in [0, 1).
         """
         cells = self.shape[0] * self.shape[1]
-        if isinstance(episode, Episode):
+        if isinstance(episode, Trial):
             return tie_noise(self._data, episode, cells, self.protocol)
         return explore_noise(self._data, episode, cells, self.protocol)
 

@@ -14,7 +14,7 @@ from semfov.io.schema import CLASSES, Anything, Array, Flag, Maybe, Number, Obje
 from semfov.io.storage import checksum
 from semfov.version import __version__
 
-_FILE = "manifest.json"
+FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
@@ -103,14 +103,14 @@ class Manifest:
     def write(self, folder: str | PathLike[str]) -> Path:
         """Write the record into the folder atomically, and return the path of its file."""
         record = {"kind": _KIND, "version": __version__, **json.loads(json.dumps(asdict(self)))}
-        path = Path(folder) / _FILE
+        path = Path(folder) / FILE
         write_text(path, json.dumps({**record, "sha256": checksum({}, record)}, indent=2) + "\n")
         return path
 
     @classmethod
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
-        path = Path(folder) / _FILE
+        path = Path(folder) / FILE
         record = _read(path)
         recorded = record.pop("sha256", None)
         if recorded != checksum({}, record):
@@ -150,9 +150,9 @@ def find_file(place: Mapping[str, str], folder: str | PathLike[str]) -> Path | N
 def _check_file(path: Path, digest: str | None) -> None:
     check_regular(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file, but {_FILE} in the same folder lists it; {_AGAIN}")
+        raise DataError(f"{path}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
     if sha256(path) != digest:
-        raise DataError(f"{path}: damaged or changed, its sha256 is not the one listed in {_FILE}; {_AGAIN}")
+        raise DataError(f"{path}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
 
 
 def _read(path: Path) -> dict[str, Any]:

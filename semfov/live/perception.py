@@ -1,26 +1,21 @@
 """Active perception of a camera or a video, by the kind of look that suits its frames."""
 
-from typing import Any
+from typing import Any, get_args
 
-from semfov.agents.fovea import FoveaAgent
-from semfov.agents.windows import ZoomAgent, pays
+from semfov.agents.episode import Episode, without_none
+from semfov.agents.fovea import RATE, FoveaAgent, FoveaEpisode
+from semfov.agents.picture import open_picture
+from semfov.agents.windows import WINDOW_RATE, ZoomAgent
 from semfov.data.inputs import Color, ImageLike
-from semfov.data.large import picture_size
-from semfov.decision import MOST_CLOSER
-from semfov.errors import check
-from semfov.head.camera import is_scene
-from semfov.live.base import FramePerception
-from semfov.live.fovea import RATE, FovealPerception
-from semfov.live.windows import WINDOW_RATE, WindowPerception
+from semfov.errors import check, lookup
 from semfov.paths import Moment
-from semfov.zoom.decision import CLOSER
 
 
-class LivePerception(FramePerception):
+class LivePerception:
     """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
 
     The first frame decides (`how="auto"`): frames that are at least four times as long as the detector's input are
-    looked at by windows (`WindowPerception`), others by a fovea (`FovealPerception`).
+    looked at by windows (`semfov.agents.WindowEpisode`), others by a fovea (`semfov.agents.FoveaEpisode`).
 
     Args:
         fovea: the part of an agent that looks by a fovea.
@@ -68,20 +63,20 @@ class LivePerception(FramePerception):
     ) -> None:
         check(how != "head", "how", "'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, "
               "and for a panoramic frame search or find_all of semfov.Panorama(frame)", how)  # fmt: skip
-        super().__init__(windows.classes, target, targets, RATE if rate is None else rate, color)
         several = "for all objects of several classes use how='windows', and for one of them a class without a list"
         check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
         self.how = "windows" if targets else how
         self._start, self._canvas = start, windows.eye.detector.input_size
-        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "color": color}
-        self._fovea = FovealPerception(
-            fovea, target, rate=RATE if rate is None else rate, start=start, seed=seed,
-            closer=MOST_CLOSER if closer is None else closer, **settings,
-        )  # fmt: skip
-        self._windows = WindowPerception(
-            windows, target, targets, rate=WINDOW_RATE if rate is None else rate,
-            closer=CLOSER if closer is None else closer, **settings,
-        )  # fmt: skip
+        settings: dict[str, Any] = {
+            "color": lookup(color, get_args(Color), "order of channels"),
+            **without_none(confirm=confirm, give_up=give_up, closer=closer),
+        }
+        self._episodes: dict[str, Episode[Any]] = {
+            "fovea": FoveaEpisode(
+                fovea, target, rate=RATE if rate is None else rate, start=start, seed=seed, **settings
+            ),
+            "windows": windows.episode(target, targets, rate=WINDOW_RATE if rate is None else rate, **settings),
+        }
         self._check_start()
 
     def step(self, frame: ImageLike) -> Moment:
@@ -97,11 +92,16 @@ class LivePerception(FramePerception):
             InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
             DataError: the file of the frame cannot be read.
         """
-        check(not is_scene(frame), "frame", "a picture; search and find_all take scenes", type(frame).__name__)
+        picture = open_picture(frame)
+        check(not picture.scene, "frame", "a picture; search and find_all take scenes", type(frame).__name__)
         if self.how == "auto":
-            self.how = "windows" if pays(picture_size(frame), self._canvas) else "fovea"
+            self.how = picture.kind("auto", self._canvas)
             self._check_start()
-        return (self._windows if self.how == "windows" else self._fovea).step(frame)
+        return self._episodes[self.how].step(frame)
+
+    def describe(self) -> str:
+        """What is done in a few words."""
+        return self._episodes["windows"].describe()
 
     def _check_start(self) -> None:
         """Raise `InputError` for a first cell where there are no cells."""

@@ -170,11 +170,11 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 
 FITS = {
-    "observation": "fit_model",
-    "tempering": "hit_rates",
-    "evidence": "fit_evidence",
+    "observation": "_fit_model",
+    "tempering": "_hit_rates",
+    "evidence": "_fit_evidence",
     "verification": "fit_in_folds",
-    "map": "fit_map_evidence",
+    "map": "_fit_map_evidence",
     "parts.windows": "fit_mosaics",
 }
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov.agents.limits import EpisodeLimits
-from semfov.agents.windows import search_windows
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import WindowEpisode
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
@@ -177,7 +177,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
-        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8))
+        path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
         found, count = unverified(sought, model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
         assert [glance.window for glance in sought.glances[:count]] == [each.window for each in path.glances]
@@ -194,7 +194,8 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     again = verify(searches, [model.verification], limits, model.thresholds)
     for sought, each in zip(searches, again, strict=True):
-        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8), closer=MOST_CLOSER)
+        episode = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8), closer=MOST_CLOSER)
+        path = episode.open(sought.looks).run()
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
         assert right is None or right == sought.right(path.decision.box)

@@ -42,7 +42,7 @@ def calls(scanpath):
     }
 
 
-NAMES = [name for name in viz.__all__ if name.startswith("plot_") and name != "plot_zoom_path"]
+NAMES = [name for name in viz.__all__ if name.startswith("plot_")]
 
 
 @pytest.mark.parametrize("name", NAMES)

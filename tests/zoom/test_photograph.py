@@ -9,7 +9,6 @@ from semfov.agents import ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.detection.detections import Detections
-from semfov.live.windows import WindowPerception
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import PhotographPlaces, WindowLook, candidates, closer_window
@@ -173,9 +172,10 @@ def test_closer_looks_can_be_left_out(detector, photograph):
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), evidence())
     path = agent.search(photograph, "red")
-    live = WindowPerception(agent, 1, rate=0.0)
+    live = agent.episode(1, rate=0.0)
     for _ in range(path.passes):
-        moment = live.step(photograph)
+        live.look(photograph)
+    moment = live.moment()
     assert moment.decision.outcome == path.decision.outcome
     assert moment.decision.probability == pytest.approx(path.decision.probability, abs=1e-9)
     assert torch.equal(moment.decision.box, path.decision.box)

@@ -19,7 +19,7 @@ from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, looks_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
 
 
@@ -104,7 +104,7 @@ class PeopleSearchRun(PolicyLooking):
         goal = tuple(y * grid.columns + x for y in range(top, bottom + 1) for x in range(left, right + 1))
         start = int(grid.cell_of(torch.tensor(self.config.screen.start)))
         (target,) = self.scenes.targets(index)
-        episode = Episode(index, target, target, 0, start, goal, True)
+        episode = Trial(index, target, target, 0, start, goal, True)
         looks = looks_of([episode], detections, grid)
         noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
         records: list[ResultRecord] = []
