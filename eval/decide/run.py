@@ -40,7 +40,6 @@ from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.runs.store import RememberedLooks
 from semfov.runs.zoom_store import StoredGlances
 from semfov.strategy import Strategy
-from semfov.zoom.decision import CLOSER
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glances
@@ -186,7 +185,7 @@ class DecisionRun(PolicyLooking):
                 limits=EpisodeLimits(USUAL_PASSES),
                 confirm=config.confirm,
                 give_up=config.give_up,
-                closer=CLOSER if config.closer else 0,
+                closer=None if config.closer else 0,
             )
             .open(glances)
             .run()
