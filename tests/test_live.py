@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, nothing_seen
-from semfov.belief.observers import Context, LearnedMap, Semantic, Target
+from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Detections
 from semfov.episode import Forgetting
@@ -38,12 +38,10 @@ def learned(kind):
 
 
 def observers():
-    context = ContextPrior(["red", "green"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1])
     return {
         "semantic": Semantic(3),
         "closest": Semantic(3, memory="closest"),
         "target": Target(learned(TargetEvidence)),
-        "context": Context(Target(learned(TargetEvidence)), context, (1.0, 1.0)),
         "map": LearnedMap(learned(MapEvidence)),
     }
 

@@ -10,7 +10,7 @@ import torch
 
 import semfov
 from semfov import FovealObservationModel
-from semfov.belief import ContextPrior, Verification
+from semfov.belief import Verification
 from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.presets import PUBLISHED_SENSORS, published_model
@@ -19,7 +19,7 @@ from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE, features
 
 KINDS = (
-    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, ContextPrior, ClassTemplates,
+    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, ClassTemplates,
     GazeHabits, GlimpseEvidence,
 )  # fmt: skip
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
@@ -37,7 +37,7 @@ def test_shipped_files_are_small_and_in_their_card_and_name_no_place(kind, path)
     assert path.stat().st_size < LARGEST.get(kind, 100_000)
     assert "/" not in json.dumps(kind.from_pretrained(path.stem).metadata).replace("://", "")
     cards = [folder / "README.md" for folder in (path.parent, path.parent.parent) if (folder / "README.md").exists()]
-    assert any(re.search(rf"`(context/)?{path.stem}(\.safetensors)?`", card.read_text("utf-8")) for card in cards)
+    assert any(re.search(rf"`{path.stem}(\.safetensors)?`", card.read_text("utf-8")) for card in cards)
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
@@ -96,20 +96,6 @@ def test_shipped_models_of_map_evidence(path):
     named = belief.probabilities[0].argmax(-1)
     assert named[grid.cell_of(fixation)[0]] == 7
     assert named[0] == named[99] == 0
-
-
-@pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
-def test_shipped_context_priors(path):
-    prior = ContextPrior.from_pretrained(path.stem)
-    assert set(prior.weights) == {"evidence", "map"}
-    assert all(weight > 0 for pair in prior.weights.values() for weight in pair)
-    index = {name: place for place, name in enumerate(prior.classes, 1)}
-    # Kites are high in images, and ties are close to people.
-    kite = prior.place[index["kite"]]
-    assert kite[:5].mean() > kite[5:].mean()
-    tie = prior.cooccurrence[index["tie"], index["person"]]
-    assert tie[0] > 0 > tie[-1]
-    assert bool((prior.cooccurrence.diagonal() == 0).all())
 
 
 def test_shipped_class_templates():

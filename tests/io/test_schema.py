@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
-from semfov.belief import ContextPrior, MapEvidence, Verification
+from semfov.belief import MapEvidence, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
 from semfov.gaze import ClassTemplates, GazeHabits
@@ -32,11 +32,6 @@ def evidence():
 
 def everything():
     return MapEvidence(3, 2, components=3, metadata=METADATA)
-
-
-def context():
-    places, pairs = torch.randn(3, 2, 2).half().float(), torch.randn(3, 3, 2).half().float()
-    return ContextPrior(CLASSES, places, pairs, [0.1], weights={"map": (1.0, 0.5)})
 
 
 def glimpses():
@@ -72,7 +67,7 @@ def seeded(make):
     return made
 
 
-EVERY = (observation, evidence, everything, context, glimpses, verification, templates, habits)
+EVERY = (observation, evidence, everything, glimpses, verification, templates, habits)
 MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
