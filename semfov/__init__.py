@@ -14,7 +14,6 @@ fits the agent to a detector of your own. Each part is also a function or a diff
 `semfov.fusion`, `semfov.acquisition`, `semfov.rollout`.
 """
 
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import semfov.cli.start  # noqa: F401 (before what takes long to import)
@@ -94,7 +93,4 @@ def __getattr__(name: str) -> Any:
         from semfov.fit.detector import fit_detector
 
         return fit_detector
-    if name == "ZoomEye":
-        warnings.warn("semfov.ZoomEye is now semfov.WindowEye", DeprecationWarning, stacklevel=2)
-        return WindowEye
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,9 +15,6 @@ showed the target at the gaze in a search whose belief has no thresholds, no loo
 made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
 machine was over, the time of the scene was over, or the caller stopped it."""
 
-RENAMED: Mapping[str, Ending] = {"price": "worth"}
-"""Endings that files of earlier versions call by another name."""
-
 FIXATIONS = {
     "box": "The gaze is on a box of the target.",
     "detection": "A detection shows the target at the gaze.",

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Size, Text
 from semfov.io.storage import read, write_file
-from semfov.paths.endings import RENAMED, Ending
+from semfov.paths.endings import Ending
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
 
@@ -69,14 +68,12 @@ class Format:
             "lengths": Array(WHOLE, "n", least=1),
             "target": Maybe(WHOLE),
             "found": Flag(),
-            # Files of earlier versions have neither `place` nor `closer`.
-            "decision": Maybe(Object(_DECISION, None, ("outcome", "probability", "cell"))),
-            "closer": Maybe(Array(Object({name: _CLOSER[name] for name in closer}, None, tuple(closer)))),
-            # Nor these.
-            "targets": Maybe(Array(WHOLE)),
-            "least": Maybe(CHANCE),
+            "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
+            "closer": Array(Object({name: _CLOSER[name] for name in closer}, None, tuple(closer))),
+            "targets": Array(WHOLE),
+            "least": CHANCE,
             "source": Maybe(Text()),
-            "ending": Maybe(Text((*endings, *(old for old, new in RENAMED.items() if new in endings)))),
+            "ending": Maybe(Text(tuple(endings))),
         }
         boxes = {name: Field(shape, mixed=True, optional=True) for name, shape in _BOXES.items()}
         boxes["photograph"] = _PHOTOGRAPH
@@ -133,13 +130,13 @@ class Format:
         classes, target, lengths = tuple(record["classes"]), record.get("target"), record["lengths"]
         check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
         check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
-        targets, least = tuple(record.get("targets") or ()), record.get("least")
+        targets = tuple(record["targets"])
         check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
         photograph = tensors.get("photograph")
         sides = (1,) if photograph is None else photograph.shape[1:]
         check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
         looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
-        decision, closer = record.get("decision"), record.get("closer") or []
+        decision, closer = record.get("decision"), record["closer"]
         boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
         check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
         for look in closer:
@@ -150,7 +147,7 @@ class Format:
             "classes": classes,
             "target": target,
             "targets": targets,
-            "least": LEAST if least is None else least,
+            "least": record["least"],
             "source": record.get("source"),
             "photograph": photograph,
             "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
@@ -160,5 +157,5 @@ class Format:
                 CloseUp(**{"fixation": None, "cell": None} | look, box=box)
                 for look, box in zip(closer, boxes, strict=True)
             ),
-            "ending": RENAMED.get(str(record.get("ending")), record.get("ending")),
+            "ending": record.get("ending"),
         }

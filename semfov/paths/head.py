@@ -50,7 +50,6 @@ _FORMAT = Format.of(
     {
         "actions": Field(("n",), dtype=torch.int64, low=0),
         "maps": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3),
-        # Files of earlier versions have no values.
         "values": Field(("n",), mixed=True, finite=False, optional=True),
     },
     {

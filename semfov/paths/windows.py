@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -49,9 +49,7 @@ TENSORS = {
 VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
     "windows": Array(WINDOW, "n"),
-    # Files of earlier versions have scores that are no probabilities, and some have a certainty.
     "unseen": Maybe(pair(Number(low=0))),
-    "certainty": Maybe(pair(Number())),
 }
 """JSON values of the files of looks at windows."""
 
@@ -270,14 +268,6 @@ class ZoomPath(GazeRecord):
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
         objects = Objects(*(tensors[f"object_{name}"] for name in _OBJECTS))
         unseen = record.get("unseen") and tuple(record["unseen"])
-        least: dict[str, float] = {}
-        if record.get("certainty"):
-            # A file of an earlier version: probabilities followed from the scores alone.
-            offset, slope = record["certainty"]
-            logits = torch.cat([objects.scores, objects.scores.new_tensor([shared["least"]])]).logit(1e-4)
-            *chances, limit = (offset + slope * logits).sigmoid().tolist()
-            objects, unseen = replace(objects, scores=objects.scores.new_tensor(chances)), (0.0, 0.0)
-            least = {"least": limit}
         looks, classes = shared["detections"], shared["classes"]
         for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
             fits = not len(values) or int(values.max()) < most
@@ -293,7 +283,6 @@ class ZoomPath(GazeRecord):
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,
             "unseen": unseen,
-            **least,
         }
 
 

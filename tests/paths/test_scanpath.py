@@ -232,8 +232,8 @@ def spoil(tensors, record):
     yield "found", told(found=1)
     yield "lengths", told(lengths=[n + 1 for n in record["lengths"]])
     yield "seconds", told(seconds=record["seconds"][1:])
-    yield "decision", told(decision={"outcome": "perhaps", "probability": 0.5, "cell": None})
-    yield "decision.cell", told(decision={"outcome": "found", "probability": 0.5, "cell": 20})
+    yield "decision", told(decision={"outcome": "perhaps", "probability": 0.5, "cell": None, "place": None})
+    yield "decision.cell", told(decision={"outcome": "found", "probability": 0.5, "cell": 20, "place": None})
     look = {"fixation": 0, "target": 1, "cell": 1, "place": 0.5, "presence": 0.5}
     yield "closer_boxes", told(closer=[look])
     yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "cell": 20}]})
