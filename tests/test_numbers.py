@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from examples.look_graph import OPSET
 from semfov import FovealObservationModel
 from semfov.agents.head import _CONFIRM
 from semfov.agents.windows import LIKELY
@@ -30,7 +31,6 @@ from semfov.live.fovea import RATE
 from semfov.live.windows import WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
-from semfov.zoom.export import OPSET
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]

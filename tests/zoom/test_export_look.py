@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from examples.export_look import _LOOK_METADATA_KEY, export_look
 from semfov.detection.onnx import load_onnx
 from semfov.detection.selection import Selection
 from semfov.errors import InputError
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.evidence import pool_all
-from semfov.zoom.export import _LOOK_METADATA_KEY, export_look
 from semfov.zoom.glances import LiveGlances, on_lattice
 
 ort = pytest.importorskip("onnxruntime")

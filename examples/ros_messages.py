@@ -1,16 +1,18 @@
 """Detections and gaze as ROS 2 messages: dictionaries with the messages' fields, and messages filled from them.
 
 Nothing here imports ROS. The dictionaries have the fields of `vision_msgs/Detection2DArray` (version 4 of the package)
-and `geometry_msgs/PointStamped`. A complete node is in `examples/ros_node.py`.
+and `geometry_msgs/PointStamped`. A complete node is in `ros_node.py`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.decision import Decision
+from semfov.detection import Detections
 from semfov.errors import check, check_number, check_shape
 
 _Values = dict[str, Any]
@@ -18,38 +20,6 @@ Message = TypeVar("Message")
 
 _CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 _BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
-
-
-class _DetectionTensors(Protocol):
-    """The tensors of `semfov.Detections`."""
-
-    @property
-    def boxes(self) -> Tensor:
-        """Boxes `(..., L, 4)` in pixels."""
-
-    @property
-    def scores(self) -> Tensor:
-        """Score vectors `(..., L, K+1)`, background first."""
-
-    @property
-    def mask(self) -> Tensor:
-        """Which rows hold a detection, `(..., L)` boolean."""
-
-
-class _DecisionValues(Protocol):
-    """The decision of a search (`semfov.decision.Decision`)."""
-
-    @property
-    def probability(self) -> float:
-        """Probability that the image holds the target."""
-
-    @property
-    def box(self) -> Tensor | None:
-        """Box `(4,)` of the target in pixels, if it was found."""
-
-    @property
-    def place(self) -> float | None:
-        """Probability that the target is at this place, after a closer look."""
 
 
 def header(stamp: Any, frame: str) -> _Values:
@@ -66,7 +36,7 @@ def header(stamp: Any, frame: str) -> _Values:
 
 
 def detection_array(
-    detections: _DetectionTensors, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
+    detections: Detections, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
 ) -> _Values:
     """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes."""
     boxes, scores, mask = detections.boxes, detections.scores, detections.mask
@@ -87,7 +57,7 @@ def detection_array(
     return {"header": head, "detections": entries}
 
 
-def found_array(decision: _DecisionValues | None, name: str, *, stamp: Any, frame: str) -> _Values:
+def found_array(decision: Decision | None, name: str, *, stamp: Any, frame: str) -> _Values:
     """Make a `vision_msgs/Detection2DArray` of a decision: the box of the target if it was found, otherwise none.
 
     >>> found_array(None, "cup", stamp=0, frame="camera")["detections"]
@@ -124,18 +94,8 @@ def gaze_point(
     in the camera's optical frame (z ahead, x right, y down). A head that turns towards this point looks at the
     fixation.
 
-    Args:
-        fixation: `(u, v)` in pixels, pixel centres at integers.
-        stamp: time of the image, as for `header`.
-        frame: frame of reference of the image; with `camera`, the camera's optical frame.
-        camera: `(f_x, f_y, c_x, c_y)` in pixels, from `sensor_msgs/CameraInfo.k`; None leaves the point in pixels,
-            with z = 0.
-
-    Returns:
-        The fields of the message.
-
-    Raises:
-        InputError: a focal length is not positive, or the time stamp is not a time.
+    `fixation` is `(u, v)` in pixels, pixel centres at integers. `camera` is `(f_x, f_y, c_x, c_y)` in pixels, from
+    `sensor_msgs/CameraInfo.k`; without it the point stays in pixels, with z = 0.
 
     >>> gaze_point((420.0, 240.0), stamp=0, frame="camera_optical", camera=(500.0, 500.0, 320.0, 240.0))["point"]
     {'x': 0.2, 'y': 0.0, 'z': 1.0}
@@ -158,15 +118,9 @@ def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
             fill(getattr(message, name), value, *kinds)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             kind_name = fields[name].removeprefix("sequence<").partition(">")[0].partition("/")[2].split(",")[0]
-            kind = next((kind for kind in kinds if kind.__name__ == kind_name), None)
-            check(
-                kind is not None,
-                "kinds",
-                f"{kind_name} among them",
-                ", ".join(each.__name__ for each in kinds) or "none",
-            )
-            assert kind is not None
-            setattr(message, name, [fill(kind(), each, *kinds) for each in value])
+            named = {kind.__name__: kind for kind in kinds}
+            check(kind_name in named, "kinds", f"{kind_name} among them", ", ".join(named) or "none")
+            setattr(message, name, [fill(named[kind_name](), each, *kinds) for each in value])
         else:
             setattr(message, name, value)
     return message

@@ -1,6 +1,6 @@
 """Export of a look as one ONNX graph: window, detector, selection and evidence, for robots and cameras.
 
-python -m semfov.zoom.export yolox-nano look.onnx
+Run it from a checkout: python -m examples.export_look yolox-nano look.onnx
 """
 
 import argparse
@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from examples.look_graph import IR_VERSION, OPSET, LookGraph
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import OnnxDetector, probe
@@ -21,7 +22,6 @@ from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence, pool_all
-from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import FINEST, Gist
 from semfov.zoom.networks import STEPS
@@ -253,7 +253,9 @@ def _examples(cells: int, classes: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def main() -> None:
     """Run the command line of the export."""
-    parser = argparse.ArgumentParser(prog="python -m semfov.zoom.export", description="export a look as one ONNX graph")
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.export_look", description="export a look as one ONNX graph"
+    )
     parser.add_argument("detector", help="a name, or an ONNX file")
     parser.add_argument("output", type=Path, help="the ONNX file to write")
     parser.add_argument("--weights", help="file of the detector's weights, instead of a download")

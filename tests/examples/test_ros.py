@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import semfov
+from examples import ros_messages as ros
 from semfov import Detections
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic
@@ -18,10 +19,8 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
 from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
-from semfov.io import ros
+from tests.examples.messages import KINDS, plain
 from tests.small import Coloured
-
-from .messages import KINDS, plain
 
 CLASSES = ("cup", "cat", "car")
 ARRAY, DETECTION = KINDS["vision_msgs/Detection2DArray"], KINDS["vision_msgs/Detection2D"]
