@@ -192,7 +192,7 @@ def test_learned_models_are_submodules_of_the_agent(image):
     again = other.search(image.double(), "green", start=0, shifts=2)
     assert torch.equal(again.posterior, scanpath.posterior)
     with torch.no_grad():
-        next(other.searching.observer.observer.model.parameters()).add_(1)
+        next(other.searching.observer.model.parameters()).add_(1)
     assert torch.equal(agent.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
     # This agent has no learned models; the state of another agent is loaded into this one.
     plain = ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()))
