@@ -11,7 +11,6 @@ import torch
 import semfov
 from semfov import FovealObservationModel
 from semfov.belief import Verification
-from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
@@ -19,8 +18,7 @@ from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE, features
 
 KINDS = (
-    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, ClassTemplates,
-    GazeHabits, GlimpseEvidence,
+    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, GlimpseEvidence,
 )  # fmt: skip
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -28,7 +26,7 @@ MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
-LARGEST = {FovealObservationModel: 1_100_000, ClassTemplates: 200_000, GazeHabits: 10_000}
+LARGEST = {FovealObservationModel: 1_100_000}
 SHIPPED = [(kind, path) for kind in KINDS for path in sorted(kind.shipped.glob("*.safetensors"))]
 
 
@@ -96,34 +94,6 @@ def test_shipped_models_of_map_evidence(path):
     named = belief.probabilities[0].argmax(-1)
     assert named[grid.cell_of(fixation)[0]] == 7
     assert named[0] == named[99] == 0
-
-
-def test_shipped_class_templates():
-    paths = sorted(semfov.gaze.ClassTemplates.shipped.glob("*.safetensors"))
-    assert [path.stem for path in paths] == ["yolov3-tiny"]
-    model = semfov.gaze.ClassTemplates.from_pretrained("yolov3-tiny")
-    assert model.metadata["detector"]["name"] == "yolov3-tiny"
-    assert sum(model.metadata["counts"]) == 13_988
-    assert "13,988 objects" in (paths[0].parent / "README.md").read_text(encoding="utf-8")
-    # The average object of a class matches the template of its own class best.
-    average = (model.templates + model.mean)[:, :, None, None]
-    assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
-
-
-def test_shipped_gaze_habits():
-    paths = sorted(semfov.gaze.GazeHabits.shipped.glob("*.safetensors"))
-    assert [path.stem for path in paths] == ["osie-vocus2"]
-    habits = semfov.gaze.GazeHabits.from_pretrained("osie-vocus2")
-    assert habits.metadata["policy"] == "vocus2-raw"
-    card = (paths[0].parent / "README.md").read_text(encoding="utf-8")
-    assert f"{habits.metadata['held_out_bits']:.3f} ± " in card
-    assert f"{habits.metadata['fitted_choices']:,} fixations" in card
-    # People prefer salient places, the centre and short gaze shifts, and return rather to older fixations.
-    place = habits.place.view(10, 10)
-    assert float(habits.pull) > 0
-    assert place[4:6, 4:6].mean() > place[[0, 9]].mean()
-    assert bool((habits.step.diff() < 0).all())
-    assert bool((habits.back[:4].diff() > 0).all())
 
 
 @pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)

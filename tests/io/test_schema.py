@@ -10,7 +10,6 @@ from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
 from semfov.belief import MapEvidence, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
-from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io import storage
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
@@ -42,16 +41,6 @@ def verification():
     return Verification(thresholds=Thresholds(0.7, 0.3, 0.2), metadata=METADATA)
 
 
-def templates():
-    return ClassTemplates(torch.randn(2, 5), torch.randn(5), CLASSES, metadata=METADATA)
-
-
-def habits():
-    place, step, back = torch.randn(12), torch.randn(3), torch.randn(2)
-    sizes = {"edges": [0.1, 0.3], "ages": [2.0], "columns": 4}
-    return GazeHabits(place=place, step=step, back=back, pull=0.8, metadata={"policy": "kl"}, **sizes)
-
-
 def seeded(make):
     """The same model whenever it is made, with random numbers also where a new model has zeros."""
 
@@ -67,7 +56,7 @@ def seeded(make):
     return made
 
 
-EVERY = (observation, evidence, everything, glimpses, verification, templates, habits)
+EVERY = (observation, evidence, everything, glimpses, verification)
 MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 

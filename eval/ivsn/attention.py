@@ -1,13 +1,18 @@
-"""Attention to what resembles the target, accumulated over foveal looks."""
+"""IVSN over foveal looks: attention to what resembles the target, and the search that follows it."""
+
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
-from semfov.errors import check, check_shape
+from semfov.errors import InputError, check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import acuity
+from semfov.gaze.policies import Means, Policy, required_target
+from semfov.runs.candidates import Candidate
 
 
 class TemplateAttention(AcquisitionFunction):
@@ -16,10 +21,10 @@ class TemplateAttention(AcquisitionFunction):
     .. math:: a(x) = \frac{\sum_{f \in \mathcal V} v(d(x, f)) \, M_t^f(x)}{\sum_{f \in \mathcal V} v(d(x, f))},
               \qquad v(d) = e^{-\max(d / r - 1,\, 0)}
 
-    :math:`M_t^f` is the attention map for the target of the foveated image seen from f
-    (`semfov.gaze.ClassTemplates`), and :math:`\mathcal V` are the fixated cells. This is IVSN (Zhang et al., 2018)
-    "with foveal vision, extracting top-down characteristics along the way", as the outlook of Luzio, Bernardino and
-    Moreno (2024) proposes. The weights v of the looks are our choice; they are those of `CloserLook`.
+    :math:`M_t^f` is the attention map for the target of the foveated image seen from f (`ClassTemplates`), and
+    :math:`\mathcal V` are the fixated cells. This is IVSN (Zhang et al., 2018) "with foveal vision, extracting
+    top-down characteristics along the way", as the outlook of Luzio, Bernardino and Moreno (2024) proposes. The weights
+    v of the looks are our choice; they are those of `CloserLook`.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
@@ -60,3 +65,36 @@ class TemplateAttention(AcquisitionFunction):
     def _values(self, attention: Tensor, visited: Tensor) -> Tensor:
         weight = visited[..., None] * self.weight.to(attention)
         return (weight * attention).sum(-2) / weight.sum(-2).clamp(min=torch.finfo(attention.dtype).tiny)
+
+
+class TemplateSearch(Policy):
+    """Look at what resembles the template of the target's class, with a fovea of this width (`Means.fovea`)."""
+
+    name = "ivsn"
+    tasks = ("search",)
+    by_belief = False
+
+    def __init__(self, fovea: float = 100 / 640) -> None:
+        super().__init__()
+        self.fovea = fovea
+
+    @classmethod
+    def make(cls, means: Means) -> Self:
+        """The policy with the width of the fovea."""
+        return cls(means.fovea)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """Raise an error, since there is no attention without a scene."""
+        raise InputError("policy 'ivsn': expected the attention of a scene, which `python -m eval.ivsn` computes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attending(Candidate):
+    """IVSN in one scene, with the attention `(X·Y, K, X·Y)` of `TemplateAttention`."""
+
+    attention: Tensor
+    fovea: float
+
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
+        """The attention to the target, accumulated over the fixated cells."""
+        return TemplateAttention(required_target(target, TemplateSearch.name), self.attention, grid, self.fovea)

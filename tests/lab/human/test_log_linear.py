@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from semfov.errors import DataError, InputError
-from semfov.gaze.log_linear import fit_log_linear, log_probability
+from train.humanlike.log_linear import fit_log_linear, log_probability
 
 
 def draw(count=400, alternatives=6, features=4, seed=0, dtype=torch.float64):

@@ -7,8 +7,8 @@ from torch import nn
 from torch.nn import functional as F
 from torchvision.models import vgg16
 
+from eval.ivsn.published import IVSN
 from semfov.errors import DataError, InputError
-from semfov.gaze import IVSN
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ import json
 import pytest
 import torch
 
-from eval.search import main as search
+from eval.ivsn import main as search
+from eval.ivsn.templates import ClassTemplates
 from semfov import EmbeddedScenes, load_detector
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _yolov3_tiny
 from semfov.errors import InputError
-from semfov.gaze import ClassTemplates
 from tests.small import Fixed
 from train.fit_templates import main
 from train.templates import TemplateSums, objects_of

@@ -16,11 +16,12 @@ from semfov.data.fixations import Fixations
 from semfov.data.scenes import EmbeddedScenes
 from semfov.episode import StoredLooks
 from semfov.errors import DataError
-from semfov.gaze import GazeHabits, Habitual, acquisition
+from semfov.gaze import acquisition
 from semfov.gaze.acquisition import NegativeEntropy
 from semfov.gaze.choice import drawn_by
 from semfov.observation.foveal import FovealObservationModel
 from train.fit_humanlike import main
+from train.humanlike.gaze_habits import GazeHabits, Habitual
 from train.humanlike.habits import AGES, EDGES, ORDER, Halves, fit_terms, habits_of
 from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 

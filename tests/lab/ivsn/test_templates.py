@@ -4,12 +4,14 @@ import pytest
 import torch
 from scipy.spatial.distance import cosine
 
+from eval.ivsn.attention import Attending, TemplateAttention, TemplateSearch
+from eval.ivsn.templates import ClassTemplates, at_points
 from semfov import DirichletBelief, Grid
+from semfov.belief.observers import Semantic
 from semfov.detection.placement import Placement, letterbox
 from semfov.errors import InputError
-from semfov.gaze import ClassTemplates
-from semfov.gaze.acquisition import TemplateAttention
-from semfov.gaze.templates import at_points
+from semfov.gaze.policies import Means
+from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -105,6 +107,29 @@ def test_invalid_arguments_are_refused():
             TemplateAttention(1, attention, GRID)
     with pytest.raises(InputError, match=r"^fovea:"):
         TemplateAttention(1, make_attention(), GRID, 0.0)
+
+
+def test_a_search_follows_the_attention_of_its_scene():
+    strategy, attention = Strategy(Semantic(4), TemplateSearch.make(Means(fovea=0.2))), make_attention()
+    candidate = Attending(strategy, attention=attention, fovea=0.2)
+    visited = torch.zeros(1, 12, dtype=torch.bool)
+    visited[0, 5] = True
+    value = candidate.acquisition(torch.tensor([2]), GRID, torch.tensor([5]))(uniform_beliefs(1), visited)
+    torch.testing.assert_close(value[0], attention[5, 1])
+    with pytest.raises(InputError, match="policy 'ivsn': expected a target"):
+        candidate.acquisition(None, GRID, torch.tensor([5]))
+    with pytest.raises(InputError, match="policy 'ivsn': expected the attention of a scene"):
+        strategy.policy(1, GRID)
+
+
+def test_shipped_templates():
+    model = ClassTemplates.from_pretrained("yolov3-tiny")
+    assert model.metadata["detector"]["name"] == "yolov3-tiny"
+    card = (model.shipped / "README.md").read_text(encoding="utf-8")
+    assert f"{sum(model.metadata['counts']):,} objects" in card
+    # The average object of a class matches the template of its own class best.
+    average = (model.templates + model.mean)[:, :, None, None]
+    assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
 
 
 def test_looks_are_weighted_in_the_precision_of_the_attention():

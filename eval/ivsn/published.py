@@ -21,7 +21,7 @@ class IVSN(nn.Module):
     picture T after the pooling that follows; for a picture of 28 × 28 pixels they are one vector. The search image is
     correlated with this vector. The gaze goes from one maximum to the next, with inhibition of return. The network is
     VGG16 trained on ImageNet, and is not trained for the task. It sees the whole picture sharply;
-    `semfov.acquisition.TemplateAttention` is its counterpart for foveal looks.
+    `eval.ivsn.attention.TemplateAttention` is its counterpart for foveal looks.
 
     Args:
         features: network that computes φ, such as `torchvision.models.vgg16().features` without its last pooling.

@@ -44,7 +44,7 @@ class ClassTemplates(PretrainedForEye):
 
     kind: ClassVar[str] = "class-templates"
     title: ClassVar[str] = "class templates"
-    shipped: ClassVar[Path] = Path(__file__).parent / "models" / "templates"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
     schema: ClassVar[Schema] = Schema(
         {"templates": Field(("K", "C"), low=-1e3, high=1e3), "mean": Field(("C",), low=-1e3, high=1e3)},
         {"classes": CLASSES},

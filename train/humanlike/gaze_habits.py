@@ -47,7 +47,7 @@ class GazeHabits(Pretrained):
 
     kind: ClassVar[str] = "gaze-habits"
     title: ClassVar[str] = "model of gaze habits"
-    shipped: ClassVar[Path] = Path(__file__).parent / "models" / "habits"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
     schema: ClassVar[Schema] = Schema(
         {
             "pull": Field((), low=-1e3, high=1e3),
