@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from eval.decide.roc import plot_roc
 from semfov.metrics.presence import area_under_roc, roc
-from semfov.viz.presence import plot_roc
 
 
 def test_curves_and_areas_equal_those_of_the_scores():

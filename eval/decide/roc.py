@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,28 +12,13 @@ from semfov.metrics.presence import area_under_roc, roc
 from semfov.viz.style import COLOURS, LINES, make_figure, styled
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 @styled
-def plot_roc(scores: Mapping[str, Tensor], present: Tensor, *, axes: Sequence[Axes] | None = None) -> Figure:
-    """Plot hit rates against false alarm rates: the whole range, and beside it false alarm rates up to 0.1.
-
-    Args:
-        scores: for each name `(M,)`, higher where the target is more likely present.
-        present: `(M,)` boolean, whether it is; some must be true and some false.
-        axes: two axes to draw in; None makes a figure.
-
-    Returns:
-        The figure; its legend has the areas under the curves.
-
-    Raises:
-        InputError: the target is present in all cases or in none.
-
-    >>> figure = plot_roc({"one look": torch.tensor([0.9, 0.4, 0.1])}, torch.tensor([True, True, False]))
-    """
-    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed", axes=axes)
+def plot_roc(scores: Mapping[str, Tensor], present: Tensor) -> Figure:
+    """Hit rates against false alarm rates, the whole range and up to 0.1; scores `(M,)`, present `(M,)` boolean."""
+    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed")
     for panel, widest in zip(panels, (1.0, 0.1), strict=True):
         for (name, score), colour, line in zip(
             scores.items(), COLOURS * len(scores), LINES * len(scores), strict=False
