@@ -36,7 +36,7 @@ from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor
-from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
+from semfov.viz import plot_belief_bars, plot_foveated_strip
 from semfov.viz.drawing import (
     Tag,
     choose_fixations,
@@ -46,10 +46,11 @@ from semfov.viz.drawing import (
     draw_cross,
     draw_image,
     draw_look,
+    draw_scale,
     draw_tags,
 )
 from semfov.viz.path import GazePath, LookPath
-from semfov.viz.style import FOUND, GAZE, OTHER, lay_out, make_figure, save_figure, styled
+from semfov.viz.style import FOUND, GAZE, OTHER, PROBABILITY, lay_out, make_figure, save_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -304,8 +305,12 @@ def saliency_example(example: Example) -> Figure:
     pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(-1).float()
     visited_pixels = visited[0, Grid(grid.columns, grid.rows, (width, height)).cell_of(pixels)].reshape(height, width)
     figure, axes = example.pictures(1, 2, 4.2)
-    plot_saliency(saliency[0].masked_fill(visited_pixels, 0), view[0], title=f"VOCUS2 after {LOOKS} looks", axes=axes)
+    draw_image(axes[0], view[0], Grid(1, 1, (width, height)))
     axes[0].set_title("foveal image")
+    shown = saliency[0].masked_fill(visited_pixels, 0).numpy()
+    drawn = axes[1].imshow(shown, extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
+    axes[1].set(xticks=[], yticks=[], title=f"VOCUS2 after {LOOKS} looks")
+    draw_scale(axes[1], drawn, "")
     lay_out(figure)
     fixations = grid.centres[cells[:LOOKS]]
     for panel, frame in zip(axes, (example.frame, (width, height)), strict=True):

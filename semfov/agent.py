@@ -97,7 +97,6 @@ class ActivePerception(nn.Module):
         sigma: float = 100.0,
         growth: float = 2.0,
         grid: tuple[int, int] = (10, 10),
-        context: bool = False,
         **options: Any,
     ) -> Self:
         """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
@@ -107,8 +106,6 @@ class ActivePerception(nn.Module):
             sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
             growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
-            context: whether search also uses the usual places of the target and its co-occurrence with other classes
-                (`ContextPrior`).
             options: options of `semfov.load_detector`.
 
         Returns:
@@ -118,7 +115,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_arguments, name, sigma, growth, grid, context, **options)
+        return cls._of(recommended_arguments, name, sigma, growth, grid, **options)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:

@@ -7,7 +7,7 @@ cell. The person's choice of the next cell is then fitted by maximum likelihood,
 by the policy's value, a centre bias, the distribution of saccade lengths, and inhibition of return that fades. The
 model is fitted on half of the people in half of the pictures, and evaluated on the other people in the other pictures.
 
-The folder `out` gets the model (`<name>.safetensors`, a `semfov.gaze.GazeHabits`) and a report. `semfov.gaze.Habitual`
+The folder `out` gets the model (`<name>.safetensors`, a `GazeHabits`) and a report. `Habitual`
 draws fixations from the model.
 """
 

@@ -5,10 +5,10 @@
 Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
 Every photograph is passed through the detector once, without foveation. The features at the centres of the annotated
-objects are averaged for each class. These averages are the templates of the search policy `ivsn`. The folder `out` gets
+objects are averaged for each class. These averages are the templates of IVSN. The folder `out` gets
 the model (`<name>.safetensors`) and a report that evaluates it on held-out photographs.
 
-Use the model with `--policies [ivsn] --templates runs/fit_templates/<name>.safetensors`.
+Use the model with `python -m eval.ivsn --templates runs/fit_templates/<name>.safetensors`.
 """
 
 import sys

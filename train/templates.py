@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from eval.ivsn.templates import ClassTemplates, at_points, unit
 from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detector import Detector
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
 from semfov.fit.settings import FitConfig
-from semfov.gaze.templates import ClassTemplates, at_points, unit
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker
 from semfov.runs.tables import table

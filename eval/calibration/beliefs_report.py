@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
+from eval.calibration.cell_figure import plot_cell_reliability
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
@@ -18,7 +19,6 @@ from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import gather
 from semfov.runs.tables import csv_text, table
-from semfov.viz import plot_cell_reliability
 from semfov.viz.style import save_figure
 
 Sums = dict[tuple[str, int, str], BinarySums]

@@ -1,7 +1,11 @@
 """Figures of the pages of results: the paper's four, for both detectors and foveas, and one of score thresholds."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from eval.page.curves import averaged, records_of
 from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
@@ -10,7 +14,11 @@ from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
 from semfov.metrics.averages import FloatArray
-from semfov.viz.style import save_figure
+from semfov.viz.curves import draw_curves, legend_of
+from semfov.viz.style import make_figure, save_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,9 @@ PAGE_FIGURES = {
 }
 """The figures by the names of their files."""
 
+Panel = tuple[dict[str, FloatArray], dict[str, FloatArray]]
+"""Curves in [0, 1] by their names, and their standard errors."""
+
 LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
 
 
@@ -51,8 +62,6 @@ THRESHOLD_FIGURE = "thresholds"
 
 def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     """Draw the figures whose experiments are all finished; returns their files."""
-    from semfov.viz import plot_curve_panels
-
     written = []
     if not missing(AT_THRESHOLDS, runs):
         tested = {
@@ -74,7 +83,21 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     return written
 
 
-def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+@styled
+def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
+    """Curves of several experiments with the same policies side by side, two in a row, with one legend."""
+    rows = -(-len(panels) // 2)
+    figure, every = make_figure(rows, 2, width=8.8, height=2.9 * rows + 0.5)
+    for axes, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
+        draw_curves(axes, curves, errors)
+        axes.set(xlabel="gaze shifts", ylabel=label, title=title)
+    for axes in every[len(panels) :]:
+        axes.remove()
+    legend_of(figure, every[0], columns=3, inside=False)
+    return figure
+
+
+def panel(folder: Path, figure: PaperFigure) -> Panel:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     curves = {
@@ -87,7 +110,7 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
     )
 
 
-def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> Panel:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
     means, errors = {}, {}
     for threshold in SCORE_THRESHOLDS:

@@ -19,10 +19,7 @@ _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
 PARTS = ("observation", "tempering", "evidence", "verification", "map", "windows")
-"""Parts that a folder may hold, in the order in which they are fitted.
-
-Folders of earlier versions have no `verification` or no `windows`.
-"""
+"""Parts that a folder may hold, in the order in which they are fitted."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 

@@ -6,20 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 from semfov.belief import Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
-from semfov.gaze.policies.tables import salient_from
-from semfov.gaze.templates import ClassTemplates
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, SaliencyMaximum, Task, named_policy
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
-from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
-from semfov.runs.setup import make_learned, make_observation, make_templates
+from semfov.runs.presets import TARGET_EVIDENCE, resolve
+from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
 
 T = TypeVar("T")
@@ -27,10 +26,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)`."""
+    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)` from every cell, or `(1, X·Y)` from anywhere."""
 
     strategy: Strategy
-    table: Tensor | None = None
     saliency: Tensor | None = None
     weight: float = 1.0
 
@@ -41,10 +39,14 @@ class Candidate:
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
-        acquisition = self.strategy.policy.in_scene(target, grid, self.table, cell)
+        policy = self.strategy.policy
         if self.saliency is None:
-            return acquisition
-        return SaliencyPrior(acquisition, salient_from(self.saliency, cell), weight=self.weight)
+            alone: AcquisitionFunction = policy(target, grid)
+            return alone
+        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
+        if isinstance(policy, SaliencyMaximum):
+            return Static(salient)
+        return SaliencyPrior(policy(target, grid), salient, weight=self.weight)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,6 @@ class _Models:
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
     map: MapEvidence | None = None
-    templates: ClassTemplates | None = None
 
 
 def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
@@ -69,9 +70,6 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
         else None,
         make_learned(MapEvidence, belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
-        else None,
-        make_templates(config.class_templates, eye)
-        if any(table_of(policy) == "attention" for policy in policies)
         else None,
     )
 

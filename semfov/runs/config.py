@@ -197,8 +197,8 @@ class PolicyConfig(Settings):
     A setting that is null is taken from the `belief` settings of the run.
 
     Args:
-        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient cell)
-            and `ivsn` (uses class templates), or `target-evidence` (uses the learned evidence for the target).
+        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient
+            cell), or `target-evidence` (uses the learned evidence for the target).
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
             first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
             evidence in searches.
@@ -312,11 +312,6 @@ class RunConfig(LookingConfig):
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str | PolicyConfig, ...] = ("recommended",)
     models: Path | None = None
-
-    @property
-    def class_templates(self) -> str | None:
-        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
-        return None
 
     def complete(self, folder: ModelFolder) -> Self:
         """The settings, completed by the values that this kind of run takes from a folder of models."""

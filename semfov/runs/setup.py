@@ -20,7 +20,6 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
-from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
 from semfov.io.pretrained import shipped_model
@@ -176,13 +175,6 @@ def if_shipped(
             raise
         missing(str(error))
         return None
-
-
-def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
-    """Load class templates by name, or those shipped for the detector; check that they fit the eye."""
-    model = ClassTemplates.from_pretrained(name or eye.detector.name)
-    model.check_eye(eye.settings(), eye.detector.classes)
-    return model
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

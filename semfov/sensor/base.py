@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import InputError, check, check_finite, values_known
+from semfov.errors import check, check_finite, values_known
 
 
 class Sensor(nn.Module, ABC):
@@ -153,16 +153,15 @@ class Sensor(nn.Module, ABC):
     def width(cls, settings: Mapping[str, Any]) -> float:
         """Tell the width of the fovea, in pixels of the image that the settings are for.
 
+        Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
+
         Args:
             settings: settings of the sensor.
 
         Returns:
             The width.
-
-        Raises:
-            InputError: the sensor has no fovea.
         """
-        raise InputError(f"sensor: expected a sensor with a fovea, got {cls.__name__}, which has none")
+        return 100.0
 
     @classmethod
     def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:

@@ -86,7 +86,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     record = agent.find_all(picture, "blue", how="windows", passes=16)
     assert len(record.objects) == 1
     torch.testing.assert_close(record.objects.boxes[0], torch.tensor([160.0, 96, 168, 104]), atol=4, rtol=0)
-    # A part that is not used, or that a folder of an earlier version lacks, leaves the agent without it.
+    # A part that is not used, or that a folder lacks, leaves the agent without it.
     for parts in ({"windows": fitted.part.__class__(None, None, False, "")}, {}):
         replace(Manifest.read(home / "models"), parts=parts).write(home / "models")
         assert ModelFolder(home / "models").windows() is None

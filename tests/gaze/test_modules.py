@@ -1,13 +1,8 @@
 """Acquisition functions, policies and saliency models as submodules of other modules."""
 
-import torch
-from torch import nn
-
 from semfov import acquisition, policies, saliency
 from semfov.belief import DirichletBelief
 from semfov.belief.observers import LearnedMap
-from semfov.gaze import IVSN, GazeHabits
-from semfov.gaze.templates import ClassTemplates
 from tests.base_tester import GraphTester, TensorTester, make_testers
 from tests.small import GRID, detections, look, mapping, memory, model, rand
 
@@ -119,28 +114,6 @@ class TestIdealObserver(TensorTester):
         return policies.IdealObserver(model())
 
 
-class TableTester(PolicyTester):
-    """For policies that need a table of every scene, seen from the fixated cell."""
-
-    @staticmethod
-    def call(module, beta, closest):
-        table = (rand(12, 12) if module.table == "saliency" else rand(12, 3, 12)).to(closest)
-        return module.in_scene(2, GRID, table, torch.tensor([3, 5], device=closest.device))(
-            DirichletBelief(beta, closest), closest == 0
-        )
-
-
-globals().update(
-    make_testers(
-        TableTester,
-        {
-            "SaliencyMaximum": policies.SaliencyMaximum,
-            "TemplateSearch": policies.TemplateSearch,
-        },
-    )
-)
-
-
 globals().update(
     make_testers(
         PolicyTester,
@@ -175,40 +148,6 @@ class TestGain(PolicyTester):
     @staticmethod
     def call(module, scores, boxes, fixation):
         return TestExpectedGain.call(module(None, GRID), scores, boxes, fixation)
-
-
-class TestGazeHabits(TensorTester):
-    """Log probabilities of the next cell, given the present one."""
-
-    batched = (0, 1, 2)
-
-    def make(self):
-        return GazeHabits(0.5, rand(len(GRID)), rand(3), [0.2, 0.5], rand(2), [2.0], 4)
-
-    def inputs(self):
-        return rand(2, len(GRID)), torch.tensor([1, 7]), torch.full((2, len(GRID)), torch.inf)
-
-    @staticmethod
-    def call(module, values, cell, age):
-        return module(values, cell, age, GRID)
-
-
-class TestIVSN(TensorTester):
-    batched = (0, 1)
-
-    def make(self):
-        return IVSN(nn.Conv2d(3, 4, 3, 2, 1), nn.AdaptiveMaxPool2d(1), picture=32, target=8)
-
-    def inputs(self):
-        return rand(2, 3, 48, 64), rand(2, 3, 12, 9)
-
-
-class TestClassTemplates(GraphTester):
-    def make(self):
-        return ClassTemplates(rand(3, 5), rand(5), ("cat", "cup", "person"))
-
-    def inputs(self):
-        return (rand(2, 5, 4, 6),)
 
 
 class TestVOCUS2(GraphTester):

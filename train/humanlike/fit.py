@@ -21,7 +21,6 @@ from semfov.errors import DataError, check, lookup
 from semfov.eye import Eye
 from semfov.fit.outputs import model_path, write_outputs
 from semfov.fit.settings import FitConfig
-from semfov.gaze.habits import GazeHabits
 from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig, SaliencyConfig
 from semfov.runs.policy_looking import PolicyLooking
@@ -29,6 +28,7 @@ from semfov.runs.presets import label
 from semfov.runs.settings import Count, Positive
 from semfov.runs.setup import prepare_worker
 from semfov.runs.tables import table
+from train.humanlike.gaze_habits import GazeHabits
 from train.humanlike.habits import AGES, EDGES, FittedTerms, Halves, fit_terms, habits_of
 from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import DataError
-from semfov.gaze.habits import GazeHabits, age_bins, standardised, step_bins
-from semfov.gaze.log_linear import fit_log_linear, log_probability
 from semfov.metrics.averages import standard_error
+from train.humanlike.gaze_habits import GazeHabits, age_bins, standardised, step_bins
+from train.humanlike.log_linear import fit_log_linear, log_probability
 from train.humanlike.viewings import Choices
 
 EDGES = (0.05, 0.11, 0.16, 0.22, 0.3, 0.4, 0.55)

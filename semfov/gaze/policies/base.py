@@ -16,9 +16,6 @@ from semfov.gaze.acquisition.samples import DrawnModel, sampled_likelihoods
 
 Task = Literal["search", "exploration"]
 
-Table = Literal["saliency", "attention"]
-"""What a policy can need of every scene: the saliency of its cells, or attention to every class in its cells."""
-
 
 class GazeModel(DrawnModel, SightedModel, SignalModel, Protocol):
     """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
@@ -55,13 +52,11 @@ class Policy(nn.Module, ABC):
     """Base of all policies: how to choose where to look, for any target on any grid.
 
     A subclass is registered under its `name` when it is defined, and settings can then refer to it by that name.
-    `needs_model` and `needs_map` declare what it is made from, and `make` takes that from `Means`. `table` declares
-    what it needs of every scene, and `in_scene` takes that.
+    `needs_model` and `needs_map` declare what it is made from, and `make` takes that from `Means`.
 
     Attributes:
         name: name in settings.
         tasks: tasks that the policy is for.
-        table: the table that it needs of every scene; None for most policies.
         needs_model: whether it is made from an observation model.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
         by_belief: whether its choice depends on the belief.
@@ -80,7 +75,6 @@ class Policy(nn.Module, ABC):
 
     name: ClassVar[str]
     tasks: ClassVar[tuple[Task, ...]]
-    table: ClassVar[Table | None] = None
     needs_model: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
     by_belief: ClassVar[bool] = True
@@ -115,30 +109,6 @@ class Policy(nn.Module, ABC):
         Returns:
             The acquisition function.
         """
-
-    def in_scene(
-        self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
-    ) -> AcquisitionFunction:
-        """Make the acquisition function of episodes in a scene, for the cells that they fixate.
-
-        Without a `table`, a policy makes the same as in any other scene with this grid.
-
-        Args:
-            target: class 1..K, a tensor `(B,)` with one for each episode, or None in an exploration.
-            grid: the cells.
-            table: the table that the policy declares: for `saliency` that of all cells seen from each cell,
-                `(X·Y, X·Y)`, or from anywhere, `(1, X·Y)`; for `attention` that to every class in all cells seen from
-                each cell, `(X·Y, K, X·Y)`.
-            cell: `(B,)`, the fixated cells.
-
-        Returns:
-            The acquisition function.
-
-        Raises:
-            InputError: the policy needs a table, and `table` is None.
-        """
-        made: AcquisitionFunction = self(target, grid)
-        return made
 
 
 class ModelPolicy(Policy):

@@ -103,6 +103,7 @@ COMMANDS = {
             (("--detector.name", "yolov3-tinny"), "did you mean 'yolov3-tiny'"),
         ),
     ),
+    "eval.ivsn": Command(),
     "eval.explore": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
                   "--policies", "[random-raw, vocus2-raw]"),
