@@ -15,8 +15,7 @@ from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
+from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.tables import csv_text, table
 from semfov.viz import plot_cell_reliability
 from semfov.viz.style import save_figure

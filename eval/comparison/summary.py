@@ -18,8 +18,7 @@ from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
+from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import csv_text, percent
 from semfov.version import __version__

@@ -42,7 +42,7 @@ def _live(options: Any) -> int:
 
 
 def _fit_options() -> type[Any]:
-    from semfov.fit.detector_settings import FitDetectorConfig
+    from semfov.fit.settings import FitDetectorConfig
 
     return FitDetectorConfig
 

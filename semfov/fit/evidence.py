@@ -144,7 +144,7 @@ def _fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds."""
     examples = _make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
-    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     judged, model.thresholds = _judge_evidence(config, model, examples[held_out], grid)
@@ -364,14 +364,7 @@ class EvidenceFit(PartFit):
     @property
     def settings(self) -> FitSearchConfig:
         """The settings of the training."""
-        own = self.config
-        return FitSearchConfig(
-            **self.inputs.common,
-            holdout=self.inputs.holdout,
-            absent=self.inputs.absent,
-            max_target_area=own.max_target_area,
-            steps=own.steps or 500,
-        )
+        return self.inputs.settings(FitSearchConfig, absent=self.inputs.absent)
 
     @property
     def tasks(self) -> dict[str, float]:
@@ -388,7 +381,7 @@ class EvidenceFit(PartFit):
     def choose_thresholds(self, model: TargetEvidence) -> Thresholds:
         """Choose the thresholds of decisions on the held-out photographs."""
         config, inputs = self.settings, self.inputs
-        grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+        grid = Grid(*config.cells, config.cells)
         # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
         each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
         area, scenes = config.max_target_area, inputs.held_out

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Protocol
@@ -29,7 +30,7 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.samples import CellsOfLook, Sampler, Samples, SampleSettings, collect_samples, whole_photograph
+from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import csv_text, table
 from semfov.runs.zoom_samples import MosaicSampler
@@ -102,7 +103,7 @@ class FitObservationConfig(FitConfig):
 def fit_fom(config: FitObservationConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
-    sampler = collect_samples(SampleSettings.of(config), folder, config.where, "looking", kind)
+    sampler = collect_samples(config, folder, "looking", kind)
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
@@ -348,8 +349,7 @@ class ObservationFit(PartFit):
     @property
     def settings(self) -> FitObservationConfig:
         """The settings of the observation model."""
-        common = {name: each for name, each in self.inputs.common.items() if name not in ("columns", "rows")}
-        return FitObservationConfig(**common, holdout=self.inputs.holdout, fixations=self.config.fixations)
+        return self.inputs.settings(FitObservationConfig)
 
     @property
     def tasks(self) -> dict[str, float]:
@@ -363,7 +363,7 @@ class ObservationFit(PartFit):
         judged = samples[held_out]
         model = _fit_model(config, run, _statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
-        cells = whole_photograph(self.config.columns, self.config.rows)
+        cells = partial(all_cells, cells=self.config.cells)
         misses = _count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()

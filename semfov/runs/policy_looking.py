@@ -48,9 +48,8 @@ class PolicyLooking(Looking):
             observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
-        size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, size)
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }

@@ -15,7 +15,7 @@ from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 TARGET_EVIDENCE = "target-evidence"
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-WORDS = {
+_WORDS = {
     "scores": Scores,
     "footprint": Footprint,
     "memory": CellMemory,
@@ -98,10 +98,11 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
     lookup(choice.policy, _valid_policies(task), "policy")
-    if table_of(choice) == "saliency" and choice.saliency is None:
+    saliency = choice.saliency if table_of(choice) == "saliency" else None
+    if table_of(choice) == "saliency" and saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
-    for setting, words in WORDS.items():
+    for setting, words in _WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
@@ -109,7 +110,8 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     if choice.samples is not None and not (choice.policy in POLICIES and POLICIES[choice.policy].by_samples):
         names = ", ".join(name for name in policy_names(task) if POLICIES[name].by_samples)
         raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
-    scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
+    known = presets(task).values()
+    scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
@@ -144,9 +146,3 @@ def label(choice: PolicyChoice, task: Task) -> str:
             text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
             differs.append(field.name if value is True else f"{field.name} {text}")
     return ", ".join([base, *differs])
-
-
-def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
-    """Whether there is a preset of this policy with these scores."""
-    saliency = policy.saliency if table_of(policy) == "saliency" else None
-    return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

@@ -30,9 +30,9 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
 from semfov.fit.detector import _seconds_of_looks
 from semfov.fit.detector_report import _thin_classes
-from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
+from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import VerificationFit, _VerifiedSearch, scores
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
@@ -40,7 +40,7 @@ from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
-from semfov.runs.looking import looking_of
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network
@@ -537,7 +537,7 @@ def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path
     root = home / "photographs"
     data = DataConfig(root, root / "instances.json", 3, min_instances=0, max_target_area=None)
     detector = DetectorConfig(str(home / "colours.onnx"))
-    run = looking_of(
+    run = Looking(
         FitDetectorConfig(data=data, detector=detector, columns=3, rows=2, out=tmp_path, cache=tmp_path, workers=1)
     )
     clock = itertools.count(step=2.0)

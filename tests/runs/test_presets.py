@@ -12,7 +12,7 @@ from semfov.errors import InputError
 from semfov.gaze.policies import Task, policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
-from semfov.runs.presets import WORDS, _valid_policies, label, presets, resolve
+from semfov.runs.presets import _WORDS, _valid_policies, label, presets, resolve
 
 TASKS = get_args(Task)
 ALIASES = {
@@ -34,7 +34,7 @@ CHANGES = [
     {"misses": True},
     {"misses": False},
     {"samples": 4},
-    *({name: word} for name, words in WORDS.items() if name != "scores" for word in get_args(words)),
+    *({name: word} for name, words in _WORDS.items() if name != "scores" for word in get_args(words)),
 ]
 
 

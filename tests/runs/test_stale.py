@@ -19,8 +19,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import SceneResults, finish, gather
 from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
