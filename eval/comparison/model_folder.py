@@ -55,7 +55,13 @@ def with_models(config: _Config) -> _Config:
             raise InputError(
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
-    config = replace(config, detector=detector, sensor=sensor_config(folder), belief=belief, policies=tuple(chosen))
+    config = replace(
+        config,
+        detector=detector,
+        sensor=SensorConfig.of(folder.manifest.sensor),
+        belief=belief,
+        policies=tuple(chosen),
+    )
     return config.complete(folder)
 
 
@@ -70,11 +76,6 @@ def detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig
     if "weights" in options:
         options["weights"] = Path(options["weights"])
     return DetectorConfig(name=source, **{"background": None, **options})
-
-
-def sensor_config(folder: ModelFolder) -> SensorConfig:
-    """The settings of a folder's sensor."""
-    return SensorConfig.of(folder.manifest.sensor)
 
 
 def recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -20,56 +21,32 @@ from semfov.version import __version__
 
 @dataclass(frozen=True)
 class _Subcommand:
-    """A subcommand."""
+    """A subcommand; `run` is the module and the function that it runs, which are imported only then."""
 
     text: str
-    options: Callable[[], type[Any]]
-    run: Callable[[Any], int | None]
+    options: type[Any] | None
+    run: tuple[str, str]
     positional: tuple[str, str]
     goes_on: str = ""
 
 
-def _pictures(options: Any) -> int:
-    from semfov.cli.search import look_at
-
-    return look_at(options)
-
-
-def _live(options: Any) -> int:
-    from semfov.cli.live import look_live
-
-    return look_live(options)
-
-
-def _fit_options() -> type[Any]:
-    from semfov.fit.settings import FitDetectorConfig
-
-    return FitDetectorConfig
-
-
-def _fit(options: Any) -> None:
-    from semfov.fit.detector import fit_folder
-
-    fit_folder(options)
-
-
-def _detectors(options: Any) -> int:
-    from semfov.cli.detectors import list_detectors
-
-    return list_detectors(options)
-
-
+_LOOK = ("semfov.cli.search", "look_at")
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
 _MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
 _SUBCOMMANDS: dict[str, _Subcommand] = {
-    "search": _Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
-    "find": _Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
-    "explore": _Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
-    "live": _Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
-    "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
+    "search": _Subcommand(texts.SEARCH, SearchOptions, _LOOK, _PICTURES),
+    "find": _Subcommand(texts.FIND, FindOptions, _LOOK, _PICTURES),
+    "explore": _Subcommand(texts.EXPLORE, ExploreOptions, _LOOK, _PICTURES),
+    "live": _Subcommand(
+        texts.LIVE, LiveOptions, ("semfov.cli.live", "look_live"), ("source", "video file, or address")
+    ),
+    "fit": _Subcommand(texts.FIT, None, ("semfov.fit.detector", "fit_folder"), _MODEL, GOES_ON),
     "detectors": _Subcommand(
-        texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")
+        texts.LIST_DETECTORS,
+        DetectorsOptions,
+        ("semfov.cli.detectors", "list_detectors"),
+        ("name", "detector, or folder of models"),
     ),
 }
 """The subcommands by name. What they need is imported when they run."""
@@ -97,15 +74,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "--help" in rest or "-h" in rest:
         print(command.text, end="")
         return 0
-    options, program = command.options(), f"semfov {name}"
+    options, program = _options_of(command), f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
         usage = command.text.partition("\nusage:")[0]
         make_parser(options, usage, command.positional, program).print_help()
         return 0
     words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
     names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
+
+    def run(given: Any) -> int | None:
+        module, function = command.run
+        code: int | None = getattr(import_module(module), function)(given)
+        return code
+
     with _plain_warnings(words):
-        return run_command(command.run, options, command.text, rest, words=words, **names)
+        return run_command(run, options, command.text, rest, words=words, **names)
 
 
 def _unknown(name: str) -> str:
@@ -121,19 +104,26 @@ def _unknown(name: str) -> str:
 
 def _of_other_commands(command: _Subcommand, rest: Sequence[str]) -> str | None:
     """What to say about an option that only other subcommands have; None if there is none."""
-    for word in rest:
+    names = {
+        each: {field.name for field in fields(_options_of(_SUBCOMMANDS[each]))} - {_SUBCOMMANDS[each].positional[0]}
+        for each in _LOOKING
+    }
+    own = next((each for each in _LOOKING if _SUBCOMMANDS[each] is command), None)
+    for word in rest if own else ():
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
-        having = [
-            name for name in _LOOKING if option in _options(_SUBCOMMANDS[name]) and option not in _options(command)
-        ]
-        if having and command in map(_SUBCOMMANDS.get, _LOOKING):
+        having = [each for each in _LOOKING if own and option in names[each] - names[own]]
+        if having:
             return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
 
 
-def _options(command: _Subcommand) -> set[str]:
-    """Names of the options of a subcommand."""
-    return {field.name for field in fields(command.options())} - {command.positional[0]}
+def _options_of(command: _Subcommand) -> type[Any]:
+    """The options of a subcommand; those of a fit are imported only when they are needed."""
+    if command.options is not None:
+        return command.options
+    from semfov.fit.settings import FitDetectorConfig
+
+    return FitDetectorConfig
 
 
 @contextmanager

@@ -18,18 +18,14 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
-    lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
+    decision = record.decision
+    headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
+    lines = [f"{name}, {width} × {height} px: {headline}"]
     lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
     if record.decision is None:
         lines += _regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
         lines += _objects_lines(record)
     return "\n".join(lines)
-
-
-def _headline(record: GazeRecord) -> str:
-    if record.decision is not None:
-        return _decision_text(record, record.decision)
-    return record.objects_in_words()
 
 
 def _decision_text(record: GazeRecord, decision: Decision) -> str:

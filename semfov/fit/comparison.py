@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -31,11 +30,8 @@ _Ways = Mapping[str, Strategy]
 """Strategies for a task, by their names in reports."""
 
 
-class Rule(Protocol):
-    """A rule that decides after each step which searches end."""
-
-    def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
-        """Return the number of each search's outcome (`semfov.decision.OUTCOMES`), 0 for searches that continue."""
+Rule = Callable[..., Tensor]
+"""Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
 
 
 @dataclass(frozen=True)
@@ -150,12 +146,13 @@ def decisions(
             continue
         detections = run.detections(index)
         for search in searches:
-            looks = StoredLooks(detections, grid, torch.tensor([search.target]))
-            there = bool((annotation.labels == search.target).any())
+            target = search.target
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            there = bool((annotation.labels == target).any())
             for name, (strategy, rule) in ways.items():
                 ends = partial(rule, target=search.target, grid=grid)
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
+                    steps = search_steps(looks, strategy, target, search.start, search.noise, ends)
                     outcome = OUTCOMES[int(ends(steps[-1]))]
                 results[name].append((there, outcome, len(steps)))
     return {name: _rates(each) for name, each in results.items()}

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -258,23 +258,8 @@ def _judge_evidence(
     return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 
-class Bounds(Protocol):
-    """Limits on wrong decisions, by which thresholds are chosen (see `FitSearchConfig`)."""
-
-    @property
-    def false_alarms(self) -> float:
-        """Maximum share of absent targets that may be reported as found."""
-        ...
-
-    @property
-    def surest(self) -> float:
-        """Upper limit of the probability from which on a target counts as found."""
-        ...
-
-    @property
-    def lost(self) -> float:
-        """Maximum share of the targets that may be missed because the search gives up."""
-        ...
+Bounds = Any
+"""Limits on wrong decisions: settings with the `false_alarms`, `surest` and `lost` of `FitSearchConfig`."""
 
 
 def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
@@ -378,23 +363,18 @@ class EvidenceFit(PartFit):
             "deciding": judged,
         }
 
-    def choose_thresholds(self, model: TargetEvidence) -> Thresholds:
-        """Choose the thresholds of decisions on the held-out photographs."""
-        config, inputs = self.settings, self.inputs
-        grid = Grid(*config.cells, config.cells)
-        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
-        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
-        area, scenes = config.max_target_area, inputs.held_out
-        wide = _make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
-        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
-        surest = SUREST_OF_FEW if expected < 10 else SUREST
-        return _judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
-
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
         config, run, inputs = self.settings, self.run, self.inputs
         fit = _fit_evidence(config, run)
-        fit.model.thresholds = thresholds = self.choose_thresholds(fit.model)
+        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
+        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
+        area, scenes = config.max_target_area, inputs.held_out
+        wide = _make_examples(run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
+        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
+        thresholds = _judge_evidence(bounds, fit.model, wide, Grid(*config.cells, config.cells))[1]
+        fit.model.thresholds = thresholds
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {
             "fitted": learned,

@@ -11,13 +11,12 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.eye import Eye
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
 from semfov.fit.outputs import model_path, split
@@ -30,6 +29,7 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
+from semfov.runs.looking import Looking
 from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import csv_text, table
@@ -37,7 +37,6 @@ from semfov.runs.zoom_samples import MosaicSampler
 from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
-from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
@@ -125,15 +124,8 @@ def fit_fom(config: FitObservationConfig) -> None:
         print(f"  {file}")
 
 
-class _Looker(Protocol):
-    """The source of the detections: a `Sampler`, or a run with looks from every cell."""
-
-    @property
-    def eye(self) -> Eye | WindowEye:
-        """The eye that looked."""
-        ...
-
-    scenes: Scenes
+_Looker = Sampler | Looking
+"""The source of the detections: random looks, or looks from every cell."""
 
 
 def _fit_model(
@@ -245,7 +237,10 @@ def _write_report(
     write_text(config.out / "config.yaml", config.yaml())
     write_text(config.out / "manifest.json", json.dumps(_fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
-    write_text(config.out / "counts.csv", _counts_csv(model))
+    classes = ("background", *model.classes)
+    counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
+    head = ["class", *(f"level {n}" for n in range(len(model.edges) + 1))]
+    write_text(config.out / "counts.csv", csv_text([head, *counts]))
     figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
     names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
@@ -320,13 +315,6 @@ def _figures_by_level(
         raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
         rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
     return rows
-
-
-def _counts_csv(model: FovealObservationModel) -> str:
-    """Write the number of detections of each true class at each level in the fit as CSV."""
-    names = ("background", *model.classes)
-    rows = ([name, *counts] for name, counts in zip(names, model.metadata["counts"], strict=True))
-    return csv_text([["class", *(f"level {n}" for n in range(len(model.edges) + 1))], *rows])
 
 
 def _fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:

@@ -53,6 +53,11 @@ class PartInputs:
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.config, self.run = config.sized(len(run.scenes)), run
         self.components = len(run.scenes.classes) + 1
+        self.absent = 2 if self.components <= _FEW else None
+        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
+        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
+        self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
+        """The protocol of the searches and explorations that are compared."""
         self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
         self.judged: Sequence[int] = self.held_out[: self.config.judged]
         """The held-out photographs on which searches and explorations are compared."""
@@ -62,17 +67,6 @@ class PartInputs:
         """The settings of a part: those of the whole fit by their names, except its `own`."""
         names = {each.name for each in fields(kind)} & {each.name for each in fields(self.config)}
         return kind(**{name: getattr(self.config, name) for name in names} | own)
-
-    @property
-    def absent(self) -> int | None:
-        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
-        return 2 if self.components <= _FEW else None
-
-    @property
-    def protocol(self) -> ProtocolConfig:
-        """The protocol of these searches and explorations."""
-        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
-        return ProtocolConfig(shifts=shifts, seed=self.config.seed)
 
     def model(self, name: str) -> FolderModel | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
