@@ -110,24 +110,6 @@ def test_random_search_follows_the_hypergeometric_formula(scenes, look):
         assert (np.abs(curve - expected) <= 4.5 * error + 1e-12).all()
 
 
-def test_saliency_alone_replaces_the_policy(scenes, look):
-    protocol = ProtocolConfig(starts=3, shifts=8)
-    episodes = episodes_of(scenes, 0, 5, 5, protocol)
-    noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
-    saliency = torch.rand(25, 25, generator=torch.Generator().manual_seed(0))
-    for table in (saliency, saliency[:1]):
-        candidate = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
-        outcomes = run_episodes(episodes, candidate, looks_of(episodes, NOTHING, GRID), noise, shifts=8, batch=4)
-        for episode, outcome in zip(episodes, outcomes, strict=True):
-            cells = [episode.start]
-            while len(cells) <= 8 and cells[-1] not in episode.goal:
-                seen = table[cells[-1] if len(table) > 1 else 0].clone()
-                seen[cells] = -1
-                cells.append(int(seen.argmax()))
-            assert outcome.cells == tuple(cells)
-            assert outcome.found_at == (len(cells) - 1 if cells[-1] in episode.goal else -1)
-
-
 class Unread(FixedLook):
     """An observer that must not be used."""
 
