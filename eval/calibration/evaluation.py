@@ -63,12 +63,12 @@ class CalibrationConfig(EyeConfig):
 
 def judge_calibration(config: CalibrationConfig) -> None:
     """Evaluate scores, then beliefs."""
-    judge_scores(config)
+    _judge_scores(config)
     if config.beliefs:
         judge_beliefs(config)
 
 
-def judge_scores(config: CalibrationConfig) -> None:
+def _judge_scores(config: CalibrationConfig) -> None:
     """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
     sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
     samples = sampler.all()
@@ -76,7 +76,7 @@ def judge_scores(config: CalibrationConfig) -> None:
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
     predictions = {"raw": samples.scores, "calibrated": calibrated}
-    text = "\n".join(calibration_table(model, predictions, samples)) + "\n"
+    text = "\n".join(_calibration_table(model, predictions, samples)) + "\n"
     write_text(config.out / "calibration.md", text)
     write_text(config.out / "config.yaml", config.yaml())
     figure = plot_reliability({name: (p, samples.labels) for name, p in predictions.items()})
@@ -107,7 +107,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
     announce(*write_belief_report(run))
 
 
-def calibration_table(
+def _calibration_table(
     model: semfov.FovealObservationModel, predictions: dict[str, torch.Tensor], samples: Samples
 ) -> list[str]:
     """Measures of raw and of calibrated scores by level of distance, and over all levels."""
@@ -119,11 +119,11 @@ def calibration_table(
         chosen = torch.ones_like(level, dtype=torch.bool) if everything else level == number
         label = "all" if everything else f"{edges[number]} - {edges[number + 1]}"
         for name, probabilities in predictions.items():
-            rows.append([label, name, *calibration_row(calibration(probabilities[chosen], samples.labels[chosen]))])
+            rows.append([label, name, *_calibration_row(calibration(probabilities[chosen], samples.labels[chosen]))])
     return table(rows)
 
 
-def calibration_row(result: Calibration) -> list[str]:
+def _calibration_row(result: Calibration) -> list[str]:
     """The measures as cells of a table row."""
     return [
         str(result.count),

@@ -21,14 +21,6 @@ def replay(run: PolicyLooking, index: int, record: ResultRecord) -> Scanpath:
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
     the learned map of the recommended agent or, if none is shipped for the eye, a map by Kaplan's rule from tempered
     scores.
-
-    Args:
-        run: the run that made the record.
-        index: index of the scene.
-        record: a record of `episodes.jsonl`.
-
-    Returns:
-        The scanpath.
     """
     grid, candidate = run.grid(index), run.candidate(record["policy"], index)
     cue = record.get("cue")

@@ -14,29 +14,24 @@ from semfov.viz.style import save_figure
 
 
 @dataclass(frozen=True)
-class PaperFigure:
-    """A figure of the paper.
-
-    Attributes:
-        kind: kind of the experiment, `search` or `explore`.
-        policies: policies that the figure compares.
-    """
+class _PaperFigure:
+    """A figure of the paper."""
 
     kind: str
     policies: tuple[str, ...]
 
 
 PAGE_FIGURES = {
-    "prediction_and_calibration": PaperFigure(
+    "prediction_and_calibration": _PaperFigure(
         "search", ("predictive-raw", "predictive-calibrated", "non-predictive-raw", "non-predictive-calibrated")
     ),
-    "search_baselines": PaperFigure(
+    "search_baselines": _PaperFigure(
         "search", ("random", "vocus2", "predictive-calibrated", "non-predictive-calibrated")
     ),
-    "acquisition_functions": PaperFigure(
+    "acquisition_functions": _PaperFigure(
         "explore", ("kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
     ),
-    "exploration_baselines": PaperFigure(
+    "exploration_baselines": _PaperFigure(
         "explore", ("kl-raw", "kl-calibrated", "random-raw", "random-calibrated", "vocus2-calibrated")
     ),
 }
@@ -62,7 +57,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
             if contrast.finding in (TESTED[0], TESTED[7])
         }
         drawn = plot_curve_panels(
-            {title: threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
+            {title: _threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
         )
         written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
@@ -74,7 +69,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     return written
 
 
-def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def panel(folder: Path, figure: _PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     curves = {
@@ -87,7 +82,7 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
     )
 
 
-def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def _threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
     means, errors = {}, {}
     for threshold in SCORE_THRESHOLDS:
