@@ -58,11 +58,10 @@ def search_curves(
     run: Looking, scenes: Sequence[int], ways: _Ways, protocol: ProtocolConfig, max_area: float
 ) -> dict[str, FloatArray]:
     """Measure the cumulative performance of search strategies on every photograph with a target; → `(P, shifts+1)`."""
-    columns, rows = run.config.belief.columns, run.config.belief.rows
     curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
     for index in track(scenes, "searching", "scene"):
         targets = legal_targets(run.scenes.annotation(index), max_area)
-        episodes = episodes_of(run.scenes, index, columns, rows, protocol, targets)
+        episodes = episodes_of(run.scenes, index, *run.config.cells, protocol, targets)
         if not episodes:
             continue
         grid = run.grid(index)
