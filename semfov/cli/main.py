@@ -23,7 +23,6 @@ from semfov.version import __version__
 class _Subcommand:
     """A subcommand; `run` is the module and the function that it runs, which are imported only then."""
 
-    text: str
     options: type[Any] | None
     run: tuple[str, str]
     positional: tuple[str, str]
@@ -35,15 +34,12 @@ _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none:
 _MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
 _SUBCOMMANDS: dict[str, _Subcommand] = {
-    "search": _Subcommand(texts.SEARCH, SearchOptions, _LOOK, _PICTURES),
-    "find": _Subcommand(texts.FIND, FindOptions, _LOOK, _PICTURES),
-    "explore": _Subcommand(texts.EXPLORE, ExploreOptions, _LOOK, _PICTURES),
-    "live": _Subcommand(
-        texts.LIVE, LiveOptions, ("semfov.cli.live", "look_live"), ("source", "video file, or address")
-    ),
-    "fit": _Subcommand(texts.FIT, None, ("semfov.fit.detector", "fit_folder"), _MODEL, GOES_ON),
+    "search": _Subcommand(SearchOptions, _LOOK, _PICTURES),
+    "find": _Subcommand(FindOptions, _LOOK, _PICTURES),
+    "explore": _Subcommand(ExploreOptions, _LOOK, _PICTURES),
+    "live": _Subcommand(LiveOptions, ("semfov.cli.live", "look_live"), ("source", "video file, or address")),
+    "fit": _Subcommand(None, ("semfov.fit.detector", "fit_folder"), _MODEL, GOES_ON),
     "detectors": _Subcommand(
-        texts.LIST_DETECTORS,
         DetectorsOptions,
         ("semfov.cli.detectors", "list_detectors"),
         ("name", "detector, or folder of models"),
@@ -72,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     command = _SUBCOMMANDS[name]
     if "--help" in rest or "-h" in rest:
-        print(command.text, end="")
+        print(texts.HELP[name], end="")
         return 0
     options, program = _options_of(command), f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
-        usage = command.text.partition("\nusage:")[0]
+        usage = texts.HELP[name].partition("\nusage:")[0]
         make_parser(options, usage, command.positional, program).print_help()
         return 0
     words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
@@ -88,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
 
     with _plain_warnings(words):
-        return run_command(run, options, command.text, rest, words=words, **names)
+        return run_command(run, options, texts.HELP[name], rest, words=words, **names)
 
 
 def _unknown(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -54,11 +55,12 @@ class PolicyLooking(Looking):
             if name is not None
         }
 
-    def _code(self) -> str:
+    @cached_property
+    def code(self) -> str:
         """Digest of the code of the run, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
-        return digest_of([super()._code(), [class_digest(POLICIES[name]) for name in foreign]])
+        return digest_of([super().code, [class_digest(POLICIES[name]) for name in foreign]])
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""

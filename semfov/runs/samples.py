@@ -88,10 +88,6 @@ class Samples:
             fixations=fixations,
         )
 
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name."""
-        return {name: getattr(self, name) for name in _NAMES}
-
     @classmethod
     def join(cls, sets: list[Samples]) -> Samples:
         """Concatenate several sets of samples in order."""
@@ -171,7 +167,7 @@ class Sampler:
 
     def save(self, shard: int, samples: Samples) -> None:
         """Store the samples of a shard."""
-        self.store.write(self.digest(shard), samples.tensors())
+        self.store.write(self.digest(shard), vars(samples))
 
     def by_shard(self) -> Iterator[Samples]:
         """The samples of one shard after another, so that not all are in memory."""
@@ -232,7 +228,7 @@ def _prepare(kind: type[Sampler], config: Any, folder: Path) -> None:
 
 
 def _run_shard(shard: int) -> bytes:
-    return pack_tensors(_process["sampler"].sample(shard).tensors())
+    return pack_tensors(vars(_process["sampler"].sample(shard)))
 
 
 def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:

@@ -81,8 +81,8 @@ class SceneRun(ABC):
 
     @cached_property
     def code(self) -> str:
-        """sha256 of all code that the outcomes depend on."""
-        return self._code()
+        """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
+        return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
     def key(self) -> str:
@@ -96,10 +96,6 @@ class SceneRun(ABC):
     def own_settings(self, *others: str) -> dict[str, Any]:
         """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
         return {name: value for name, value in self.config.plain().items() if name not in (*_BESIDES, *others)}
-
-    def _code(self) -> str:
-        """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
-        return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
     def results(self) -> SceneResults:
