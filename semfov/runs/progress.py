@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
@@ -87,7 +87,7 @@ class _Task:
         """Do nothing: the bar stays open for other tasks."""
 
 
-Bar = tqdm | _Task
+Bar: TypeAlias = "tqdm[Any] | _Task"
 """Shows the progress of a task."""
 
 
