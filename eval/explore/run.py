@@ -18,8 +18,8 @@ from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.exploration_protocol import (
+    COUNTS,
     Exploration,
-    Progress,
     counts_of,
     explorations_of,
     explore_noise,
@@ -118,21 +118,23 @@ class ExploreRun(PolicyLooking):
         with torch.inference_mode():
             sharp = self.eye.detector(self.scenes[index].image[None])
             for name, probabilities in _sharp_maps(sharp, grid).items():
-                counts = [tuple(each.tolist()) * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
-                records += [self._record(name, answers, episode, Progress((), *counts)) for episode in episodes]
+                counts = [each.tolist() * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
+                named = [], dict(zip(COUNTS, counts, strict=True))
+                records += [self._record(name, answers, episode, named) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds
 
-    def _record(self, policy: str, answers: Tensor, episode: Exploration, progress: Progress) -> ResultRecord:
+    def _record(
+        self, policy: str, answers: Tensor, episode: Exploration, progress: tuple[list[int], dict[str, list[int]]]
+    ) -> ResultRecord:
+        cells, counts = progress
         return {
             "policy": policy,
             "scene": self.scenes.ids[episode.scene],
             "repetition": episode.repetition,
             "start": episode.start,
-            "cells": list(progress.cells),
+            "cells": cells,
             "object_cells": int(answers.any(-1).sum()),
             "grid_cells": len(answers),
-            "right": list(progress.right),
-            "right_without_background": list(progress.right_without_background),
-            "right_everywhere": list(progress.right_everywhere),
+            **counts,
         }

@@ -84,6 +84,6 @@ class SearchRun(PolicyLooking):
             **vars(episode),
             "scene": self.scenes.ids[episode.scene],
             "target_name": self.scenes.classes[episode.target - 1],
-            "cells": list(outcome.cells),
-            "found_at": outcome.found_at,
+            "cells": outcome[0],
+            "found_at": outcome[1],
         }

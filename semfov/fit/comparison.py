@@ -72,7 +72,7 @@ def search_curves(
                 outcomes = run_episodes(
                     episodes, Candidate(strategy), looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
-            shifts = np.array([outcome.found_at for outcome in outcomes])
+            shifts = np.array([found_at for _, found_at in outcomes])
             curves[name].append(cumulative_performance(shifts, protocol.shifts))
     return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
 
@@ -107,9 +107,9 @@ def explore_curves(
                     shifts=protocol.shifts,
                     batch=protocol.batch,
                 )
-            rates = [success_rate(each.right, cells) for each in progress]
+            rates = [success_rate(counts["right"], cells) for _, counts in progress]
             curves["objects"][name].append(np.mean(rates, axis=0))
-            rates = [success_rate(each.right_everywhere, len(grid)) for each in progress]
+            rates = [success_rate(counts["right_everywhere"], len(grid)) for _, counts in progress]
             curves["all"][name].append(np.mean(rates, axis=0))
     return {
         what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}
@@ -117,15 +117,8 @@ def explore_curves(
     }
 
 
-@dataclass(frozen=True)
-class _DecisionRates:
-    """The decisions of searches for present and for absent classes."""
-
-    found: float
-    false_alarms: float
-    undecided: float
-    looks: float
-    searches: int
+_DecisionRates = tuple[float, float, float, float, int]
+"""Shares of searches that find a present class, find an absent one, and decide nothing; mean looks; searches."""
 
 
 def decisions(
@@ -167,7 +160,7 @@ def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
         chosen = [each[1] == outcome for each in searches if each[0] in which]
         return sum(chosen) / len(chosen) if chosen else math.nan
 
-    return _DecisionRates(
+    return (
         share("found", [True]),
         share("found", [False]),
         share("undecided", [True, False]),

@@ -363,18 +363,20 @@ class EvidenceFit(PartFit):
             "deciding": judged,
         }
 
+    def _wide_thresholds(self, model: TargetEvidence) -> Thresholds:
+        """Choose the thresholds on the held-out photographs, with many absent classes for a precise share of alarms."""
+        config, scenes = self.settings, self.inputs.held_out
+        each, area = max(config.classes, min(20, _ABSENT // len(scenes))), config.max_target_area
+        wide = _make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
+        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
+        return _judge_evidence(bounds, model, wide, Grid(*config.cells, config.cells))[1]
+
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
         config, run, inputs = self.settings, self.run, self.inputs
         fit = _fit_evidence(config, run)
-        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
-        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
-        area, scenes = config.max_target_area, inputs.held_out
-        wide = _make_examples(run, config.classes, area, config.seed, absent=each, scenes=scenes)
-        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
-        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
-        thresholds = _judge_evidence(bounds, fit.model, wide, Grid(*config.cells, config.cells))[1]
-        fit.model.thresholds = thresholds
+        fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {
             "fitted": learned,
@@ -400,10 +402,7 @@ class EvidenceFit(PartFit):
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
         outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
-        outcomes += [
-            [name, percent_of(d.found), percent_of(d.false_alarms), percent_of(d.undecided), f"{d.looks:.1f}"]
-            for name, d in decided.items()
-        ]
+        outcomes += [[name, *map(percent_of, shares), f"{looks:.1f}"] for name, (*shares, looks, _) in decided.items()]
         report = "\n".join(
             [
                 section(
@@ -413,7 +412,7 @@ class EvidenceFit(PartFit):
                     rows,
                 ),
                 section(
-                    f"Decisions of {decided['fitted'].searches} searches for present and for absent classes. A target "
+                    f"Decisions of {decided['fitted'][-1]} searches for present and for absent classes. A target "
                     f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
                     f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
                     "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "

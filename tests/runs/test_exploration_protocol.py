@@ -106,7 +106,7 @@ def explore_by_loop(episode, look, model, answers, noise, shifts):
         best = max(values[c] for c in free)
         tied = [c for c in free if values[c] > best * (1 - 1e-6)]
         cell = max(tied, key=lambda c: float(noise[shift, c]))
-    return tuple(cells), tuple(right), tuple(without_background)
+    return cells, right, without_background
 
 
 @pytest.mark.parametrize("batch", [2, 100])
@@ -120,7 +120,8 @@ def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
     right_classes = [set(row.nonzero()[:, 0].tolist()) for row in ANSWERS]
     for episode, random, outcome in zip(episodes, noise, progress, strict=True):
         expected = explore_by_loop(episode, look, model, right_classes, random, shifts)
-        assert (outcome.cells, outcome.right, outcome.right_without_background) == expected
+        cells, counts = outcome
+        assert (cells, counts["right"], counts["right_without_background"]) == expected
 
 
 def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
@@ -129,9 +130,9 @@ def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
     observer, policy = FixedLook(look), policies.Surprise(model)
     explorer = Candidate(Strategy(observer, policy), saliency=table, weight=0.5)
     _, _, progress = explored(explorer, starts=4, shifts=6, batch=3)
-    for outcome in progress:
+    for fixated, _ in progress:
         belief, visited = observer.start(1, GRID, look.likelihood), torch.zeros(1, 12, dtype=torch.bool)
-        for here, there in pairwise(outcome.cells):
+        for here, there in pairwise(fixated):
             belief = observer.update(belief, look[torch.tensor([here])])
             visited[0, here] = True
             raised = table[here] + 1e-3 * table[here].max()
@@ -146,13 +147,13 @@ def test_saliency_alone_replaces_the_policy(look):
         explorer = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
         episodes, _, progress = explored(explorer, starts=12, shifts=11, index=1)
         assert sorted(episode.start for episode in episodes) == list(range(12))
-        for episode, outcome in zip(episodes, progress, strict=True):
+        for episode, (fixated, _) in zip(episodes, progress, strict=True):
             cells = [episode.start]
             while len(cells) < 12:
                 seen = table[cells[-1] if len(table) > 1 else 0].clone()
                 seen[cells] = -1
                 cells.append(int(seen.argmax()))
-            assert outcome.cells == tuple(cells)
+            assert fixated == cells
 
 
 def test_starts_and_tie_breaking_noise_depend_on_the_seed():
