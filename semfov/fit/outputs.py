@@ -17,7 +17,7 @@ from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 
-Model = TypeVar("Model", bound=Pretrained)
+_Model = TypeVar("_Model", bound=Pretrained)
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
@@ -46,10 +46,10 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
 
 
 @dataclass(frozen=True)
-class Fit(Generic[Model]):
+class Fit(Generic[_Model]):
     """The result of a fit."""
 
-    model: Model
+    model: _Model
     judged: list[dict[str, float]]
     trained: int
     held_out: int
