@@ -117,8 +117,7 @@ def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("detector", ["yolov3-tiny"])
-def test_a_deleted_store_file_is_written_identically_with_more_threads(config, detector):
+def test_a_deleted_store_file_is_written_identically_with_more_threads(config):
     run = SearchRun(config)
     finish(run, "searching")
     (file,) = (config.cache / "looks").rglob("*.safetensors")
