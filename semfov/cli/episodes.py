@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import shutil
@@ -29,7 +28,9 @@ from semfov.data.sources import embedded_picture
 from semfov.errors import InputError, SemfovError, check
 from semfov.head.world import World
 from semfov.io.code import package_digest
-from semfov.io.files import write_bytes
+from semfov.io.files import sha256, write_bytes
+from semfov.io.manifest import FILE as MANIFEST
+from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
 from semfov.report import write_page
 from semfov.runs.config import WHERE
@@ -60,6 +61,17 @@ class PictureJob(ABC):
             scene = embedded_picture(self.agent.classes[1:], self.target, self.options.seed)
             self._sources = [PictureSource("embedded scene", scene=scene)]
         return self._sources
+
+    def depends_on(self) -> dict[str, Any]:
+        """What outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
+        agent, folder = self.agent, self.options.models
+        return {
+            "options": {name: value for name, value in self.options.plain().items() if name not in WHERE},
+            "eye": agent.eye.settings(),
+            "classes": agent.classes,
+            "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
+            "folder": None if folder is None else sha256(folder / MANIFEST),
+        }
 
     @abstractmethod
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
@@ -136,14 +148,13 @@ class _PictureFiles:
         self.results = ResultsFile(file, kind or ".json", searched=self.job.title.startswith("search"))
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several:
-            settings = {name: value for name, value in self.job.options.plain().items() if name not in WHERE}
-            key = hashlib.sha256(f"{digest_of(settings)} {package_digest()}".encode()).hexdigest()[:32]
+            key = digest_of([self.job.depends_on(), package_digest()])[:32]
             versions = [source.version() for source in self.job.sources]
             folder = file.with_name(f"{file.name}.unfinished")
             self.finished = SceneResults(folder, key, lambda number: json.dumps(versions[number]))
 
     def before(self) -> dict[int, PictureOutcome]:
-        """Outcomes of an interrupted command with the same options, by the numbers of the pictures."""
+        """Outcomes of an interrupted command with the same options and models, by the numbers of the pictures."""
         if self.finished is None:
             return {}
         stored = ((number, self.finished.load(number)) for number in range(len(self.job.sources)))

@@ -35,6 +35,10 @@ class _SearchJob(PictureJob):
         self.target = next(iter(self.weights))
         self.title = f"search for “{self.target}”"
 
+    def depends_on(self) -> dict[str, Any]:
+        """What outcomes depend on, with the classes that word vectors tell."""
+        return {**super().depends_on(), "weights": self.weights}
+
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Search a picture."""
         agent, options, weights = self.agent, self.options, self.weights

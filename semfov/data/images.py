@@ -1,6 +1,8 @@
 """Reading image files of any common format into RGB tensors."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,12 @@ from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
 """Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
+
+FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "BMP", "PPM")
+"""Formats of photographs, which are told by the content of a file (AVIF and HEIF where Pillow has them).
+
+Pillow knows others, of which some start programs (EPS) or are made of other files.
+"""
 
 _ORIENTATION_TAG = 0x0112
 _PHOTOMETRIC_TAG = 0x0106
@@ -42,7 +50,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     keep their precision. The first frame of an animation is read. Colour profiles are not applied.
 
     Args:
-        path: a file in any format that Pillow reads.
+        path: a file in one of `FORMATS`, whatever its name.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
 
     Returns:
@@ -65,8 +73,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
         try:
             check_regular(path, name)
-            # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
-            with Path(path).open("rb") as file, Image.open(file) as image:
+            with open_pillow(path) as image:
                 _check_pixels(image.size, name)
                 array = _pixels(image, name, upright=oriented)
         except DataError:
@@ -76,13 +83,26 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:
-            raise DataError(f"{name}: not an image in a format that Pillow reads; replace or remove it") from None
+            raise DataError(
+                f"{name}: not an image in a format that is read ({', '.join(FORMATS)}); convert it"
+            ) from None
         except Image.DecompressionBombError:
             raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; reduce the image") from None
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"{name}: truncated, damaged or of an unsupported kind ({reason}); replace it") from error
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
+
+
+@contextmanager
+def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
+    """The Pillow image of a file in one of `FORMATS`, not decoded yet."""
+    from PIL import Image
+
+    Image.init()
+    # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
+    with Path(path).open("rb") as file, Image.open(file, formats=[n for n in FORMATS if n in Image.OPEN]) as image:
+        yield image
 
 
 def from_pillow(image: Any, name: str) -> Tensor:

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.images import orientation, read_image, turned
+from semfov.data.gdal import open_raster, raster_settings
+from semfov.data.images import open_pillow, orientation, read_image, turned
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.reduction import (
     FIRST,
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 RASTERS = (".vrt", ".jp2")
 """Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
 
-_BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
 _ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
 _TILED = (".tif", ".tiff")
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
@@ -149,11 +149,9 @@ class _PhotographPicture(LargePicture):
     path: Path
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        from PIL import Image
-
         self.path = Path(path)
         self._array: NDArray[np.uint8] | None = None
-        with _opening(self.path, "opened"), Image.open(self.path) as image:
+        with _opening(self.path, "opened"), open_pillow(self.path) as image:
             self.size = _upright_size(image)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
@@ -163,10 +161,7 @@ class _PhotographPicture(LargePicture):
 
     def _whole(self) -> NDArray[np.uint8]:
         if self._array is None:
-            from PIL import Image
-
-            # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
-            with _opening(self.path, "decoded"), self.path.open("rb") as file, Image.open(file) as image:
+            with _opening(self.path, "decoded"), open_pillow(self.path) as image:
                 if image.mode in _PLAIN and "transparency" not in image.info:
                     stored = orientation(image)
                     image.load()
@@ -274,14 +269,12 @@ class _RasterPicture(LargePicture):
 
     def __init__(self, path: str | PathLike[str]) -> None:
         try:
-            import rasterio
+            self._settings = raster_settings()
         except ImportError:
             raise DataError(f'{path}: expected rasterio for reading it; pip install "semfov[geo]"') from None
         self.path = Path(path)
-        self._limits = rasterio.Env(GDAL_CACHEMAX=_BLOCKS)
-        with _opening(self.path, "opened"), self._limits:
-            self.path.stat()  # GDAL has many messages for a file that is not there
-            self._file: Any = rasterio.open(self.path)
+        with _opening(self.path, "opened"), self._settings:
+            self._file: Any = open_raster(self.path)
         weakref.finalize(self, self._file.close)
         meanings = [each.name for each in self._file.colorinterp]
         kinds = {*self._file.dtypes}
@@ -316,7 +309,7 @@ class _RasterPicture(LargePicture):
 
         x1, y1, x2, y2 = box
         shape = len(self._bands), -(-(y2 - y1) // reduction), -(-(x2 - x1) // reduction)
-        with _opening(self.path, "decoded"), self._limits:
+        with _opening(self.path, "decoded"), self._settings:
             bands = self._file.read(
                 self._bands, window=Window(x1, y1, x2 - x1, y2 - y1), out_shape=shape, resampling=Resampling.average
             )
@@ -386,7 +379,7 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
         if path.suffix.lower() in (*_TILED, *RASTERS):
             with suppress(DataError):
                 return open_large(path).size
-        with _opening(path, "opened"), Pillow.open(path) as image:
+        with _opening(path, "opened"), open_pillow(path) as image:
             return _upright_size(image)
     if isinstance(source, Pillow.Image):
         return _upright_size(source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -19,6 +20,7 @@ from semfov.io.files import check_regular
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 
+_PLAYLIST = b"#EXTM3U"
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
@@ -94,6 +96,9 @@ def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
     if isinstance(source, Path):
         _check_there(source)
         check_regular(source)
+        with suppress(OSError), source.open("rb") as file:
+            if file.read(len(_PLAYLIST)) == _PLAYLIST:
+                raise DataError(f"{name}: expected a video, got a playlist, which names other files; give these")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised below
     try:

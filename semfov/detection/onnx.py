@@ -12,7 +12,7 @@ from torch import Tensor
 
 from semfov.detection.class_names import COCO_CLASSES, keep_classes, named_outputs
 from semfov.detection.detector import Detector
-from semfov.detection.onnx_file import check_canvas, check_elements, read_settings, with_input_size
+from semfov.detection.onnx_file import check_canvas, check_elements, model_digest, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
@@ -158,8 +158,7 @@ def load_onnx(
     """
     name = fspath(name_or_path)
     file = _locate(name, weights)
-    digest = sha256(file) if file.is_file() else ""
-    published_name = name if name in _ONNX_MODELS else NETWORKS.get(digest)
+    published_name = name if name in _ONNX_MODELS else NETWORKS.get(sha256(file) if file.is_file() else "")
     path = file
     if published_name in _ONNX_MODELS and input_size is not None:
         path = with_input_size(file, _sides(input_size), STRIDES)
@@ -208,7 +207,7 @@ def load_onnx(
         logits=chosen.get("logits", False),
         background=chosen.get("background"),
         selection=Selection(threshold, iou, limit, per_class),
-        digest=digest,
+        digest=model_digest(file),
     )
 
 

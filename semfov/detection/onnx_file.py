@@ -11,7 +11,7 @@ from typing import Any
 from semfov.detection.onnx_heads import cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, inside, sha256, write_bytes
+from semfov.io.files import check_regular, inside, json_sha256, sha256, write_bytes
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _MOST_ELEMENTS = 2**28
@@ -67,6 +67,16 @@ def check_file(path: Path) -> None:
         raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from None
     values = [*inferred.value_info, *inferred.input, *inferred.output]
     _check_sizes(path, ((value.name, _dims(value)) for value in values))
+
+
+def model_digest(path: Path) -> str:
+    """sha256 of a model's file; with weights in other files, of all of them."""
+    import onnx
+
+    stored = onnx.load(path, load_external_data=False).graph.initializer
+    others = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
+    digests = [sha256(path), *(sha256(inside(path.parent, name)) for name in sorted(others))]
+    return digests[0] if len(digests) == 1 else json_sha256(digests)
 
 
 def check_elements(name: str, sizes: Iterable[int]) -> None:

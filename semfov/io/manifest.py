@@ -14,7 +14,7 @@ from semfov.io.schema import CLASSES, Anything, Array, Flag, Maybe, Number, Obje
 from semfov.io.storage import checksum
 from semfov.version import __version__
 
-_FILE = "manifest.json"
+FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
@@ -103,14 +103,14 @@ class Manifest:
     def write(self, folder: str | PathLike[str]) -> Path:
         """Write the record into the folder atomically, and return the path of its file."""
         record = {"kind": _KIND, "version": __version__, **json.loads(json.dumps(asdict(self)))}
-        path = Path(folder) / _FILE
+        path = Path(folder) / FILE
         write_text(path, json.dumps({**record, "sha256": checksum({}, record)}, indent=2) + "\n")
         return path
 
     @classmethod
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
-        path = Path(folder) / _FILE
+        path = Path(folder) / FILE
         record = _read(path)
         recorded = record.pop("sha256", None)
         if recorded != checksum({}, record):
@@ -125,11 +125,9 @@ class Manifest:
                 file = inside(Path(folder), part.file)
                 check_regular(file)
                 if not file.is_file():
-                    raise DataError(f"{file}: no such file, but {_FILE} in the same folder lists it; {_AGAIN}")
+                    raise DataError(f"{file}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
                 if sha256(file) != part.sha256:
-                    raise DataError(
-                        f"{file}: damaged or changed, its sha256 is not the one listed in {_FILE}; {_AGAIN}"
-                    )
+                    raise DataError(f"{file}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
         columns, rows = record["grid"]
         settings = {name: record[name] for name in ("detector", "sensor", "training")}
         return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **settings)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semfov.data.gdal import open_raster, raster_settings
 from semfov.data.large import RASTERS
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
@@ -29,9 +30,9 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
             'pip install "semfov[geo]"'
         ) from None
     try:
-        with rasterio.open(source) as picture:
+        with raster_settings(), open_raster(source) as picture:
             system, affine = picture.crs, picture.transform
-    except rasterio.errors.RasterioError as error:
+    except (rasterio.errors.RasterioError, OSError) as error:
         raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
     if system is None:
         return None

@@ -252,6 +252,59 @@ def test_only_what_is_as_before_counts_as_finished(run, folder, tmp_path, agent,
     assert [name[-5] for name in calls] == ["a", "c"]
 
 
+def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, monkeypatch):
+    """A file is replaced after the command was stopped: detector, weights, folder of models, or word vectors."""
+    from semfov.agent import ActivePerception
+    from semfov.cli.main import main
+
+    home = tmp_path / "home"
+    home.mkdir()
+    network, out, calls = home / "colours.onnx", tmp_path / "boxes.json", []
+
+    def counted(self, picture, *arguments, **options):
+        calls.append(picture)
+        if stopped and len(calls) == 3:
+            raise KeyboardInterrupt
+        return look(self, picture, *arguments, **options)
+
+    def pictures(name, *arguments):
+        calls.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(ActivePerception, name, counted)
+            code = main([{"find_all": "find", "search": "search"}[name], str(folder), *map(str, arguments)])
+        capsys.readouterr()
+        return code, len(calls)
+
+    look = ActivePerception.find_all
+    find = "--agent", "raw", "--detector", network, "--how", "fovea", "--shifts", 2, "--least", 0.001, "--out", out
+    write_network(network)
+    stopped = False
+    assert pictures("find_all", *find) == (0, 3)
+    first = untimed(out)
+    for bias in (-4.0, -2.0):
+        write_network(network, bias)
+        stopped = True
+        assert pictures("find_all", *find) == (130, 3)
+    stopped = False
+    assert pictures("find_all", *find) == (0, 1)
+    continued = untimed(out)
+    assert pictures("find_all", *find) == (0, 3)
+    assert continued == untimed(out) != first
+
+    look, vectors = ActivePerception.search, tmp_path / "vectors.txt"
+    described = (
+        *(word for word in find if word not in ("--least", 0.001)),
+        "--target",
+        "crimson",
+        "--embeddings",
+        vectors,
+    )
+    for line in ("crimson 1 0.9", "crimson 0.9 1"):
+        vectors.write_text(f"red 1 0.8\ngreen 0.8 1\nblue 0 1\n{line}\n")
+        stopped = True
+        assert pictures("search", *described) == (130, 3)
+
+
 @pytest.mark.slow
 def test_processes_share_the_pictures_of_a_folder(folder, tmp_path, capsys):
     from semfov.cli.main import main

@@ -127,7 +127,7 @@ def test_what_is_no_picture_is_refused(rasterio, tmp_path):
     with pytest.raises(DataError, match="got a palette"):
         _RasterPicture(palette)
     (tmp_path / "c.vrt").write_text("no raster")
-    with pytest.raises(DataError, match="cannot be opened"):
+    with pytest.raises(DataError, match="expected the XML text of a mosaic"):
         open_large(tmp_path / "c.vrt")
     with pytest.raises(DataError, match="no such file"):
         open_large(tmp_path / "d.jp2")

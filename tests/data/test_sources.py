@@ -48,6 +48,14 @@ def test_frames_of_a_video_are_read_in_order(video):
     assert len(list(open_stream(video, 100).frames)) == 8
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".m3u8", ".avi", ".ts"])
+def test_a_playlist_is_no_video(video, tmp_path, suffix):
+    path = tmp_path / f"list{suffix}"
+    path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n{video}\n#EXT-X-ENDLIST\n")
+    with pytest.raises(DataError, match="expected a video, got a playlist"):
+        open_stream(path)
+
+
 def test_streams_are_opened_by_their_address(video):
     class Quiet(SimpleHTTPRequestHandler):
         def __init__(self, *rest):

@@ -215,7 +215,7 @@ def test_every_network_and_version_has_its_own_export(make_small, folder, monkey
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
     assert exported(network, folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", _VERSION + 1)
+    monkeypatch.setattr("semfov.detection.darknet_onnx._VERSION", _VERSION + 1)
     assert exported(network, folder) != path
     assert network_digest(copy.deepcopy(network).double()) == network_digest(network)
     with torch.no_grad():

@@ -11,6 +11,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.detection.preprocessing import Preprocessing
 from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
+from tests.colours import write_network
 
 SIDE = 64
 NAMES = ("cat", "dog", "cup")
@@ -366,3 +367,22 @@ def test_real_models_against_opencv_and_numpy(shared, name):
     limits = np.array([width, height] * 2)
     ours = placement.boxes_to_image(found.boxes[0][confident]).numpy()
     np.testing.assert_allclose(ours, np.clip(boxes[confident.numpy()], 0, limits), atol=0.5)
+
+
+def test_a_digest_is_of_all_files_of_a_model(tmp_path):
+    """Weights in another file count, wherever both files lie."""
+    import onnx
+
+    digests = []
+    for folder, factor in (("a", 1), ("b", 1), ("c", 2)):
+        path = write_network(tmp_path / "whole.onnx")
+        assert load_detector(path).settings()["digest"] == sha256(path)
+        model, split = onnx.load(path), tmp_path / folder / "split.onnx"
+        weight = next(each for each in model.graph.initializer if each.name == "weight")
+        weight.raw_data = (np.frombuffer(weight.raw_data, np.float32) * factor).tobytes()
+        split.parent.mkdir()
+        external = {"save_as_external_data": True, "location": "split.bin", "size_threshold": 64}
+        onnx.save(model, str(split), **external)
+        digests.append((load_detector(split).settings()["digest"], sha256(split)))
+    assert digests[0] == digests[1]
+    assert (digests[0][0] == digests[2][0], digests[0][1] == digests[2][1]) == (False, True)

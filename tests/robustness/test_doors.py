@@ -175,7 +175,7 @@ INVALID_IMAGES = {
     "address": (lambda _: "https://example.org/cup.jpg", "expected a file on this machine.*download it first"),
     "missing": (lambda folder: folder / "nosuch.jpg", r"nosuch\.jpg: no such file; check"),
     "folder": (lambda folder: folder, "expected a file, got a folder"),
-    "text": (lambda folder: folder / "notes.txt", r"notes\.txt: not an image in a format that Pillow reads"),
+    "text": (lambda folder: folder / "notes.txt", r"notes\.txt: not an image in a format that is read"),
     "half a file": (lambda folder: folder / "cut.png", r"cut\.png: truncated, damaged"),
     "half a file, opened": (
         lambda folder: Image.open(io.BytesIO((folder / "cut.png").read_bytes())),
