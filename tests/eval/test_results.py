@@ -22,7 +22,6 @@ from eval.page.thresholds import CONTRASTS
 from eval.results import _PLACE, WHOLE, _fill_page, _page_table, results
 from eval.search.run import SearchConfig
 from semfov.errors import DataError, InputError
-from semfov.runs.config import SensorConfig
 from semfov.runs.presets import label
 
 ROOT = Path(__file__).parents[2]
@@ -115,16 +114,6 @@ def test_a_trial_limits_every_experiment_on_the_listed_photographs(tmp_path):
     assert {run.data.limit for run in experiments(config).values()} == {None, 100}
 
 
-def test_published_experiments_have_the_published_sensor_and_model(runs):
-    for kind in ("search", "explore"):
-        for fovea in ("published", "published-narrow"):
-            for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
-                run = runs[f"{kind}-{fovea}-{name}"]
-                assert run.sensor.name == fovea
-                assert run.belief.model == f"{detector}-{fovea}"
-                assert run.saliency.view == "foveated"
-
-
 def place(name, content="anything"):
     return f"<!-- table {name} -->\n\n{content}\n\n<!-- end -->"
 
@@ -183,14 +172,6 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
         rows = [cells_of(row) for row in lines_of(f"beliefs-nano {kind}", runs)]
         assert rows[0] == ["looks", "belief", "NLL", "ECE", "mean probability", "share that hold it"]
         assert rows[2] == [str(number), *"xxxxx"]
-
-
-def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
-    for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
-        decide, beliefs = runs[f"decide-{name}"], runs[f"beliefs-{name}"]
-        assert decide.detector.name == beliefs.detector.name == detector
-        assert decide.sensor == beliefs.sensor == SensorConfig("gradual")
-        assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
 
 
 @pytest.mark.parametrize("page", ["results", "tables"])

@@ -65,13 +65,6 @@ def test_maps_without_detections_are_background_or_uniform(most):
     torch.testing.assert_close(maps[FUSED], torch.full((1, 20, 4), 0.25))
 
 
-def test_background_is_painted_unless_a_class_scores_higher():
-    box = torch.tensor([[[1.0, 1, 19, 14], [21, 1, 39, 14]]])
-    scores = torch.tensor([[[0.6, 0.19, 0.11, 0.1], [0.6, 0.21, 0.1, 0.09]]])
-    painted = _sharp_maps(Detections(box, scores, torch.ones(1, 2, dtype=torch.bool)), GRID)[PAINTED][0]
-    assert painted.argmax(-1).tolist() == [0, 1] + [0] * 18
-
-
 def counts_by_loop(probabilities, answers):
     """Right cells with background as an answer, without it, and over the whole grid; ties give no answer."""
     totals = [0, 0, 0]

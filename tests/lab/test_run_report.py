@@ -66,7 +66,7 @@ def test_the_page_of_a_search_run_shows_curves_and_episodes(searched):
 
 def test_the_size_limit_leaves_one_episode(searched, monkeypatch):
     run, records = searched
-    monkeypatch.setattr(module, "MOST_BYTES", 1)
+    monkeypatch.setattr(module, "_MOST_BYTES", 1)
     _, _, data = write_search(run, records)
     assert len(data["episodes"]) == 1
 
