@@ -55,7 +55,7 @@ class _SensorChoice(NamedTuple):
     settings: Mapping[str, Any] = {}
 
 
-_CANDIDATES = {
+CANDIDATES = {
     "published, 320": _SensorChoice("published", 320),
     "multi-scale, 4 × 160": _SensorChoice("multi-scale", 160),
     "gradual, 320": _SensorChoice("gradual", 320),
@@ -87,7 +87,7 @@ class _SensorsConfig(LookingConfig):
         protocol: the protocol of searches and explorations.
         fixations: random fixations in each photograph of the fit (0: no observation model is fitted).
         classes: largest number of classes of a photograph that are told present or absent, and as many that it lacks.
-        candidates: the sensors to compare, of `_CANDIDATES`.
+        candidates: the sensors to compare, of `CANDIDATES`.
         out: folder for models, records and the table.
     """
 
@@ -95,12 +95,12 @@ class _SensorsConfig(LookingConfig):
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(starts=5, shifts=15))
     fixations: Whole = 4
     classes: Count = 8
-    candidates: tuple[str, ...] = tuple(_CANDIDATES)[:-1]
+    candidates: tuple[str, ...] = tuple(CANDIDATES)[:-1]
     out: Path = Path("runs/sensors")
 
     def settings(self, name: str) -> dict[str, Any]:
         """Settings that the fit and the runs of a candidate have in common."""
-        candidate = _CANDIDATES[lookup(name, _CANDIDATES, "candidate")]
+        candidate = CANDIDATES[lookup(name, CANDIDATES, "candidate")]
         detector = replace(self.detector, input_size=candidate.side, stride=None)
         sensor = SensorConfig(candidate.sensor, **candidate.settings)  # type: ignore[arg-type]
         where = {"cache": self.cache, "workers": self.workers, "scheduler": self.scheduler}

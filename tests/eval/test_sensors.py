@@ -33,7 +33,7 @@ def test_sensors_are_compared_with_models_of_their_own(home, monkeypatch, capsys
         "crops": sensors._SensorChoice("multi-scale", 64, CROPS),
         "log-polar": sensors._SensorChoice("log-polar", 64),
     }
-    monkeypatch.setattr(sensors, "_CANDIDATES", chosen)
+    monkeypatch.setattr(sensors, "CANDIDATES", chosen)
     fit = ["--fit.root", str(home / "photographs"), "--fit.annotations", str(home / "photographs/instances.json")]
     small = ["--belief.columns", "4", "--belief.rows", "4", "--protocol.starts", "1", "--candidates", '["crops"]']
     arguments = given(home, "sensors", *fit, *small, "--data.limit", "3")
