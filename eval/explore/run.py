@@ -119,7 +119,7 @@ class ExploreRun(PolicyLooking):
             sharp = self.eye.detector(self.scenes[index].image[None])
             for name, probabilities in _sharp_maps(sharp, grid).items():
                 counts = [each.tolist() * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
-                named = [], dict(zip(COUNTS, counts, strict=True))
+                named: tuple[list[int], dict[str, list[int]]] = [], dict(zip(COUNTS, counts, strict=True))
                 records += [self._record(name, answers, episode, named) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds

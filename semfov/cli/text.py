@@ -123,25 +123,6 @@ def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def columns(names: Sequence[str], width: int = 100) -> str:
-    r"""Names in columns, in order down each column.
-
-    Args:
-        names: the names.
-        width: width of the text in letters.
-
-    Returns:
-        Lines of text.
-
-    >>> columns(["cup", "fork", "oven"], 12)
-    'cup   oven\nfork'
-    """
-    wide = max(map(len, names)) + 2
-    across = max(1, width // wide)
-    down = -(-len(names) // across)
-    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
-
-
 def plain_name(name: str) -> str:
     """Make a name valid on every file system.
 
