@@ -60,12 +60,12 @@ MOST = 12
 """Largest number of detections in a picture."""
 LOOKS = 4
 """Looks before the map of saliency is drawn, and fixations of the example of a search, as in the paper."""
-SAME_OBJECT = 0.5
+_SAME_OBJECT = 0.5
 """Intersection over union from which on two detections are of one object."""
 
 
 @dataclass(frozen=True)
-class FiguresConfig(Settings):
+class _FiguresConfig(Settings):
     """What the figures show.
 
     Args:
@@ -93,10 +93,7 @@ class FiguresConfig(Settings):
 class Example:
     """A photograph, and a search in it.
 
-    Attributes:
-        eye: the paper's wide fovea, and the detector.
-        image: `(3, H, W)`.
-        scanpath: the search.
+    Shapes: image `(3, H, W)`.
     """
 
     eye: Eye
@@ -130,11 +127,11 @@ class Example:
         return make_figure(rows, columns, width * columns, height * rows, layout="compressed")
 
 
-def figures(config: FiguresConfig) -> None:
+def figures(config: _FiguresConfig) -> None:
     """Draw all figures and print their files."""
     with torch.inference_mode():
-        example = search_example(config)
-        for name, draw in FIGURES.items():
+        example = _search_example(config)
+        for name, draw in _FIGURES.items():
             print(f"{name}: ", end="")
             figure = draw(example)
             print(
@@ -144,7 +141,7 @@ def figures(config: FiguresConfig) -> None:
             )
 
 
-def search_example(config: FiguresConfig) -> Example:
+def _search_example(config: _FiguresConfig) -> Example:
     """Search the photograph as published: calibrated scores, and predictive search."""
     sensor = SensorConfig(name="published")
     eye = make_eye(config.detector, sensor)
@@ -194,7 +191,7 @@ def detection_example(example: Example) -> Figure:
 
 
 @styled
-def foveal_scene(example: Example) -> Figure:
+def _foveal_scene(example: Example) -> Figure:
     """The foveal image, and the distance from the fovea to the centre of each box, as a share of the longer side."""
     figure, (axes,) = example.pictures(1, 1, 5.4)
     draw_image(axes, example.foveated("published", example.fixation), example.grid)
@@ -228,22 +225,14 @@ def ambiguities(example: Example) -> Figure | None:
     if pair is None:
         return None
     before, cell, after = pair
-    return ambiguity(example, before, after, example.grid.centres[cell])
+    return _ambiguity(example, before, after, example.grid.centres[cell])
 
 
 def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detections, int, Detections] | None:
-    """The pair of detections of one object that differ in class, of which the less confident is most confident.
-
-    Args:
-        sharp: detections in the photograph, a batch of one.
-        looks: detections in foveal images, each a batch of one.
-
-    Returns:
-        The detection in the photograph, the number of the look, and its detection; None if no class changes.
-    """
+    """The pair of detections of one object that differ in class, of which the less confident is most confident."""
     best, pair = 0.0, None
     for number, look in enumerate(looks):
-        same = box_iou(sharp.boxes[0], look.boxes[0]) >= SAME_OBJECT
+        same = box_iou(sharp.boxes[0], look.boxes[0]) >= _SAME_OBJECT
         other = sharp.labels[0][:, None] != look.labels[0][None]
         sure = torch.minimum(sharp.confidence[0][:, None], look.confidence[0][None]) * (same & other)
         if sure.numel() and float(sure.max()) > best:
@@ -254,7 +243,7 @@ def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detection
 
 
 @styled
-def ambiguity(example: Example, before: Detections, after: Detections, fixation: Tensor) -> Figure:
+def _ambiguity(example: Example, before: Detections, after: Detections, fixation: Tensor) -> Figure:
     """A detection in the photograph, beside one in the foveal image of a fixation."""
     figure, axes = example.pictures(1, 2, 4.2)
     draw_image(axes[0], example.image, example.grid)
@@ -320,7 +309,7 @@ def saliency_example(example: Example) -> Figure:
 
 
 @styled
-def search_in_steps(example: Example) -> Figure:
+def _search_in_steps(example: Example) -> Figure:
     """Fixations of a search with what is detected at each, above the probability of the target in every cell."""
     from matplotlib.figure import Figure
 
@@ -338,19 +327,19 @@ def search_in_steps(example: Example) -> Figure:
     return figure
 
 
-FIGURES: dict[str, Callable[[Example], Figure | None]] = {
+_FIGURES: dict[str, Callable[[Example], Figure | None]] = {
     "detection_example": detection_example,
     "foveal_reconstruction": foveal_reconstruction,
-    "map": foveal_scene,
+    "map": _foveal_scene,
     "ambiguities": ambiguities,
     "grid_example": grid_example,
     "saliency_example": saliency_example,
-    "vsexample": search_in_steps,
+    "vsexample": _search_in_steps,
 }
 """The figures by their labels in the source of the paper."""
 
 
-main = command(figures, FiguresConfig, __doc__)
+main = command(figures, _FiguresConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -37,13 +37,8 @@ class FitTemplatesConfig(FitConfig):
     out: Path = Path("runs/fit_templates")
 
 
-class TemplateSums:
-    """Sums of the features of objects and of all positions.
-
-    Args:
-        classes: number of classes K.
-        channels: number of feature channels C.
-    """
+class _TemplateSums:
+    """Sums of the features of objects and of all positions."""
 
     def __init__(self, classes: int, channels: int) -> None:
         self.objects = torch.zeros(classes, channels, dtype=torch.float64)
@@ -54,10 +49,7 @@ class TemplateSums:
     def update(self, features: Tensor, objects: Tensor, labels: Tensor) -> None:
         """Add a photograph.
 
-        Args:
-            features: `(C, h, w)`, features at all positions.
-            objects: `(M, C)`, features at the centres of the objects.
-            labels: `(M,)`, classes of the objects, 1..K.
+        Shapes: features `(C, h, w)`, objects `(M, C)`, labels `(M,)`.
         """
         self.everywhere += features.double().sum((1, 2))
         self.places += features[0].numel()
@@ -67,8 +59,7 @@ class TemplateSums:
     def templates(self) -> tuple[Tensor, Tensor]:
         """Compute the templates.
 
-        Returns:
-            The templates `(K, C)`, 0 for classes without objects, and the mean over all positions `(C,)`.
+        Shapes: → `(K, C)`.
         """
         mean = self.everywhere / max(1, self.places)
         centred = self.objects / self.counts.clamp(min=1)[:, None] - mean
@@ -86,10 +77,10 @@ def fit_templates(config: FitTemplatesConfig) -> None:
         raise DataError(
             f"data: expected at least 2 photographs, one to train on and one to hold out, got {len(scenes)}"
         )
-    sums: TemplateSums | None = None
+    sums: _TemplateSums | None = None
     for index in tqdm(fitted, desc="averaging objects", unit="photograph", dynamic_ncols=True):
-        features, objects, labels = objects_of(detector, scenes, index)
-        sums = sums or TemplateSums(len(detector.classes), len(features))
+        features, objects, labels = _objects_of(detector, scenes, index)
+        sums = sums or _TemplateSums(len(detector.classes), len(features))
         sums.update(features, objects, labels)
     assert sums is not None
     metadata = {"detector": detector.settings(), "counts": sums.counts.tolist(), **training_of(config, scenes)}
@@ -97,7 +88,7 @@ def fit_templates(config: FitTemplatesConfig) -> None:
     areas = [
         area
         for index in tqdm(held_out, desc="evaluating", unit="photograph", dynamic_ncols=True)
-        for area in areas_under_roc(model, detector, scenes, index)
+        for area in _areas_under_roc(model, detector, scenes, index)
     ]
     path = model_path(config, detector.name)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,17 +108,10 @@ def fit_templates(config: FitTemplatesConfig) -> None:
     write_outputs(config, text, ("areas.json", json.dumps({"mean": mean, "areas": areas}) + "\n"), path)
 
 
-def objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, Tensor, Tensor]:
+def _objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the features of a photograph and of its objects, normalised to unit length.
 
-    Args:
-        detector: the detector.
-        scenes: the photographs.
-        index: index of the photograph.
-
-    Returns:
-        The features at all positions `(C, h, w)`, those at the centres of the objects `(M, C)`, and the labels of the
-        objects `(M,)`.
+    Shapes: → `(C, h, w)`.
     """
     with torch.inference_mode():
         canvas, placement = detector.fit(scenes[index].image[None])
@@ -138,19 +122,10 @@ def objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, 
         return features[0], at_points(features, centres, placement, size)[0].t(), annotation.labels
 
 
-def areas_under_roc(model: ClassTemplates, detector: Detector, scenes: Scenes, index: int) -> list[float]:
+def _areas_under_roc(model: ClassTemplates, detector: Detector, scenes: Scenes, index: int) -> list[float]:
     """Compute the area under the ROC curve for each class in a photograph.
 
     The area is the probability that a cell with the class gets more attention than a cell without it. Ties count half.
-
-    Args:
-        model: the templates.
-        detector: the detector.
-        scenes: the photographs.
-        index: index of the photograph.
-
-    Returns:
-        The areas.
     """
     annotation: Annotation = scenes.annotation(index)
     grid = Grid(10, 10, annotation.size)

@@ -22,29 +22,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PaperFigure:
-    """A figure of the paper.
-
-    Attributes:
-        kind: kind of the experiment, `search` or `explore`.
-        policies: policies that the figure compares.
-    """
+class _PaperFigure:
+    """A figure of the paper."""
 
     kind: str
     policies: tuple[str, ...]
 
 
 PAGE_FIGURES = {
-    "prediction_and_calibration": PaperFigure(
+    "prediction_and_calibration": _PaperFigure(
         "search", ("predictive-raw", "predictive-calibrated", "non-predictive-raw", "non-predictive-calibrated")
     ),
-    "search_baselines": PaperFigure(
+    "search_baselines": _PaperFigure(
         "search", ("random", "vocus2", "predictive-calibrated", "non-predictive-calibrated")
     ),
-    "acquisition_functions": PaperFigure(
+    "acquisition_functions": _PaperFigure(
         "explore", ("kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
     ),
-    "exploration_baselines": PaperFigure(
+    "exploration_baselines": _PaperFigure(
         "explore", ("kl-raw", "kl-calibrated", "random-raw", "random-calibrated", "vocus2-calibrated")
     ),
 }
@@ -71,7 +66,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
             if contrast.finding in (TESTED[0], TESTED[7])
         }
         drawn = plot_curve_panels(
-            {title: threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
+            {title: _threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
         )
         written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
@@ -97,7 +92,7 @@ def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
     return figure
 
 
-def panel(folder: Path, figure: PaperFigure) -> Panel:
+def panel(folder: Path, figure: _PaperFigure) -> Panel:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     curves = {
@@ -110,7 +105,7 @@ def panel(folder: Path, figure: PaperFigure) -> Panel:
     )
 
 
-def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> Panel:
+def _threshold_panel(contrast: Contrast, name: str, runs: Runs) -> Panel:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
     means, errors = {}, {}
     for threshold in SCORE_THRESHOLDS:

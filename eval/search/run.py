@@ -11,7 +11,7 @@ from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
@@ -77,6 +77,6 @@ class SearchRun(PolicyLooking):
             **vars(episode),
             "scene": self.scenes.ids[episode.scene],
             "target_name": self.scenes.classes[episode.target - 1],
-            "cells": list(outcome.cells),
-            "found_at": outcome.found_at,
+            "cells": outcome[0],
+            "found_at": outcome[1],
         }

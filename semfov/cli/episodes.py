@@ -34,8 +34,7 @@ from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
 from semfov.report import write_page
 from semfov.runs.config import WHERE
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
+from semfov.runs.scene_run import SceneResults, digest_of
 from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 

@@ -35,7 +35,9 @@ def look_live(options: LiveOptions) -> int:
     check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", options.out)
     start = start_of(options.start)
     _sought(options, detector_classes(options))
-    stream = _open_live(options)
+    source = options.source if options.camera is None else options.camera
+    assert source is not None
+    stream = open_stream(source, options.frames)
     agent = make_agent(options)
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
@@ -49,13 +51,6 @@ def look_live(options: LiveOptions) -> int:
 def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:
     """The class that is searched for, or the list of those whose objects are all to be found."""
     return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
-
-
-def _open_live(options: LiveOptions) -> Stream:
-    """Open the video, the camera or the stream that the options name."""
-    source = options.source if options.camera is None else options.camera
-    assert source is not None
-    return open_stream(source, options.frames)
 
 
 def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:

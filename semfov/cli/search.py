@@ -44,8 +44,8 @@ class _SearchJob(PictureJob):
         agent, options, weights = self.agent, self.options, self.weights
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
         kind = agent.kind_of_look(picture, shared["how"])
-        if kind != "fovea":
-            _only_likeliest(weights)
+        if kind != "fovea" and len(weights) > 1:
+            print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
         start = start_beside(agent, source, options.seed) if beside else self.start
@@ -138,9 +138,3 @@ def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
         if len([class_index(name.strip(), classes) for name in names]) > 1:
             return "; a search is for one class, and `semfov find` takes several"
     return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"
-
-
-def _only_likeliest(weights: dict[str, float]) -> None:
-    """Say so if only the most likely class of a description is searched for."""
-    if len(weights) > 1:
-        print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")

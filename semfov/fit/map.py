@@ -130,7 +130,7 @@ def _fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model."""
     examples = _make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
-    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
@@ -313,8 +313,7 @@ class MapFit(PartFit):
     def settings(self) -> FitMapConfig:
         """The settings of the training."""
         steps = self.config.map_steps or 1000
-        holdout, gain_steps = self.inputs.holdout, max(1, steps // 5)
-        return FitMapConfig(**self.inputs.common, holdout=holdout, steps=steps, gain_steps=gain_steps)
+        return self.inputs.settings(FitMapConfig, steps=steps, gain_steps=max(1, steps // 5))
 
     @property
     def tasks(self) -> dict[str, float]:

@@ -66,22 +66,22 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
     return _Models(
         make_observation(belief.model, eye) if _needs_observation(policies, belief) else None,
         make_learned(TargetEvidence, belief.target_model, eye)
-        if any(by_evidence(policy, task) for policy in policies)
+        if any(_by_evidence(policy, task) for policy in policies)
         else None,
         make_learned(MapEvidence, belief.map_model, eye)
-        if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
+        if any(policy.scores == "learned" and not _by_evidence(policy, task) for policy in policies)
         else None,
     )
 
 
-def by_evidence(policy: PolicyConfig, task: Task) -> bool:
+def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
     """Whether a policy uses the learned target evidence."""
     return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
 
 
 def belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
-    if by_evidence(policy, task):
+    if _by_evidence(policy, task):
         return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
     return replace(policy, policy=Random.name, saliency=None, samples=None)
 
@@ -105,7 +105,7 @@ def make_strategy(
     calibrated = policy.scores == "calibrated"
     means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
     chosen = named_policy(policy.policy, task, means)
-    if by_evidence(policy, task):
+    if _by_evidence(policy, task):
         return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)

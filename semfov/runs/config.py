@@ -276,21 +276,40 @@ WHERE = ("out", "cache", "workers", "scheduler")
 
 
 @dataclass(frozen=True)
-class LookingConfig(WorkConfig):
-    """Looks at scenes from every cell of a grid.
+class EyeConfig(WorkConfig):
+    """Looks at scenes from the cells of a grid; `cells` are its columns and rows.
 
     Args:
         data: the scenes.
         sensor: the foveal sensor.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        raise NotImplementedError(f"{type(self).__name__} has no cells")
+
+
+@dataclass(frozen=True)
+class LookingConfig(EyeConfig):
+    """Looks at scenes from every cell of a grid.
+
+    Args:
         belief: the belief, a grid of class distributions; its columns and rows are the cells.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     store: bool = True
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the belief."""
+        return self.belief.columns, self.belief.rows
 
 
 @dataclass(frozen=True)

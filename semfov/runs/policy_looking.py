@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -45,18 +46,18 @@ class PolicyLooking(Looking):
             observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
-        size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, size)
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }
 
-    def _code(self) -> str:
+    @cached_property
+    def code(self) -> str:
         """Digest of the code of the run, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
-        return digest_of([super()._code(), [class_digest(POLICIES[name]) for name in foreign]])
+        return digest_of([super().code, [class_digest(POLICIES[name]) for name in foreign]])
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""

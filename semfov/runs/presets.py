@@ -15,7 +15,7 @@ from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 TARGET_EVIDENCE = "target-evidence"
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-WORDS = {
+_WORDS = {
     "scores": Scores,
     "footprint": Footprint,
     "memory": CellMemory,
@@ -88,10 +88,11 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
     lookup(choice.policy, _valid_policies(task), "policy")
-    if choice.policy == SaliencyMaximum.name and choice.saliency is None:
+    saliency = choice.saliency if choice.policy == SaliencyMaximum.name else None
+    if choice.policy == SaliencyMaximum.name and saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
-    for setting, words in WORDS.items():
+    for setting, words in _WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
@@ -99,7 +100,8 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     if choice.samples is not None and not (choice.policy in POLICIES and POLICIES[choice.policy].by_samples):
         names = ", ".join(name for name in policy_names(task) if POLICIES[name].by_samples)
         raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
-    scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
+    known = presets(task).values()
+    scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
@@ -134,9 +136,3 @@ def label(choice: PolicyChoice, task: Task) -> str:
             text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
             differs.append(field.name if value is True else f"{field.name} {text}")
     return ", ".join([base, *differs])
-
-
-def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
-    """Whether there is a preset of this policy with these scores."""
-    saliency = policy.saliency if policy.policy == SaliencyMaximum.name else None
-    return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

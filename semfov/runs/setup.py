@@ -7,7 +7,6 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -58,7 +57,16 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     _check_data(data)
     if data.root is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
-    return _photographs(data, classes, None if data.ids is None else _read_ids(data.ids), data.limit)
+    ids = None
+    if data.ids is not None:
+        check_regular(data.ids)
+        try:
+            ids = data.ids.read_text(encoding="utf-8").split()
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(
+                f"{data.ids}: expected a text file with one id per line; it cannot be read ({error})"
+            ) from None
+    return _photographs(data, classes, ids, data.limit)
 
 
 def _photographs(
@@ -82,15 +90,6 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
     others = [name for number, name in enumerate(ids) if number % every]
     return _photographs(data, classes, others), _photographs(data, classes, ids[::every])
-
-
-def _read_ids(path: Path) -> list[str]:
-    """Read the ids of photographs from a text file with one per line."""
-    check_regular(path)
-    try:
-        return path.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: expected a text file with one id per line; it cannot be read ({error})") from None
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
@@ -187,17 +186,11 @@ def prepare_worker() -> None:
     Only worker processes are silenced: the main process has logged the same messages already.
     """
     torch.set_num_threads(1)
-    _keep_memory()
-    if multiprocessing.parent_process() is not None:
-        logging.getLogger("semfov").setLevel(logging.ERROR)
-
-
-def _keep_memory() -> None:
-    """Have glibc keep freed memory; otherwise it would return and request memory at every look.
-
-    Dask's workers return memory at once, by a variable of the environment, which also takes away glibc's own rule.
-    """
+    # Otherwise glibc would return and request memory at every look. Dask's workers return memory at once, by a variable
+    # of the environment, which also takes away glibc's own rule.
     with suppress(OSError, AttributeError):  # other systems have no such setting
         setting = ctypes.CDLL(None).mallopt
         setting(_MMAP_THRESHOLD, 31 << 20)
         setting(_TRIM_THRESHOLD, 1 << 30)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)

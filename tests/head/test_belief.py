@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from eval.head.run import rests_on
+from eval.head.run import _rests_on
 from semfov.belief.observers import LearnedMap, Target
 from semfov.episode import rollout
 from semfov.errors import InputError
@@ -219,7 +219,7 @@ def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
     places = views.world.places(torch.tensor(boxes), views.poses[pose])
     for cell in range(100):
         x1, y1, x2, y2 = views.view_grid.edges[cell].tolist()
-        found = rests_on(views, pose * 100 + cell, places).tolist()
+        found = _rests_on(views, pose * 100 + cell, places).tolist()
         for rests, (left, top, right, bottom) in zip(found, boxes, strict=True):
             gap = min(right - x1, x2 - left, bottom - y1, y2 - top)
             if abs(gap) > 0.3:  # where they almost touch, rounding decides

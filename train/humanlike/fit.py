@@ -73,7 +73,7 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
     names = [label(choice, "exploration") for choice in config.policies]
     if config.save is not None:
         lookup(config.save, names, "policy to save")
-    choices, size, eye = gather_choices(config)
+    choices, size, eye = _gather_choices(config)
     columns, rows = config.belief.columns, config.belief.rows
     halves = Halves.of(choices, Grid(columns, rows, size), config.smoothing)
     models = {name: fit_terms(halves, name, config.ridge) for name in [None, *names]}
@@ -84,23 +84,13 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
     path = model_path(config, eye.detector.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     habits.save(path)
-    text = humanlike_report(halves, [model for several in models.values() for model in several], habits)
+    text = _humanlike_report(halves, [model for several in models.values() for model in several], habits)
     figures = [model.figures() for several in models.values() for model in several]
     write_outputs(config, text, ("bits.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
-def gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
-    """Gather people's choices with the value that every policy gives to each cell.
-
-    Args:
-        config: the settings.
-
-    Returns:
-        All choices, the size `(width, height)` of the pictures, and the eye.
-
-    Raises:
-        DataError: pictures are missing, or their size differs from that in the file of fixations.
-    """
+def _gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
+    """Gather people's choices with the value that every policy gives to each cell."""
     people = by_picture(read_osie(config.fixations))
     viewing = Viewing(config, list(people)[: config.limit])
     size = people[str(viewing.scenes.ids[0])][0].size
@@ -111,12 +101,7 @@ def gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int]
 
 
 class Viewing(PolicyLooking):
-    """Compute the values that policies give to the cells of pictures whenever a person chose the next fixation.
-
-    Args:
-        config: settings of the fit.
-        names: file names of the pictures.
-    """
+    """Compute the values that policies give to the cells of pictures whenever a person chose the next fixation."""
 
     task: Task = "exploration"
 
@@ -136,16 +121,7 @@ class Viewing(PolicyLooking):
     def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
         """Gather the choices of all people in a picture.
 
-        Args:
-            number: number of the picture.
-            records: people's fixations in it.
-            size: `(width, height)` that all pictures should have.
-
-        Returns:
-            The choices with the values of all policies.
-
-        Raises:
-            DataError: the picture or its fixations have another size.
+        Shapes: size `(width, height)`.
         """
         if any((each.size, self.scenes.annotation(number).size) != (size, size) for each in records):
             raise DataError(
@@ -167,7 +143,7 @@ class Viewing(PolicyLooking):
 _TERMS = {"policy": "policy", "centre": "centre bias", "steps": "saccade length", "return": "return"}
 
 
-def humanlike_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
+def _humanlike_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
     """Write the report as Markdown."""
     sizes = halves.sizes
     rows = [

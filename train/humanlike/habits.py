@@ -22,7 +22,7 @@ AGES = (1.0, 2.0, 3.0, 6.0)
 """Upper limits of the age bins of inhibition of return, in fixations. The last bin has no limit."""
 
 Term = Literal["policy", "centre", "steps", "return"]
-ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
+_ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
 """Terms in the order in which they are added."""
 
 
@@ -30,13 +30,7 @@ ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
 class Halves:
     """The choices to fit on, and the choices of other people in other pictures.
 
-    Attributes:
-        fitted: choices to fit on.
-        held_out: choices to evaluate on.
-        place: `(X·Y)`, logarithm of the frequency with which people of the fitted half fixated each cell.
-        grid: the grid of cells. Distances are in units of the longer side, so one grid serves all pictures of the same
-            shape.
-        sizes: numbers of choices, people and pictures in both halves, for metadata.
+    Shapes: place `(X·Y)`.
     """
 
     fitted: Choices
@@ -46,19 +40,7 @@ class Halves:
 
     @classmethod
     def of(cls, choices: Choices, grid: Grid, smoothing: float) -> Halves:
-        """Split choices into people with odd numbers in every other picture, and the other people in the other ones.
-
-        Args:
-            choices: all choices.
-            grid: the grid of cells.
-            smoothing: number of fixations added to every cell when the centre bias is counted.
-
-        Returns:
-            The two halves.
-
-        Raises:
-            DataError: there are too few people or pictures for two halves.
-        """
+        """Split choices into people with odd numbers in every other picture, and the other people in the other ones."""
         other = choices.subject % 2 == 0
         between = choices.picture % 2 == 1
         fitted, held_out = choices[~other & ~between], choices[other & between]
@@ -88,15 +70,7 @@ class Halves:
 class FittedTerms:
     """Some terms of the model, fitted together.
 
-    Attributes:
-        policy: policy whose values are a term, or None.
-        terms: the terms of the model.
-        weights: `(F,)`, weights of the features.
-        fitted: information gain over a uniform choice among the cells, in bits per fixation, on the fitted half.
-        even: the same on the held-out half.
-        gain: information gain over the centre bias alone, in bits per fixation, as a mean over the pictures of the
-            held-out half.
-        error: standard error of `gain` over pictures.
+    Shapes: weights `(F,)`.
     """
 
     policy: str | None
@@ -114,33 +88,23 @@ class FittedTerms:
 
 def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTerms]:
     """Add the terms one after another, the values of a policy first, and fit all of them again each time."""
-    order = ORDER if policy is not None else ORDER[1:]
+    order = _ORDER if policy is not None else _ORDER[1:]
     base = _bits(halves, None, ("centre",), _fit(halves, None, ("centre",), ridge))[1]
     fits = []
     for number in range(1, len(order) + 1):
         terms = order[:number]
         weights = _fit(halves, policy, terms, ridge)
         fitted, held_out = _bits(halves, policy, terms, weights)
-        over = mean_by_picture(held_out - base, halves.held_out.picture)
+        over = _mean_by_picture(held_out - base, halves.held_out.picture)
         error = float(standard_error(over.numpy()))
-        even = float(mean_by_picture(held_out, halves.held_out.picture).mean())
-        mean = float(mean_by_picture(fitted, halves.fitted.picture).mean())
+        even = float(_mean_by_picture(held_out, halves.held_out.picture).mean())
+        mean = float(_mean_by_picture(fitted, halves.fitted.picture).mean())
         fits.append(FittedTerms(policy, terms, weights, mean, even, float(over.mean()), error))
     return fits
 
 
-def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[Term, ...]) -> Tensor:
-    """Compute the features of every cell for every choice.
-
-    Args:
-        choices: n choices.
-        halves: the halves, for the centre bias and the grid.
-        policy: policy whose values are a feature.
-        terms: the terms of the model.
-
-    Returns:
-        Features `(n, X·Y, F)`: one for the policy, one for the centre bias, and one for each bin of the other terms.
-    """
+def _features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[Term, ...]) -> Tensor:
+    """Compute the features of every cell for every choice."""
     shape = len(choices), len(halves.grid)
     columns = []
     for term in terms:
@@ -160,14 +124,14 @@ def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tup
 
 def habits_of(model: FittedTerms, halves: Halves) -> GazeHabits:
     """Convert a fitted model with all terms into a `GazeHabits`, which draws fixations."""
-    assert model.terms == ORDER
+    assert model.terms == _ORDER
     pull, centre, *rest = model.weights.tolist()
     step, back = torch.tensor(rest[: len(EDGES) + 1]), torch.tensor(rest[len(EDGES) + 1 :])
     place = (centre * halves.place).float()
     return GazeHabits(pull, place - place.mean(), step, EDGES, back, AGES, halves.grid.columns)
 
 
-def mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
+def _mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
     """Compute the mean of the values of each picture."""
     _, number = picture.unique(return_inverse=True)
     count = torch.bincount(number)
@@ -175,13 +139,13 @@ def mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
 
 
 def _fit(halves: Halves, policy: str | None, terms: tuple[Term, ...], ridge: float) -> Tensor:
-    return fit_log_linear(features_of(halves.fitted, halves, policy, terms), halves.fitted.next_cell, ridge=ridge)
+    return fit_log_linear(_features_of(halves.fitted, halves, policy, terms), halves.fitted.next_cell, ridge=ridge)
 
 
 def _bits(halves: Halves, policy: str | None, terms: tuple[Term, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the information gain of every choice over a uniform one, in bits, for both halves."""
     bits = []
     for choices in (halves.fitted, halves.held_out):
-        log = log_probability(features_of(choices, halves, policy, terms), choices.next_cell, weights)
+        log = log_probability(_features_of(choices, halves, policy, terms), choices.next_cell, weights)
         bits.append((log + math.log(len(halves.grid))) / math.log(2))
     return bits[0], bits[1]

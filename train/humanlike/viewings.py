@@ -20,13 +20,7 @@ from semfov.gaze.choice import Given
 class Choices:
     """n choices of the next fixation.
 
-    Attributes:
-        picture: `(n,)`, number of the picture.
-        subject: `(n,)`, number of the person.
-        cell: `(n,)`, the fixated cell.
-        next_cell: `(n,)`, the cell that was fixated next, possibly the same one.
-        age: `(n, X·Y)`, number of fixations since each cell was last fixated; infinite if it never was.
-        values: `(n, X·Y)` for each policy, its values of all cells.
+    Shapes: picture `(n,)`, subject `(n,)`, cell `(n,)`, next_cell `(n,)`, age `(n, X·Y)`, values `(n, X·Y)`.
     """
 
     picture: Tensor
@@ -56,13 +50,7 @@ class Choices:
 def fixated_cells(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor]:
     """Convert people's fixations to cells. Fixations outside the picture are left out.
 
-    Args:
-        fixations: fixations of P people.
-        grid: the grid of cells.
-
-    Returns:
-        The cells `(P, n)`, with the last one repeated as padding, and the number of fixations of each person `(P,)`,
-        which is 0 if all of them are outside the picture.
+    Shapes: → `(P, n)`.
     """
     rows = [grid.cell_of(torch.as_tensor(each.points[each.inside], dtype=torch.float32)) for each in fixations]
     count = torch.tensor([len(row) for row in rows])
@@ -77,15 +65,7 @@ def fixated_cells(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, T
 def choices_in(cells: Tensor, count: Tensor, grid: Grid, picture: int, subject: Tensor) -> Choices:
     """List the choices in one picture, person by person, without the values of policies.
 
-    Args:
-        cells: `(P, n)`, cells that each person fixated.
-        count: `(P,)`, number of fixations of each person.
-        grid: the grid of cells.
-        picture: number of the picture.
-        subject: `(P,)`, numbers of the people.
-
-    Returns:
-        The choices.
+    Shapes: cells `(P, n)`, count `(P,)`, subject `(P,)`.
     """
     by_shift = []
     age = torch.full((len(cells), len(grid)), torch.inf)
@@ -109,15 +89,7 @@ def values_in(
 
     The belief at each choice results from looks at the cells that the person has fixated so far.
 
-    Args:
-        looks: looks at the picture from every cell.
-        observer: the observer, which turns looks into a belief.
-        acquire: makes the acquisition function for episodes that fixate the cells `(A,)`.
-        cells: `(P, n)`, cells that each person fixated.
-        count: `(P,)`, number of fixations of each person.
-
-    Returns:
-        Values `(n, X·Y)`, in the order of `choices_in`.
+    Shapes: acquire `(A,)`, cells `(P, n)`, count `(P,)`.
     """
     seeing = (count > 1).nonzero()[:, 0]
     table = torch.zeros(len(cells), cells.shape[1] - 1, len(looks.grid))

@@ -22,7 +22,7 @@ from semfov.gaze.choice import drawn_by
 from semfov.observation.foveal import FovealObservationModel
 from train.fit_humanlike import main
 from train.humanlike.gaze_habits import GazeHabits, Habitual
-from train.humanlike.habits import AGES, EDGES, ORDER, Halves, fit_terms, habits_of
+from train.humanlike.habits import _ORDER, AGES, EDGES, Halves, fit_terms, habits_of
 from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 GRID = Grid(4, 3, (80, 60))
@@ -161,7 +161,7 @@ def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
     assert habits.metadata["fitted_choices"] == habits.metadata["held_out_choices"] == 2 * 2 * 4
     figures = json.loads((tmp_path / "out/bits.json").read_text())
     assert [(row["policy"], tuple(row["terms"])) for row in figures[3:7]] == [
-        ("kl-raw", ORDER[:number]) for number in range(1, 5)
+        ("kl-raw", _ORDER[:number]) for number in range(1, 5)
     ]
     text = (tmp_path / "out/report.md").read_text()
     assert "evaluated on 16 fixations of 2 other people in 2 other pictures" in text

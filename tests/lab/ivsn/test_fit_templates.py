@@ -13,7 +13,7 @@ from semfov.detection.darknet_config import _yolov3_tiny
 from semfov.errors import InputError
 from tests.small import Fixed
 from train.fit_templates import main
-from train.templates import TemplateSums, objects_of
+from train.templates import _objects_of, _TemplateSums
 
 
 def test_features_are_the_input_of_the_last_convolution():
@@ -36,7 +36,7 @@ def test_features_are_the_input_of_the_last_convolution():
 
 def test_templates_from_sums_equal_means():
     generator = torch.Generator().manual_seed(0)
-    sums, everything, objects, labels = TemplateSums(3, 4), [], [], []
+    sums, everything, objects, labels = _TemplateSums(3, 4), [], [], []
     for count in (2, 0, 3):
         features = torch.randn(4, 2, 5, generator=generator)
         some, theirs = torch.randn(count, 4, generator=generator), torch.randint(1, 3, (count,), generator=generator)
@@ -56,7 +56,7 @@ def test_templates_from_sums_equal_means():
 def test_features_of_objects_are_taken_at_their_centres():
     detector = load_detector("yolov3-tiny")
     scenes = EmbeddedScenes(detector.classes, count=1)
-    features, objects, labels = objects_of(detector, scenes, 0)
+    features, objects, labels = _objects_of(detector, scenes, 0)
     assert torch.equal(labels, scenes.annotation(0).labels)
     assert objects.shape == (len(labels), len(features))
     canvas, placement = detector.fit(scenes[0].image[None])
