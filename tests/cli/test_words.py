@@ -9,7 +9,7 @@ import pytest
 
 import semfov
 from semfov.cli import agent, live, search, start
-from semfov.cli.main import _SUBCOMMANDS, main
+from semfov.cli.main import _SUBCOMMANDS, main, options_of
 from semfov.errors import InputError
 from semfov.runs.command import make_parser
 
