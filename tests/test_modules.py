@@ -76,7 +76,7 @@ def test_every_public_module_has_a_tester():
         for name, thing in things
         if isclass(thing) and issubclass(thing, nn.Module) and not isabstract(thing)
     }
-    assert len(modules) > 50
+    assert modules
     assert sorted(modules - {name.removeprefix("Test") for name in find_testers()}) == []
 
 

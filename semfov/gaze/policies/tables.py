@@ -95,8 +95,5 @@ def _required_table(table: Tensor | None, policy: Policy) -> Tensor:
 
 
 def salient_from(saliency: Tensor, cell: Tensor) -> Tensor:
-    """Saliency of all cells in the view from the fixated `cell` of each episode.
-
-    Shapes: saliency `(X·Y, X·Y)`, cell `(B,)` → `(B, X·Y)`.
-    """
+    """Saliency of all cells in the view from the fixated `cell` of each episode, `(B, X·Y)`."""
     return saliency[cell if len(saliency) > 1 else torch.zeros_like(cell)]
