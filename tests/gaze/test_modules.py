@@ -130,40 +130,10 @@ class TableTester(PolicyTester):
         )
 
 
-globals().update(
-    make_testers(
-        TableTester,
-        {
-            "SaliencyMaximum": policies.SaliencyMaximum,
-            "TemplateSearch": policies.TemplateSearch,
-        },
-    )
-)
-
-
-globals().update(
-    make_testers(
-        PolicyTester,
-        {
-            "Random": policies.Random,
-            "NonPredictive": policies.NonPredictive,
-            "Predictive": lambda: policies.Predictive(model()),
-            "Neighbourhood": lambda: policies.Neighbourhood(model()),
-            "FovealHits": lambda: policies.FovealHits(model()),
-            "InformationOnPlace": lambda: policies.InformationOnPlace(model()),
-            "EntropyLimitMinimisation": lambda: policies.EntropyLimitMinimisation(model().requires_grad_(False)),
-            "Closer": policies.Closer,
-            "ObjectSeeking": policies.ObjectSeeking,
-            "KL": lambda: policies.KL(model()),
-            "Surprise": lambda: policies.Surprise(model()),
-            "Negentropy": lambda: policies.Negentropy(model()),
-            "Peaks": lambda: policies.Peaks(model()),
-            "ConfidenceBound": lambda: policies.ConfidenceBound(model()),
-            "Improvement": lambda: policies.Improvement(model()),
-            "Accuracy": lambda: policies.Accuracy(model().requires_grad_(False)),
-        },
-    )
-)
+for kind in policies.POLICIES.values():
+    if kind is not policies.IdealObserver and not kind.needs_map:
+        made = {kind.__name__: lambda kind=kind: kind.make(policies.Means(model().requires_grad_(False)))}
+        globals().update(make_testers(TableTester if kind.table else PolicyTester, made))
 
 
 class TestGain(PolicyTester):

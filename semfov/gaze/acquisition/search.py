@@ -60,7 +60,7 @@ class PredictedTargetPosterior(AcquisitionFunction):
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
         likelihoods: `(K+1, N, M, K+1)`, likelihoods of drawn looks
-            (`semfov.gaze.acquisition.samples.sampled_likelihoods`), of which those at level 0 count; None is the
+            (`semfov.gaze.acquisition.lookahead.sampled_likelihoods`), of which those at level 0 count; None is the
             published plug-in.
 
     >>> from semfov import DirichletBelief, FovealObservationModel

@@ -10,7 +10,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.samples import sampled_likelihoods
+from semfov.gaze.acquisition.lookahead import sampled_likelihoods
 from semfov.observation.foveal import FovealObservationModel
 
 Task = Literal["search", "exploration"]
