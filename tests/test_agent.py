@@ -322,7 +322,7 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
     view = eye.open(picture)
     got = eye.foveated(view, gaze)
     shown, _ = eye.detector.fit(Foveation(60.0, growth=growth)(picture, gaze[None])[0])
-    scaled = foveate(view.state.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
+    scaled = foveate(view.state[0], view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
     error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
     assert error < 0.02
     # With growth 1 both views are the same up to rounding.

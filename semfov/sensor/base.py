@@ -188,6 +188,12 @@ class Sensor(nn.Module, ABC):
         numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
+    def extra_repr(self) -> str:
+        """The settings as text."""
+        settings = self.settings()
+        named = ((name, settings[name]) for name in self.names)
+        return ", ".join(f"{name}={v:g}" if isinstance(v, float) else f"{name}={v!r}" for name, v in named)
+
 
 def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
     """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""

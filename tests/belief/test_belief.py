@@ -5,7 +5,7 @@ import torch
 
 from semfov import Detections, Grid, InputError
 from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
-from semfov.belief.belief import dirichlet_belief, pick
+from semfov.belief.belief import dirichlet_belief
 from semfov.belief.observers import AnyOf, Landing, LearnedMap, Semantic, Target
 from tests import small
 
@@ -167,7 +167,7 @@ def test_before_the_first_look_all_cells_are_alike_and_infinitely_far(kind):
     present = belief.probability(2)
     assert torch.equal(present, present[:1, :1].expand(2, 12))
     assert torch.equal(belief.chance(2), present)
-    assert present.dtype == torch.float64
+    assert present.dtype == belief.closest.dtype == torch.float64
     assert bool(belief.closest.isposinf().all())
 
 
@@ -181,17 +181,6 @@ def test_probability_of_a_target_equals_a_loop():
             torch.testing.assert_close(belief.probability(target)[batch, cell], expected)
     torch.testing.assert_close(belief.probabilities.sum(-1), torch.ones(3, 12, dtype=torch.float64))
     torch.testing.assert_close(belief.probabilities[..., 2], belief.probability(2))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_before_the_first_look_all_distances_are_infinite(dtype):
-    belief = DirichletBelief(torch.ones(2, 12, 5, dtype=dtype))
-    assert belief.closest.shape == (2, 12)
-    assert belief.closest.dtype == dtype
-    assert torch.isposinf(belief.closest).all()
-    uniform = DirichletBelief.uniform(2, 12, 5, 0.5, torch.empty(0, dtype=dtype))
-    assert torch.equal(uniform.beta, torch.full((2, 12, 5), 0.5, dtype=dtype))
-    assert torch.equal(uniform.closest, belief.closest)
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
@@ -274,14 +263,6 @@ def test_a_belief_about_one_target_is_refused_where_all_classes_are_needed(kind)
 def test_a_class_index_out_of_range_is_refused(target):
     with pytest.raises(InputError, match="target: expected a class index from 0 to 4"):
         DirichletBelief(rand(2, 12, 5)).probability(torch.tensor(target))
-
-
-def test_pick_selects_one_component_per_row():
-    values, target = rand(2, 3, 4, 5), torch.tensor([4, 0])
-    got = pick(values, target)
-    for row in range(2):
-        assert torch.equal(got[row], values[row, ..., target[row]])
-    assert torch.equal(pick(values, torch.tensor(3)), values[..., 3])
 
 
 def test_put_replaces_the_beliefs_of_the_given_episodes():

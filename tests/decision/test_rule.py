@@ -14,7 +14,6 @@ from semfov.belief import Belief
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import (
-    OUTCOMES,
     Decision,
     conclude,
     decide,
@@ -54,10 +53,6 @@ class Guided(Known):
 
     def chance(self, target):
         return self.present / 10
-
-
-def test_names_of_outcomes():
-    assert OUTCOMES == ("undecided", "found", "absent", "undecided")
 
 
 def test_thresholds_change_one_at_a_time():

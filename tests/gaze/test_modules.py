@@ -114,29 +114,10 @@ class TestIdealObserver(TensorTester):
         return policies.IdealObserver(model())
 
 
-globals().update(
-    make_testers(
-        PolicyTester,
-        {
-            "Random": policies.Random,
-            "NonPredictive": policies.NonPredictive,
-            "Predictive": lambda: policies.Predictive(model()),
-            "Neighbourhood": lambda: policies.Neighbourhood(model()),
-            "FovealHits": lambda: policies.FovealHits(model()),
-            "InformationOnPlace": lambda: policies.InformationOnPlace(model()),
-            "EntropyLimitMinimisation": lambda: policies.EntropyLimitMinimisation(model().requires_grad_(False)),
-            "Closer": policies.Closer,
-            "ObjectSeeking": policies.ObjectSeeking,
-            "KL": lambda: policies.KL(model()),
-            "Surprise": lambda: policies.Surprise(model()),
-            "Negentropy": lambda: policies.Negentropy(model()),
-            "Peaks": lambda: policies.Peaks(model()),
-            "ConfidenceBound": lambda: policies.ConfidenceBound(model()),
-            "Improvement": lambda: policies.Improvement(model()),
-            "Accuracy": lambda: policies.Accuracy(model().requires_grad_(False)),
-        },
-    )
-)
+for kind in (each for each in policies.POLICIES.values() if each.__module__.startswith("semfov.")):
+    if kind not in (policies.IdealObserver, policies.SaliencyMaximum) and not kind.needs_map:
+        made = {kind.__name__: lambda kind=kind: kind.make(policies.Means(model().requires_grad_(False)))}
+        globals().update(make_testers(PolicyTester, made))
 
 
 class TestGain(PolicyTester):

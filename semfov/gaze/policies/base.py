@@ -2,23 +2,18 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, Self
+from typing import ClassVar, Literal, Self
 
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import InputError, lookup
-from semfov.gaze.acquisition.accuracy import SightedModel
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.ideal import SignalModel
-from semfov.gaze.acquisition.samples import DrawnModel, sampled_likelihoods
+from semfov.gaze.acquisition.lookahead import sampled_likelihoods
+from semfov.observation.foveal import FovealObservationModel
 
 Task = Literal["search", "exploration"]
-
-
-class GazeModel(DrawnModel, SightedModel, SignalModel, Protocol):
-    """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +35,7 @@ class Means:
     semfov.errors.InputError: policy 'kl': expected an observation model in `Means.model`, got none
     """
 
-    model: GazeModel | None = None
+    model: FovealObservationModel | None = None
     map: MapEvidence | None = None
     fovea: float = 100 / 640
     prior: float = 0.5
@@ -117,15 +112,24 @@ class ModelPolicy(Policy):
     Args:
         model: observation model.
 
+    Attributes:
+        function: acquisition function that `forward` makes, unless a subclass defines `forward`.
+
     >>> issubclass(POLICIES["predictive"], ModelPolicy), issubclass(POLICIES["random"], ModelPolicy)
     (True, False)
     """
 
     needs_model = True
+    function: ClassVar[type[AcquisitionFunction]]
 
-    def __init__(self, model: GazeModel) -> None:
+    def __init__(self, model: FovealObservationModel) -> None:
         super().__init__()
         self.model = model
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The acquisition function `function` of the model and the grid, in a search for the target."""
+        searched = (required_target(target, self.name),) if "search" in self.tasks else ()
+        return self.function(*searched, self.model, grid)
 
     @classmethod
     def make(cls, means: Means) -> Self:
@@ -152,10 +156,14 @@ class SamplingPolicy(ModelPolicy):
     by_samples = True
     likelihoods: Tensor | None
 
-    def __init__(self, model: GazeModel, samples: int | None = None, calibrated: bool = True) -> None:
+    def __init__(self, model: FovealObservationModel, samples: int | None = None, calibrated: bool = True) -> None:
         super().__init__(model)
         drawn = None if samples is None else sampled_likelihoods(model, samples, calibrated=calibrated)
         self.register_buffer("likelihoods", drawn, persistent=False)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The acquisition function `function` of the model, the grid and the drawn looks."""
+        return self.function(self.model, grid, likelihoods=self.likelihoods)
 
     @classmethod
     def make(cls, means: Means) -> Self:

@@ -120,10 +120,7 @@ class Neighbourhood(ModelPolicy):
 
     name = "neighbourhood"
     tasks = ("search",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The predicted posterior of the target in the neighbourhood."""
-        return NeighbourhoodPosterior(required_target(target, self.name), self.model, grid)
+    function = NeighbourhoodPosterior
 
 
 class FovealHits(ModelPolicy):
@@ -142,10 +139,7 @@ class FovealHits(ModelPolicy):
     name = "foveal-hit"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of a detection."""
-        return FovealHit(required_target(target, self.name), self.model, grid)
+    function = FovealHit
 
 
 class InformationOnPlace(ModelPolicy):
@@ -164,10 +158,7 @@ class InformationOnPlace(ModelPolicy):
     name = "place-information"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The expected information about the place."""
-        return PlaceInformation(required_target(target, self.name), self.model, grid)
+    function = PlaceInformation
 
 
 class EntropyLimitMinimisation(ModelPolicy):
@@ -187,10 +178,7 @@ class EntropyLimitMinimisation(ModelPolicy):
     name = "entropy-limit"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The limit of the decrease of the entropy."""
-        return EntropyLimit(required_target(target, self.name), self.model, grid)
+    function = EntropyLimit
 
 
 class IdealObserver(ModelPolicy):
@@ -211,7 +199,4 @@ class IdealObserver(ModelPolicy):
     name = "ideal-observer"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of a correct localisation."""
-        return CorrectLocalisation(required_target(target, self.name), self.model, grid)
+    function = CorrectLocalisation
