@@ -44,10 +44,11 @@ _Targets = str | int | Sequence[str | int] | None
 class ActivePerception(nn.Module):
     """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
 
-    The picture decides how the agent looks (`how="auto"`). In a photograph it moves the gaze of a fovea over a grid of
-    cells (`fovea`). In a picture with two octaves or more to zoom in, at least four times as long as the detector's
-    input, it looks at windows and chooses their places and magnifications (`windows`). In a scene, such as a
-    `semfov.Panorama`, it moves eye and head (`head`). `record.how` says which it was.
+    The picture decides how the agent looks (`how="auto"`). At a flat picture of any size it looks at windows, the first
+    of them the whole picture, and chooses their places and magnifications (`windows`). In a scene, such as a
+    `semfov.Panorama`, it moves eye and head (`head`). `how="fovea"` moves the gaze of a fovea over the cells of a
+    photograph, as in the paper; without evidence for photographs, `auto` does so where the picture is less than four
+    times as long as the detector's input. `record.how` says which it was.
 
     Args:
         eye: sensor and detector.
@@ -237,13 +238,17 @@ class ActivePerception(nn.Module):
             )
         return HeadAgent(self.eye, search.model, explore.model)
 
-    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> KindOfLook:
+    def kind_of_look(
+        self, picture: PictureLike, how: How = "auto", *, every: bool = False, foveal: bool = False
+    ) -> KindOfLook:
         """How the agent looks at a picture.
 
         Args:
             picture: as for `search`.
             how: `auto` chooses by the picture; another kind is returned as it is, if it suits the picture.
-            every: whether all objects are wanted, of which the overview of a photograph shows most.
+            every: whether all objects are wanted.
+            foveal: whether something is asked for that only a fovea can do in a photograph: a search for any of several
+                classes, a first cell, gaze shifts, or the protocol of the paper.
 
         Returns:
             `fovea`, `windows` or `head`.
@@ -251,7 +256,11 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        return open_picture(picture).kind(how, self.eye.detector.input_size, every=every)
+        return self._kind_of(open_picture(picture), how, every=every, foveal=foveal)
+
+    def _kind_of(self, picture: OpenedPicture, how: str, *, every: bool, foveal: bool) -> KindOfLook:
+        photographs = not foveal and self.windows is not None and self.windows.photograph is not None
+        return picture.kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
 
     def search(
         self,
@@ -326,7 +335,10 @@ class ActivePerception(nn.Module):
         """
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration)
+        foveal = start is not None or boxes is not None or (not isinstance(target, str | int) and len(target) > 1)
+        opened, kind, limits = self._begin(
+            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+        )
         only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
             return self.fovea.search(
@@ -456,7 +468,10 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration)
+        foveal = start is not None
+        opened, kind, limits = self._begin(
+            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+        )
         if kind == "fovea":
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
@@ -536,10 +551,11 @@ class ActivePerception(nn.Module):
         duration: float | None,
         *,
         every: bool = False,
+        foveal: bool = False,
     ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
         """Open the picture, choose the kind of look, and check the limits that suit it."""
         opened = open_picture(picture, color)
-        kind = opened.kind(how, self.eye.detector.input_size, every=every)
+        kind = self._kind_of(opened, how, every=every, foveal=foveal or shifts is not None)
         only_for(kind, "fovea", "passes", shifts=shifts)
         only_for(kind, "head", "seconds", duration=duration)
         return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}

@@ -69,6 +69,8 @@ class LivePerception:
         check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
         self.how = "windows" if targets else how
         self._start, self._canvas = start, windows.eye.detector.input_size
+        evidence = windows.evidence
+        self._photographs = start is None and evidence is not None and evidence.photograph is not None
         settings: dict[str, Any] = {
             "color": lookup(color, get_args(Color), "order of channels"),
             **without_none(confirm=confirm, give_up=give_up, closer=closer),
@@ -97,7 +99,7 @@ class LivePerception:
         picture = open_picture(frame)
         check(not picture.scene, "frame", "a picture; search and find_all take scenes", type(frame).__name__)
         if self.how == "auto":
-            self.how = picture.kind("auto", self._canvas)
+            self.how = picture.kind("auto", self._canvas, photographs=self._photographs)
             self._check_start()
         return self._episodes[self.how].step(frame)
 

@@ -31,8 +31,8 @@ class OpenedPicture:
         self.source, self.color = source, color
         self.scene = is_scene(source)
 
-    def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False) -> KindOfLook:
-        """The kind of look that suits it; canvas `(width, height)` of the detector's input."""
+    def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
+        """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""
         how = lookup(how, get_args(How), "kind of look")
         if self.scene:
             check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
@@ -43,7 +43,8 @@ class OpenedPicture:
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            return "windows" if pays(picture_size(cast(ImageLike | LargePicture, self.source)), canvas) else "fovea"
+            size = picture_size(cast(ImageLike | LargePicture, self.source))
+            return "windows" if photographs or pays(size, canvas) else "fovea"
         return "fovea"
 
     def image(self, like: Tensor) -> Tensor:

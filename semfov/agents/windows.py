@@ -21,7 +21,7 @@ from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import closer_window, look_closely
+from semfov.zoom.closer import candidates, closer_window, look_closely
 from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
@@ -31,7 +31,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects, without_replaced
 from semfov.zoom.slices import ranked, usual_slices
 
-_USUAL_PASSES = 24
+USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
 
 LIKELY = 0.5
@@ -158,7 +158,7 @@ class ZoomAgent(nn.Module):
         check_whole(closer, "closer", 0, 100)
         episode = self.episode(
             class_index(target, self.classes[1:], "target"),
-            limits=EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look),
+            limits=EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look),
             confirm=confirm, give_up=give_up, closer=closer,
         )  # fmt: skip
         return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
@@ -200,7 +200,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:
@@ -328,13 +328,14 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def open(self, glances: Glances, *, told: bool = False) -> Self:
         """Begin with a picture or the first frame of a stream; `told` leaves the choice of windows to `look`."""
+        self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]
         if told:
             self.searches, self._decisions = False, None
             belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
             self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
-        elif self.evidence is None:
+        elif self.evidence is None or (self._slicing and not self.searches):
             order = ranked(usual_slices(glances.lattice), sought)
             self._turns = look_by_look(glances, order, None, forgetting=self.forgetting)
         elif self.searches and self.target is not None:
@@ -406,7 +407,7 @@ class WindowEpisode(Episode[ZoomPath]):
         glance = look_closely(self._glances, box)
         self._looks.append(_Look(self.passes, glance, 0.0, closely=True))
         self.passes += 1
-        return glance.detections
+        return candidates(glance)
 
     def _judge(self) -> None:
         """End the search where the look decides it."""
@@ -422,9 +423,14 @@ class WindowEpisode(Episode[ZoomPath]):
         elif self.searches:
             self._concluded, decided = self.decision, "detection"
         found = self._concluded is not None and self._concluded.outcome == "found"
-        usual: Ending = "windows" if self.searches or self.evidence is None else "worth"
+        usual: Ending = "windows" if self.searches or self._slicing else "worth"
         over = found or (self._decisions is not None and self._decisions.outcome > 0)
         self.ending = decided if over else limit or usual
+
+    @property
+    def _slicing(self) -> bool:
+        """Whether all objects are looked for in slices: without evidence, and in a photograph."""
+        return self.evidence is None or (self._glances is not None and self._glances.lattice.levels == 1)
 
     @property
     def decision(self) -> Decision | None:

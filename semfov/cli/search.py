@@ -43,7 +43,8 @@ class _SearchJob(PictureJob):
         """Search a picture."""
         agent, options, weights = self.agent, self.options, self.weights
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
-        kind = agent.kind_of_look(picture, shared["how"])
+        foveal = len(weights) > 1 or self.start is not None or shared.get("shifts") is not None
+        kind = agent.kind_of_look(picture, shared["how"], foveal=foveal)
         if kind != "fovea" and len(weights) > 1:
             print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))

@@ -174,10 +174,13 @@ class Verifier(Generic[LookType]):
 
     @property
     def presence(self) -> float:
-        """Probability that the picture holds the target: the largest after a closer look, or that without them."""
+        """Probability that the picture holds the target: after the look at the best place, or that without one."""
         without = self.places.presence
-        recent = (each for each in self.verdicts if self._recent(each))
-        return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
+        recent = [(self._chance(each), each) for each in self.verdicts if self._recent(each)]
+        if not recent:
+            return without
+        _, best = max(recent, key=lambda pair: pair[0])
+        return self._faded(best.look.presence, without, best.age)
 
     @property
     def best(self) -> CloseUp:

@@ -181,20 +181,23 @@ class ZoomPath(GazeRecord):
         return "score" if self.unseen is None else "probability"
 
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many are expected.
+        """Count the objects, by class where classes were searched for, and say how many this detector can show.
 
-        That is the number of all objects; where fewer are expected than are counted, it is the number of those counted
-        that are right.
+        Where fewer are expected than are counted, it is said how many of those counted are right. Without a class to
+        search for there is no such number, since the small rests of all classes add up to many. Where no object was
+        found, the detector hardly reacts to what is there, and no number is given either.
 
         Returns:
-            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 in all)`, or `9 × person from probability
-            0.5 (about 8 ± 1 of them right)`.
+            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 that this detector can show)`, or `9 ×
+            person from probability 0.5 (about 8 ± 1 of them right)`.
         """
         text = super().objects_in_words()
-        if self.unseen is None:
+        if self.unseen is None or not self._sought():
             return text
+        if not len(self.objects):
+            return f"{text} (the detector hardly reacts, so no number is given)"
         mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
-        of = "in all"
+        of = "that this detector can show"
         if round(mean) < len(self.objects):
             chances = self.objects.scores.double()
             mean, variance, of = float(chances.sum()), float((chances * (1 - chances)).sum()), "of them right"

@@ -90,11 +90,11 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
 @pytest.mark.parametrize(
     ("chances", "unseen", "words"),
     [
-        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 in all)"),
-        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 in all)"),
+        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 that this detector can show)"),
+        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 that this detector can show)"),
         ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability 0.5 (about 2 ± 1 of them right)"),
         ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability 0.5 (about 2 ± 1 of them right)"),
-        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (about 0 ± 0 in all)"),
+        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (the detector hardly reacts, so no number is given)"),
     ],
 )
 def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances, unseen, words):
