@@ -22,6 +22,7 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "find": _PICTURES,
     "explore": _PICTURES,
     "live": ("source", "video file, or address"),
+    "gaze": _PICTURES,
     "fit": ("model", "the detector: a name or a file, as for semfov.load_detector"),
     "detectors": ("name", "detector, or folder of models"),
 }
@@ -43,6 +44,7 @@ def options_of(name: str) -> type[Any]:
         "find": options.FindOptions,
         "explore": options.ExploreOptions,
         "live": options.LiveOptions,
+        "gaze": options.GazeOptions,
         "detectors": options.DetectorsOptions,
     }
     return by_name[name]
@@ -58,6 +60,10 @@ def _run(name: str, options: Any) -> int | None:
         from semfov.cli.live import look_live
 
         return look_live(options)
+    if name == "gaze":
+        from semfov.cli.gaze import predict_gaze
+
+        return predict_gaze(options)
     if name == "detectors":
         from semfov.cli.detectors import list_detectors
 

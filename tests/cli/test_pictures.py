@@ -327,7 +327,8 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     code, printed = run(*search, "--out", tmp_path / "out", "--report", tmp_path / "page.html")
     assert code == 0
     assert re.search(
-        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, probability that the picture holds it: 0\.50",
+        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, "
+        r"probability that the picture holds it: 0\.50",
         printed.out,
     )
     assert "A closer look confirmed the target." in printed.out

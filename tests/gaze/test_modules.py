@@ -1,5 +1,7 @@
 """Acquisition functions, policies and saliency models as submodules of other modules."""
 
+import torch
+
 from semfov import acquisition, policies, saliency
 from semfov.belief import DirichletBelief
 from semfov.belief.observers import LearnedMap
@@ -129,6 +131,43 @@ class TestGain(PolicyTester):
     @staticmethod
     def call(module, scores, boxes, fixation):
         return TestExpectedGain.call(module(None, GRID), scores, boxes, fixation)
+
+
+class TestFixationDensity(GraphTester):
+    """After scanpaths of three fixations, on the cells of the picture."""
+
+    batched = (0, 1, 2)
+    differentiable = (0, 1, 2)
+
+    def make(self):
+        density = saliency.FixationDensity({"fine": 3, "coarse": 2}, readouts=2, units=4, centre=-rand(3, 4))
+        with torch.no_grad():
+            for parameter in density.oculomotor.parameters():
+                parameter.add_(0.2 * torch.randn_like(parameter))
+        return density
+
+    def inputs(self):
+        return rand(2, 3, 6, 8), rand(2, 2, 3, 4), 60 * rand(2, 3, 2)
+
+    @staticmethod
+    def call(module, fine, coarse, scanpath):
+        return module({"fine": fine, "coarse": coarse}, (39, 52), scanpath).flatten(1)[:, ::97]
+
+
+class TestOculomotorBias(GraphTester):
+    batched = (0,)
+    differentiable = (0, 1)
+    autocast = 0.05
+
+    def make(self):
+        bias = saliency.OculomotorBias()
+        with torch.no_grad():
+            for parameter in bias.parameters():
+                parameter.add_(torch.randn_like(parameter))
+        return bias
+
+    def inputs(self):
+        return rand(2, 4, 2), rand(5, 2)
 
 
 class TestVOCUS2(GraphTester):
