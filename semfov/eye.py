@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_image, as_points
+from semfov.data.inputs import ImageLike, PointLike, as_image, as_points, as_positions
 from semfov.detection.crops import merge_crops
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector, check_images
@@ -73,7 +74,9 @@ class Eye(nn.Module):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.fit(image)
-        scale = canvas.new_tensor(placement.scale) * (max(placement.size) / self.reference)
+        scale = as_positions(torch.tensor(placement.scale, dtype=torch.float64), canvas) * (
+            max(placement.size) / self.reference
+        )
         return View(canvas, placement, self.sensor.open(canvas, scale))
 
     def fit(self, image: Tensor) -> tuple[Tensor, Placement]:
@@ -212,7 +215,7 @@ class Eye(nn.Module):
 
 def _points(fixations: PointLike, view: View) -> Tensor:
     """Fixations as `(F, 2)`; a single point becomes a batch of one."""
-    points = as_points(fixations, "fixations").to(view.canvas)
+    points = as_positions(as_points(fixations, "fixations"), view.canvas)
     points = points[None] if points.ndim == 1 else points
     check_shape(points, "fixations", None, 2)
     return points

@@ -8,6 +8,7 @@ from typing import Any, Self, TypeVar
 import torch
 from torch import Tensor
 
+from semfov.belief.fusion import check_parameters
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
 
@@ -168,6 +169,7 @@ class DirichletBelief(Belief):
 
     def __post_init__(self) -> None:
         if self.closest is None:
+            check_parameters(self.beta)
             object.__setattr__(self, "closest", torch.full_like(self.beta[..., 0], torch.inf))
 
     @classmethod

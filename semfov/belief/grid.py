@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, check_whole, lookup
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
@@ -50,7 +51,7 @@ class Grid:
     def extent(self) -> Tensor:
         """`(width, height)` as a floating-point tensor, `(2,)` or `(B, 2)`."""
         size = torch.as_tensor(self.size)
-        return size if size.is_floating_point() else size.to(torch.get_default_dtype())
+        return as_positions(size) if size.is_floating_point() else size.to(torch.get_default_dtype())
 
     @property
     def centres(self) -> Tensor:
@@ -85,6 +86,7 @@ class Grid:
         """
         check_shape(points, "points", 2)
         check_finite(points, "points")
+        points = as_positions(points)
         step = ((points + 0.5) / self._align(self._cell_size(), points)).floor()
         column = step[..., 0].clamp(0, self.columns - 1).long()
         row = step[..., 1].clamp(0, self.rows - 1).long()
@@ -123,6 +125,7 @@ class Grid:
         check_shape(boxes, "boxes", None, 4)
         check_finite(boxes, "boxes")
         lookup(rule, get_args(Footprint), "footprint rule")
+        boxes = as_positions(boxes)
         full = (boxes[..., 2] > boxes[..., 0]) & (boxes[..., 3] > boxes[..., 1])
         low, high = boxes[..., None, :2], boxes[..., None, 2:]
         if rule == "overlap":
@@ -169,6 +172,7 @@ class Grid:
         check_shape(fixation, "fixation", 2)
         check_finite(boxes, "boxes")
         check_finite(fixation, "fixation")
+        boxes, fixation = as_positions(boxes), as_positions(fixation)
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
         return offset / self.extent.amax(-1)[..., None].to(offset)
@@ -189,6 +193,7 @@ class Grid:
         tensor([0.0000, 0.5000])
         """
         check_shape(fixation, "fixation", 2)
+        fixation = as_positions(fixation)
         offset = self.centres.to(fixation) - fixation[..., None, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1).to(fixation)[..., None]
 

@@ -162,6 +162,15 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
     return torch.from_numpy(array.copy())
 
 
+def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
+    """Positions with the device and precision of a tensor (None: their own), but float32 at least.
+
+    Half precision is off by pixels from 2,048 pixels on, and whole numbers cut the fractions of what is added to them.
+    """
+    base = values if like is None else like
+    return values.to(base.device, torch.promote_types(base.dtype, torch.float32))
+
+
 def _from_numpy(array: NDArray[Any], argument: str) -> Tensor:
     """An array as a tensor; the array may have any order in memory."""
     kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}

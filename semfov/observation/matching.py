@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check_shape
 
 
@@ -10,6 +11,7 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
     """Intersection over union of every pair of boxes, `(M, N)`; 0 for boxes without area."""
     check_shape(boxes, "boxes", None, 4)
     check_shape(others, "others", None, 4)
+    boxes, others = (as_positions(each) for each in (boxes, others))
     low = torch.maximum(boxes[:, None, :2], others[None, :, :2])
     high = torch.minimum(boxes[:, None, 2:], others[None, :, 2:])
     shared = (high - low).clamp(min=0).prod(-1)

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, values_known
 
 
@@ -203,11 +204,12 @@ def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, emp
 
 
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:
-    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as `(B, G, 2)` like the images, and whether they had G."""
+    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as positions `(B, G, 2)` beside the images, and whether they had G."""
     batch = like.shape[0]
     fits = 1 <= gaze.ndim <= 3 and gaze.shape[-1] == 2 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch)
     check(fits, "gaze", f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)", tuple(gaze.shape))
     if values_known(gaze):
         check_finite(gaze, "gaze")
     many = gaze.ndim == 3
-    return (gaze.to(like) if many else gaze.to(like).expand(batch, 2)[:, None]), many
+    points = as_positions(gaze, like)
+    return (points if many else points.expand(batch, 2)[:, None]), many

@@ -6,7 +6,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, is_batch
+from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, as_positions, is_batch
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
@@ -226,7 +226,8 @@ def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tens
     least = torch.finfo(sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
     widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
     offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
-    pieces = offset.square().mul(-0.5).exp().split([n for size in sizes for n in reversed(size)], -1)
+    weights = offset.square().mul(-0.5).exp().to(bands.base.dtype)
+    pieces = weights.split([n for size in sizes for n in reversed(size)], -1)
     return list(zip(pieces[0::2], pieces[1::2], strict=True))
 
 
@@ -250,7 +251,7 @@ def _layout(
 
 def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
     """σ along x and y for every image, `(B, 2)`."""
-    width = torch.as_tensor(sigma).to(like)
+    width = as_positions(torch.as_tensor(sigma), like)
     batch = like.shape[0]
     fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
     check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))

@@ -5,6 +5,7 @@ from typing import Literal, TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
 from semfov.sensor.base import stacked_views
 
@@ -64,7 +65,7 @@ def glimpse(
         check_finite(boxes.detach(), "boxes")
         full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
         check(full, "boxes", "windows with a positive width and height", "an empty window")
-    windows = boxes.to(image) if boxes.ndim == 3 else boxes[:, None].to(image)
+    windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image)
     value = 0.0 if padding_mode == "zeros" else fill_value
 
     def view(b: int, g: int) -> Tensor:
@@ -80,6 +81,7 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
     .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
     """
     check_shape(points, "points", 2)
+    points = as_positions(points)
     return torch.cat(edges_at(points, magnification[..., None], points.new_tensor(size)), -1)
 
 
@@ -97,6 +99,7 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
+    box = as_positions(box)
     low, high = box[:2], box[2:]
     whole = box.new_tensor(picture)
     side = torch.minimum((context * (high - low).amax()).clamp(min=least * max(picture)), whole)
@@ -161,6 +164,7 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
     part = image[:, top:bottom, left:right]
+    across, down = across.to(part), down.to(part)
     if value:
         return down @ (part - value) @ across.mT + value
     return down @ part @ across.mT

@@ -248,9 +248,9 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
     """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
     finest = levels[0]
     size = _size(finest)
-    offset = _places(retina, size, finest.dtype, finest.device)
+    offset = _places(retina, size, fixation.dtype, finest.device)
     # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
-    place = (2 * (fixation[:, :, None, None] + offset) + 1) / finest.new_tensor(size) - 1
+    place = (2 * (fixation[:, :, None, None] + offset) + 1) / fixation.new_tensor(size) - 1
     rings, many = offset.shape[0], fixation.shape[1]
     by_level = []
     for level, first, weight in _shares(retina, size, finest.dtype, finest.device):
@@ -258,8 +258,8 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
             break
         last = first + len(weight)
         where = place[:, :, first:last].flatten(1, 2)
-        responses = F.grid_sample(levels[level], where, "bicubic", "border", align_corners=False)
-        responses = responses.unflatten(2, (many, last - first)) * weight[:, None]
+        responses = F.grid_sample(levels[level].to(where), where, "bicubic", "border", align_corners=False)
+        responses = responses.to(finest).unflatten(2, (many, last - first)) * weight[:, None]
         by_level.append(F.pad(responses, (0, 0, first, rings - last)))
     return torch.stack(by_level).sum(0).transpose(1, 2)
 
@@ -287,8 +287,8 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     whole = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
     whole = torch.cat([whole[..., -1:], whole, whole[..., :2]], -1).flatten(0, 1)
     where = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
-    images = F.grid_sample(whole, where, "bicubic", "border", align_corners=True)
-    return images.unflatten(0, (batch, many))
+    images = F.grid_sample(whole.to(where), where, "bicubic", "border", align_corners=True)
+    return images.to(cortical).unflatten(0, (batch, many))
 
 
 @constant

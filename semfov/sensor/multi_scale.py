@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape, check_whole
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.glimpse import windows_at
@@ -132,19 +133,19 @@ class MultiScaleFovea(Sensor):
         crops = self(means, gaze[None])[0]
         fixation, _ = fixations(gaze, crops)
         windows = self.windows(fixation[:, 0])
-        x, y = (torch.arange(n, dtype=crops.dtype, device=crops.device) + 0.5 for n in size)
+        x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in size)
         picture = crops.new_zeros(len(crops), crops.shape[2], size[1], size[0])
         for scale in reversed(range(self.scales)):
             low, side = windows[:, scale, :2], self.side * 2**scale
             across, down = (2 * (place - low[:, axis, None]) / side - 1 for axis, place in enumerate((x, y)))
             where = torch.stack(torch.broadcast_tensors(across[:, None, :], down[:, :, None]), -1)
-            crop = F.grid_sample(crops[:, scale], where, "bilinear", "border", align_corners=False)
+            crop = F.grid_sample(crops[:, scale].to(where), where, "bilinear", "border", align_corners=False).to(crops)
             picture = torch.where((where.abs() <= 1).all(-1)[:, None], crop, picture)
         return picture
 
     def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
-        windows = self.windows(gaze.to(boxes)).flatten(0, 1)[:, None]
+        windows = self.windows(as_positions(gaze, boxes)).flatten(0, 1)[:, None]
         unit = (windows[..., 2:] - windows[..., :2]).repeat(1, 1, 2) / self.side
         return boxes * unit + windows[..., :2].repeat(1, 1, 2)
 
@@ -182,4 +183,5 @@ class MultiScaleFovea(Sensor):
         x, y = share[..., 0, None, None, None], share[..., 1, None, None, None]
         lines = planes[image, places[1][0]] * (1 - y) + planes[image, places[1][1]] * y
         columns = [each[..., None, None, :].expand(*lines.shape[:-1], self.side) for each in places[0]]
-        return (lines.gather(-1, columns[0]) * (1 - x) + lines.gather(-1, columns[1]) * x).transpose(-3, -2)
+        crop = lines.gather(-1, columns[0]) * (1 - x) + lines.gather(-1, columns[1]) * x
+        return crop.transpose(-3, -2).to(plane.dtype)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape
 from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
@@ -46,7 +47,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     check_shape(pose, "pose", 3)
     fits = pose.ndim in (2, 3) and pose.shape[0] == batch
     check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
-    poses = (pose if pose.ndim == 3 else pose[:, None]).to(panorama)
+    poses = as_positions(pose if pose.ndim == 3 else pose[:, None], panorama)
     source = go_around(even_rows(panorama) if antialias else panorama)
 
     def view(b: int, g: int) -> Tensor:
@@ -100,8 +101,9 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
     points = panorama_points(camera.directions(grid.flatten(0, 1)), (wide, high)).unflatten(0, grid.shape[:2])
     place = (2 * points + 3) / points.new_tensor([wide + 2, high + 2]) - 1
-    view = F.grid_sample(source[None], place[None].to(source), mode="bilinear", align_corners=False)
-    return F.avg_pool2d(view, times)[0] if times > 1 else view[0]
+    place = as_positions(place, source)
+    view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
+    return (F.avg_pool2d(view, times) if times > 1 else view)[0].to(source.dtype)
 
 
 class Perspective(nn.Module):
