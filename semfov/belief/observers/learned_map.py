@@ -135,9 +135,9 @@ class LearnedMap(Gatherer):
     ) -> Tensor:
         """Probabilities `(B, X·Y, T+1)` from the gathered evidence."""
         classes = nearest.shape[1]
-        by_class = (values.flatten(0, 1) for values in (nearest, best, mean))
+        nearest, best, mean = (values.flatten(0, 1) for values in (nearest, best, mean))
         distance, number, seen = (values.repeat_interleave(classes, 0) for values in (closest, looks, visited))
-        rows = Gathered(*by_class, distance, score.flatten(), number, seen, targets.flatten())
+        rows = Gathered(nearest, best, mean, distance, score.flatten(), number, seen, targets.flatten())
         cells = self.model.log_odds(rows, columns, classes)
         nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
         return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)

@@ -103,5 +103,8 @@ class ExpectedGain(AcquisitionFunction):
         belief = own(belief, MapBelief, "belief")
         distance = self.distance.to(belief.closest)
         return one_by_one(
-            lambda *rows: self.model.gain(*rows, distance).sum(-1), belief.probabilities, belief.closest, belief.looks
+            lambda probabilities, closest, looks: self.model.gain(probabilities, closest, looks, distance).sum(-1),
+            belief.probabilities,
+            belief.closest,
+            belief.looks,
         )
