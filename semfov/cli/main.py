@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,31 +20,24 @@ from semfov.version import __version__
 
 @dataclass(frozen=True)
 class _Subcommand:
-    """A subcommand; `run` is the module and the function that it runs, which are imported only then."""
+    """A subcommand: its options (None: those of a fit), its positional argument, and what an interrupt adds."""
 
     options: type[Any] | None
-    run: tuple[str, str]
     positional: tuple[str, str]
     goes_on: str = ""
 
 
-_LOOK = ("semfov.cli.search", "look_at")
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
-_MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
 
 _SUBCOMMANDS: dict[str, _Subcommand] = {
-    "search": _Subcommand(SearchOptions, _LOOK, _PICTURES),
-    "find": _Subcommand(FindOptions, _LOOK, _PICTURES),
-    "explore": _Subcommand(ExploreOptions, _LOOK, _PICTURES),
-    "live": _Subcommand(LiveOptions, ("semfov.cli.live", "look_live"), ("source", "video file, or address")),
-    "fit": _Subcommand(None, ("semfov.fit.detector", "fit_folder"), _MODEL, GOES_ON),
-    "detectors": _Subcommand(
-        DetectorsOptions,
-        ("semfov.cli.detectors", "list_detectors"),
-        ("name", "detector, or folder of models"),
-    ),
+    "search": _Subcommand(SearchOptions, _PICTURES),
+    "find": _Subcommand(FindOptions, _PICTURES),
+    "explore": _Subcommand(ExploreOptions, _PICTURES),
+    "live": _Subcommand(LiveOptions, ("source", "video file, or address")),
+    "fit": _Subcommand(None, ("model", "the detector: a name or a file, as for semfov.load_detector"), GOES_ON),
+    "detectors": _Subcommand(DetectorsOptions, ("name", "detector, or folder of models")),
 }
-"""The subcommands by name. What they need is imported when they run."""
+"""The subcommands by name."""
 
 _LOOKING = "search", "find", "explore", "live"
 
@@ -77,14 +69,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
     names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
-
-    def run(given: Any) -> int | None:
-        module, function = command.run
-        code: int | None = getattr(import_module(module), function)(given)
-        return code
-
     with _plain_warnings(words):
-        return run_command(run, options, texts.HELP[name], rest, words=words, **names)
+        return run_command(partial(_run, name), options, texts.HELP[name], rest, words=words, **names)
+
+
+def _run(name: str, options: Any) -> int | None:
+    """Run a subcommand, whose modules are imported only now."""
+    if name == "live":
+        from semfov.cli.live import look_live
+
+        return look_live(options)
+    if name == "fit":
+        from semfov.fit.detector import fit_folder
+
+        fit_folder(options)
+        return 0
+    if name == "detectors":
+        from semfov.cli.detectors import list_detectors
+
+        return list_detectors(options)
+    from semfov.cli.search import look_at
+
+    return look_at(options)
 
 
 def _unknown(name: str) -> str:
