@@ -20,7 +20,7 @@ from semfov.io.files import replacing
 from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_scanpath
 from semfov.viz.animation import Frame, render
 
-PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+_PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 _PHOTOGRAPH = Path(skimage.__file__).parent / "data" / "coffee.png"  # by Rachel Michetti, CC0
 TARGET, START = "cup", 99
 
@@ -33,7 +33,7 @@ def _make_picture(path: Path) -> None:
     assert isinstance(scanpath, Scanpath)
     views = plot_foveated_strip(scanpath, most=3)
     beliefs = plot_belief_strip(scanpath, most=3)
-    _write_picture(stacked(render([views, beliefs], dpi=105)), path)
+    _write_picture(_stacked(render([views, beliefs], dpi=105)), path)
 
 
 def _make_zoom_picture(path: Path, weights: str | None) -> None:
@@ -53,7 +53,7 @@ def _write_picture(frame: Frame, path: Path) -> None:
         image.quantize(palette=image.quantize(256, kmeans=3)).save(temporary, format="PNG", optimize=True)
 
 
-def stacked(frames: list[Frame]) -> Frame:
+def _stacked(frames: list[Frame]) -> Frame:
     """Stack frames vertically on a white background."""
     width = max(frame.shape[1] for frame in frames)
     pads = [((0, 0), (0, width - frame.shape[1]), (0, 0)) for frame in frames]
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--weights", help="ONNX file of YOLOX-nano (none: the registered weights)")
     parser.add_argument("--out", type=Path, help="file to write (none: the picture's file in docs/pictures)")
     options = parser.parse_args(arguments)
-    path = options.out or PICTURES / ("zoom.png" if options.zoom else "search.png")
+    path = options.out or _PICTURES / ("zoom.png" if options.zoom else "search.png")
     if options.zoom:
         _make_zoom_picture(path, options.weights)
     else:

@@ -118,17 +118,17 @@ def _page_table(line: str, runs: Runs) -> _PageTable:
     """The table that a comment names: of several experiments, of a study, or of one experiment."""
     if line in STUDIES:
         return _PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
-    if line in WHOLE:
-        return WHOLE[line]
+    if line in _WHOLE:
+        return _WHOLE[line]
     name, _, kind = line.partition(" ")
-    lookup(name, [*runs, *STUDIES, *WHOLE], "experiment")
+    lookup(name, [*runs, *STUDIES, *_WHOLE], "experiment")
     make = _TABLES[lookup(kind, _TABLES, "table")]
     return _PageTable((name,), lambda runs: make(runs[name].out))
 
 
 _SEARCHES, _EXPLORATIONS = (tuple(published(kind).values()) for kind in ("search", "explore"))
 
-WHOLE = {
+_WHOLE = {
     "paper": _PageTable(_SEARCHES, beside_paper),
     "findings": _PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
     "verdicts": _PageTable(AT_THRESHOLDS, verdicts),

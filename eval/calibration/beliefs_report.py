@@ -20,7 +20,7 @@ from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.tables import csv_text, table
 from semfov.viz.style import save_figure
 
-Sums = dict[tuple[str, int, str], BinarySums]
+_Sums = dict[tuple[str, int, str], BinarySums]
 """Sums over predictions by belief, number of looks, and group of cells."""
 
 _HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
@@ -39,13 +39,13 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     groups = (
         f"distance from the closest fixation, as a fraction of the longer side, after {_judged_after(sums)[-1]} looks"
     )
-    figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
+    figure = save_figure(plot_cell_reliability(*_curves(sums), groups=groups), run.config.out / "beliefs.png")
     return text, [*written, figure]
 
 
-def _add_up(records: Iterable[ResultRecord]) -> Sums:
+def _add_up(records: Iterable[ResultRecord]) -> _Sums:
     """Add up the sums of all searches."""
-    sums: Sums = defaultdict(BinarySums.nothing)
+    sums: _Sums = defaultdict(BinarySums.nothing)
     for record in records:
         for belief, measures in record["beliefs"].items():
             for looks, groups in measures["looks"].items():
@@ -54,20 +54,20 @@ def _add_up(records: Iterable[ResultRecord]) -> Sums:
     return dict(sums)
 
 
-def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
+def _pooled(sums: _Sums, belief: str, looks: int) -> BinarySums:
     """Sums over all cells, whatever their group."""
     return sum(
         (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), BinarySums.nothing()
     )
 
 
-def _beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCalibrationRun) -> str:
+def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCalibrationRun) -> str:
     """The tables, as Markdown."""
     beliefs = list(run.observers)
     there = sum(record["present"] for record in records)
     by_looks = [["looks", "belief", "cells", *_HEAD]]
     for looks in _judged_after(sums):
-        rows = [(belief, pooled(sums, belief, looks)) for belief in beliefs]
+        rows = [(belief, _pooled(sums, belief, looks)) for belief in beliefs]
         by_looks += [[str(looks), belief, str(each.count), *_measures_row(each)] for belief, each in rows]
     last = _judged_after(sums)[-1]
     by_distance = [["distance", "belief", "cells", *_HEAD]]
@@ -82,7 +82,7 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCal
             f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
             "classes are present, so its probabilities are expected to be too low."
         )
-    every = pooled(sums, beliefs[0], last)
+    every = _pooled(sums, beliefs[0], last)
     alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
     return "\n".join(
         [
@@ -107,7 +107,7 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCal
     )
 
 
-def _judged_after(sums: Sums) -> list[int]:
+def _judged_after(sums: _Sums) -> list[int]:
     """The numbers of looks for which there are sums."""
     return sorted({looks for _, looks, _ in sums})
 
@@ -126,7 +126,7 @@ def _landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
     ]
 
 
-def _beliefs_csv(sums: Sums) -> str:
+def _beliefs_csv(sums: _Sums) -> str:
     """All measures as CSV: a row for each belief, number of looks and group of cells."""
     rows: list[list[object]] = [
         ["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"]
@@ -137,7 +137,7 @@ def _beliefs_csv(sums: Sums) -> str:
     return csv_text(rows)
 
 
-def _beliefs_json(sums: Sums) -> str:
+def _beliefs_json(sums: _Sums) -> str:
     """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
     entries = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
@@ -146,21 +146,21 @@ def _beliefs_json(sums: Sums) -> str:
     return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
 
 
-def _sums_by_name(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
     """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
-        yield belief, looks, "all", pooled(sums, belief, looks)
+        yield belief, looks, "all", _pooled(sums, belief, looks)
         for group in CELL_GROUPS:
             if (belief, looks, group) in sums:
                 yield belief, looks, group, sums[belief, looks, group]
 
 
-def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
+def _curves(sums: _Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
     """The arguments of `plot_cell_reliability`."""
     beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), _judged_after(sums)
     panels = {
         f"after {looks} looks" if looks > 1 else "after 1 look": {
-            belief: pooled(sums, belief, looks).bins for belief in beliefs
+            belief: _pooled(sums, belief, looks).bins for belief in beliefs
         }
         for looks in numbers
     }

@@ -37,7 +37,7 @@ def with_models(config: _Config) -> _Config:
     policies = tuple(_recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
     chosen = []
     for policy in policies:
-        missing = next((part for part in needs(policy, config) if files[part] is None), None)
+        missing = next((part for part in _needs(policy, config) if files[part] is None), None)
         if missing is None:
             chosen.append(policy)
         elif named:
@@ -82,7 +82,7 @@ def _recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
     )
 
 
-def needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
+def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:

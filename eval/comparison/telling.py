@@ -61,7 +61,7 @@ class Telling:
         places = torch.stack([self.places.get(name, nowhere).double() for name in by_name])
 
         def measure(index: Tensor) -> Tensor:
-            figures = torch.tensor([tells(score[index], there[index]) for score in scores], dtype=torch.float64)
+            figures = torch.tensor([_tells(score[index], there[index]) for score in scores], dtype=torch.float64)
             return torch.cat([figures, places[:, index].nanmean(1, keepdim=True)], 1)
 
         self.figures = Bootstrap.of(measure, scenes)
@@ -99,7 +99,7 @@ class Telling:
         return table(rows)
 
 
-def tells(score: Tensor, there: Tensor) -> list[float]:
+def _tells(score: Tensor, there: Tensor) -> list[float]:
     """Area under the ROC curve, and hit rates at the false alarm rates `_SHARES`; NaN if all or none are present."""
     if not there.any() or there.all():
         return [torch.nan] * (1 + len(_SHARES))

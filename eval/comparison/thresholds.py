@@ -104,7 +104,7 @@ class _ThresholdLooking(Looking):
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Look at a scene from every cell, and store the looks that are missing; there are no records."""
         digest, grid = self.digest(index), self.grid(index)
-        missing = [number for number, store in enumerate(self.stores) if not holds(store, digest, len(grid))]
+        missing = [number for number, store in enumerate(self.stores) if not _holds(store, digest, len(grid))]
         if missing:
             with one_thread(), torch.inference_mode():
                 image = self.scenes[index].image[None]
@@ -117,7 +117,7 @@ class _ThresholdLooking(Looking):
         return [], {}
 
 
-def holds(store: DetectionStore, digest: str, cells: int) -> bool:
+def _holds(store: DetectionStore, digest: str, cells: int) -> bool:
     """Whether a store holds the looks at a scene from all cells."""
     looks = store.load(digest)
     return all(cell in looks for cell in range(cells))

@@ -40,7 +40,7 @@ _GUIDED = (
 )
 """Searches with saliency as a prior over the cells."""
 
-PUBLISHED = (
+_PUBLISHED = (
     "random",
     "non-predictive-raw",
     "predictive-raw",
@@ -113,9 +113,9 @@ _EXPECTED_EXPLORATION = tuple(
 Experiment = RunConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
 
-Changes = dict[str, dict[str, object]]
+_Changes = dict[str, dict[str, object]]
 
-_SENSITIVITY: dict[str, Changes] = {
+_SENSITIVITY: dict[str, _Changes] = {
     "as published": {},
     "OpenCV's pyramid": {"sensor": {"convention": "opencv"}},
     "growth 2": {"sensor": {"growth": 2.0}},
@@ -136,19 +136,19 @@ _SENSITIVITY: dict[str, Changes] = {
 }
 """Variations of non-predictive search with raw scores; each changes one setting."""
 
-_SENSORS: dict[str, Changes] = {
+_SENSORS: dict[str, _Changes] = {
     f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
     for sigma in (50, 100, 200)
     for growth in (1, 2)
 }
 """Variations of the sensor."""
 
-_WEIGHTS: dict[str, Changes] = {
+_WEIGHTS: dict[str, _Changes] = {
     f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
 }
 """Variations of the weight of a saliency map as a prior."""
 
-_VIEWS: dict[str, Changes] = {
+_VIEWS: dict[str, _Changes] = {
     "foveated view, as published": {"saliency": {"view": "foveated"}},
     "whole photograph, once": {"saliency": {"view": "picture"}},
 }
@@ -159,7 +159,7 @@ _VIEWS: dict[str, Changes] = {
 class _Study:
     """Runs on photographs of the fit set with different settings; a table row is a setting and a policy."""
 
-    settings: dict[str, Changes]
+    settings: dict[str, _Changes]
     policies: tuple[PolicyChoice, ...]
     explores: bool = False
     shifts: tuple[int, ...] = (1, 5, 15, 30)
@@ -246,7 +246,7 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
         for fovea in FOVEAE:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
-            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
+            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=_PUBLISHED)
             yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=_PUBLISHED_EXPLORATION)
         few = {**common, "data": replace(data, limit=min(config.few, config.limit or config.few))}
         yield from _thresholds(name, settings, few)
@@ -292,7 +292,7 @@ def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> 
     for threshold in SCORE_THRESHOLDS:
         # Without a name, the observation model is the one that was fitted at the threshold.
         own = {**common, "detector": replace(settings, threshold=threshold), "sensor": sensor}
-        seek = SearchConfig(**own, policies=tuple(p for p in PUBLISHED if p != "vocus2"))
+        seek = SearchConfig(**own, policies=tuple(p for p in _PUBLISHED if p != "vocus2"))
         tour = ExploreConfig(**own, policies=_PUBLISHED_EXPLORATION[:4])
         yield at_threshold("search", threshold, name), seek
         yield at_threshold("explore", threshold, name), tour

@@ -48,7 +48,7 @@ PAGE_FIGURES = {
 Panel = tuple[dict[str, FloatArray], dict[str, FloatArray]]
 """Curves in [0, 1] by their names, and their standard errors."""
 
-LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
+_LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
 
 
 THRESHOLD_FIGURE = "thresholds"
@@ -73,7 +73,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
         if missing(published(figure.kind).values(), runs):
             continue
         panels = {title: panel(folder, figure) for title, folder in published_columns(figure.kind, runs).items()}
-        drawn = plot_curve_panels(panels, label=LABELS[figure.kind])
+        drawn = plot_curve_panels(panels, label=_LABELS[figure.kind])
         written.append(save_figure(drawn, folder / f"{name}.png"))
     return written
 

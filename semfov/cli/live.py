@@ -42,7 +42,7 @@ def look_live(options: LiveOptions) -> int:
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
     running = agent.live(_sought(options, agent.classes[1:]), start=first, **settings)
-    written = watch(running, stream, options.out)
+    written = _watch(running, stream, options.out)
     if written is not None:
         print(f"written:\n  {written}")
     return 0
@@ -53,7 +53,7 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
     return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
 
 
-def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
+def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
     """Look at every frame, print detections and belief until Ctrl-C, and return the path of the video, if any."""
     if path is not None:
         path = path if path.suffix and not path.is_dir() else path / f"live{video_suffix()}"

@@ -29,9 +29,9 @@ class _SearchJob(PictureJob):
         super().__init__(options)
         self.start = _check(options)
         classes = detector_classes(options)
-        weights = None if classes is None else meant(options, classes)
+        weights = None if classes is None else _meant(options, classes)
         self.agent = make_agent(options)
-        self.weights = meant(options, self.agent.classes[1:]) if weights is None else weights
+        self.weights = _meant(options, self.agent.classes[1:]) if weights is None else weights
         self.target = next(iter(self.weights))
         self.title = f"search for “{self.target}”"
 
@@ -116,7 +116,7 @@ def _check(options: PictureOptions) -> Any:
     return start_of(options.start)
 
 
-def meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
+def _meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
     """The classes that a target may mean, each with a weight, the most likely first."""
     target = options.target or ""
     try:

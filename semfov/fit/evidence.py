@@ -167,7 +167,7 @@ def _train_evidence(
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
-        for step in searches(model, chosen, grid, config.looks, astray, generator):
+        for step in _searches(model, chosen, grid, config.looks, astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + evidence_objective(config, step, chosen.goal)
         return loss
@@ -176,7 +176,7 @@ def _train_evidence(
     return model.eval()
 
 
-def searches(
+def _searches(
     model: TargetEvidence, examples: _TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
     """Search every example; see `example_episodes`."""
@@ -232,7 +232,7 @@ def _judge_evidence(
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*_JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []
-    for step in searches(model, examples, grid, looks, 0.0, generator):
+    for step in _searches(model, examples, grid, looks, 0.0, generator):
         assert isinstance(step.belief, TargetBelief)
         present.append(step.belief.present)
         anywhere.append(step.belief.anywhere)

@@ -75,12 +75,12 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
     samples = sampler.all()
     model = make_observation(None, cast(Eye, sampler.eye)) if config.calibrated else None
-    hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
+    hits = {tempering: _measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = _tempering_report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
-def measure(
+def _measure(
     config: FitTemperingConfig,
     sampler: Sampler,
     samples: Samples,

@@ -21,7 +21,7 @@ from semfov.runs.presets import TARGET_EVIDENCE, resolve
 from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,11 @@ def make_strategy(
     return Strategy(observer, chosen)
 
 
-def _of(own: T | None, common: T) -> T:
+def _of(own: _T | None, common: _T) -> _T:
     return common if own is None else own
 
 
-def _required(model: T | None, argument: str, expected: str) -> T:
+def _required(model: _T | None, argument: str, expected: str) -> _T:
     if model is None:
         raise InputError(f"{argument}: expected {expected}, got none")
     return model

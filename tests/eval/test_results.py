@@ -19,7 +19,7 @@ from eval.page.findings import _BASELINES, _FINDINGS, COUNTED, TESTED, VERDICTS,
 from eval.page.origin import missing, origin
 from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
-from eval.results import _PLACE, WHOLE, _fill_page, _page_table, results
+from eval.results import _PLACE, _WHOLE, _fill_page, _page_table, results
 from eval.search.run import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.presets import label
@@ -133,7 +133,7 @@ def test_tables_of_runs_are_renewed_and_the_rest_of_the_page_stays(searched):
 
 
 def test_a_table_of_several_experiments_waits_for_all_of_them(runs):
-    for made in WHOLE.values():
+    for made in _WHOLE.values():
         assert missing(made.made_of, runs) == list(made.made_of) != []
     study = _page_table("sensitivity", runs).made_of
     for name in study[1:]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
-from eval.calibration.beliefs_report import _add_up, _landing_table, curves, pooled, write_belief_report
+from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
 from eval.search.run import SearchConfig
 from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
@@ -190,10 +190,10 @@ def test_searches_add_up_by_belief_looks_and_group():
         ("a", 1, CELL_GROUPS[1]): 1,
         ("a", 1, CELL_GROUPS[2]): 1,
     }
-    every = pooled(sums, "a", 1)
+    every = _pooled(sums, "a", 1)
     assert (every.count, every.rate) == (5, 0.4)
     assert every.brier == pytest.approx((0.01 + 0.04 + 0.25 + 0.09 + 0.01) / 5)
-    panels, errors = curves(sums)
+    panels, errors = _curves(sums)
     assert torch.equal(panels["after 1 look"]["a"], every.bins)
     assert errors == {"a": {group: sums["a", 1, group].ece for group in CELL_GROUPS[:3]}}
     means = ["3", "0.250 → 0.625"]

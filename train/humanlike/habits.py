@@ -21,8 +21,8 @@ EDGES = (0.05, 0.11, 0.16, 0.22, 0.3, 0.4, 0.55)
 AGES = (1.0, 2.0, 3.0, 6.0)
 """Upper limits of the age bins of inhibition of return, in fixations. The last bin has no limit."""
 
-Term = Literal["policy", "centre", "steps", "return"]
-_ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
+_Term = Literal["policy", "centre", "steps", "return"]
+_ORDER: tuple[_Term, ...] = ("policy", "centre", "steps", "return")
 """Terms in the order in which they are added."""
 
 
@@ -74,7 +74,7 @@ class FittedTerms:
     """
 
     policy: str | None
-    terms: tuple[Term, ...]
+    terms: tuple[_Term, ...]
     weights: Tensor
     fitted: float
     even: float
@@ -103,7 +103,7 @@ def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[FittedTe
     return fits
 
 
-def _features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[Term, ...]) -> Tensor:
+def _features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[_Term, ...]) -> Tensor:
     """Compute the features of every cell for every choice."""
     shape = len(choices), len(halves.grid)
     columns = []
@@ -138,11 +138,11 @@ def _mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
     return torch.zeros(len(count), dtype=values.dtype).index_add(0, number, values) / count
 
 
-def _fit(halves: Halves, policy: str | None, terms: tuple[Term, ...], ridge: float) -> Tensor:
+def _fit(halves: Halves, policy: str | None, terms: tuple[_Term, ...], ridge: float) -> Tensor:
     return fit_log_linear(_features_of(halves.fitted, halves, policy, terms), halves.fitted.next_cell, ridge=ridge)
 
 
-def _bits(halves: Halves, policy: str | None, terms: tuple[Term, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
+def _bits(halves: Halves, policy: str | None, terms: tuple[_Term, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the information gain of every choice over a uniform one, in bits, for both halves."""
     bits = []
     for choices in (halves.fitted, halves.held_out):
