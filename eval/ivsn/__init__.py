@@ -2,7 +2,7 @@
 
     python -m eval.ivsn --data.root val2017 --data.annotations instances_val2017.json --out runs/ivsn
 
-The detector must give access to its features. Templates of YOLOv3-tiny are here; `python -m train.fit_templates` fits
+The detector must give access to its features. Templates of YOLOv3-tiny are here; `python -m eval.ivsn.fit` fits
 others. Without arguments the command searches the embedded scenes. It has all settings of `eval.search`.
 """
 

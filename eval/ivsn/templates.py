@@ -24,7 +24,7 @@ class ClassTemplates(PretrainedForEye):
     φ are a detector's features before its first head, :math:`\bar\phi_k` is the mean of :math:`\hat\phi` at the centres
     of objects of class k, and μ its mean over all positions. IVSN (Zhang, Feng, Ma, Lim, Zhao and Kreiman, 2018)
     correlates the features of a search image with those of a picture of the target. Here the average object of the
-    class takes the place of that picture, and the network is the detector that searches. `train.fit_templates` fits the
+    class takes the place of that picture, and the network is the detector that searches. `eval.ivsn.fit` fits the
     templates.
 
     Args:

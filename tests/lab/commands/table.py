@@ -210,8 +210,8 @@ COMMANDS = {
         files=("hits.json", "report.md"),
         parts="cache/samples/*/*.safetensors",
     ),
-    "train.fit_templates": Command(workers=False),
-    "train.fit_humanlike": Command(
+    "eval.ivsn.fit": Command(workers=False),
+    "eval.human habits": Command(
         settings=(*NETWORK, *GRID, "--root", "HERE/people", "--fixations", "HERE/people.json",
                   "--policies", "[closer-look-raw, vocus2-raw]"),
         files=(MODEL, "bits.json", "report.md"),

@@ -7,13 +7,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eval.human.habits.gaze_habits import GazeHabits, Habitual, standardised
 from semfov import Detections, Grid, rollout
 from semfov.belief.observers import Semantic
 from semfov.episode import StoredLooks
 from semfov.errors import InputError
 from semfov.gaze import acquisition
 from semfov.gaze.choice import drawn_by
-from train.humanlike.gaze_habits import GazeHabits, Habitual, standardised
 
 GRID = Grid(4, 3, (80, 60))
 EDGES, AGES = (0.1, 0.3, 0.6), (1.0, 3.0)

@@ -6,8 +6,8 @@ import torch
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from eval.human.habits.log_linear import fit_log_linear, log_probability
 from semfov.errors import DataError, InputError
-from train.humanlike.log_linear import fit_log_linear, log_probability
 
 
 def draw(count=400, alternatives=6, features=4, seed=0, dtype=torch.float64):

@@ -1,4 +1,4 @@
-"""`python -m train.fit_templates`: its sums against loops, and templates of embedded scenes used in a search."""
+"""`python -m eval.ivsn.fit`: its sums against loops, and templates of embedded scenes used in a search."""
 
 import json
 
@@ -6,14 +6,13 @@ import pytest
 import torch
 
 from eval.ivsn import main as search
+from eval.ivsn.fit import _objects_of, _TemplateSums, main
 from eval.ivsn.templates import ClassTemplates
 from semfov import EmbeddedScenes, load_detector
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _yolov3_tiny
 from semfov.errors import InputError
 from tests.small import Fixed
-from train.fit_templates import main
-from train.templates import _objects_of, _TemplateSums
 
 
 def test_features_are_the_input_of_the_last_convolution():

@@ -11,6 +11,9 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from eval.human.habits.gaze_habits import GazeHabits
+from eval.human.habits.habits import AGES, EDGES, FittedTerms, Halves, fit_terms, habits_of
+from eval.human.habits.viewings import Choices, choices_in, fixated_cells, values_in
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture, read_osie
 from semfov.data.pictures import Pictures
@@ -28,13 +31,10 @@ from semfov.runs.presets import label
 from semfov.runs.settings import Count, Positive
 from semfov.runs.setup import prepare_worker
 from semfov.runs.tables import table
-from train.humanlike.gaze_habits import GazeHabits
-from train.humanlike.habits import AGES, EDGES, FittedTerms, Halves, fit_terms, habits_of
-from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 
 @dataclass(frozen=True)
-class FitHumanlikeConfig(FitConfig):
+class HabitsConfig(FitConfig):
     """Fit a model of how people choose their next fixation.
 
     Args:
@@ -63,10 +63,10 @@ class FitHumanlikeConfig(FitConfig):
     limit: Count | None = None
     ridge: Positive = 1.0
     smoothing: Positive = 1.0
-    out: Path = Path("runs/fit_humanlike")
+    out: Path = Path("runs/habits")
 
 
-def fit_humanlike(config: FitHumanlikeConfig) -> None:
+def fit_habits(config: HabitsConfig) -> None:
     """Gather people's choices, fit half of the people on half of the pictures, and evaluate on the others."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     prepare_worker()
@@ -84,12 +84,12 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
     path = model_path(config, eye.detector.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     habits.save(path)
-    text = _humanlike_report(halves, [model for several in models.values() for model in several], habits)
+    text = _habits_report(halves, [model for several in models.values() for model in several], habits)
     figures = [model.figures() for several in models.values() for model in several]
     write_outputs(config, text, ("bits.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
-def _gather_choices(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
+def _gather_choices(config: HabitsConfig) -> tuple[Choices, tuple[int, int], Eye]:
     """Gather people's choices with the value that every policy gives to each cell."""
     people = by_picture(read_osie(config.fixations))
     viewing = Viewing(config, list(people)[: config.limit])
@@ -105,7 +105,7 @@ class Viewing(PolicyLooking):
 
     task: Task = "exploration"
 
-    def __init__(self, config: FitHumanlikeConfig, names: list[str]) -> None:
+    def __init__(self, config: HabitsConfig, names: list[str]) -> None:
         self._fit, self._names = config, names
         shared = (each.name for each in fields(RunConfig) if hasattr(config, each.name))
         super().__init__(RunConfig(**{name: getattr(config, name) for name in shared}))
@@ -143,7 +143,7 @@ class Viewing(PolicyLooking):
 _TERMS = {"policy": "policy", "centre": "centre bias", "steps": "saccade length", "return": "return"}
 
 
-def _humanlike_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
+def _habits_report(halves: Halves, models: Sequence[FittedTerms], habits: GazeHabits) -> str:
     """Write the report as Markdown."""
     sizes = halves.sizes
     rows = [

@@ -23,7 +23,7 @@ class GazeHabits(Pretrained):
     centre bias, and s a table over the length of the saccade. r is a table over the age of a cell, the number of
     fixations since it was last fixated at fixation l(x): a negative entry keeps the gaze from returning, and a positive
     one attracts it. This is inhibition of return that fades. There is no other inhibition: the gaze may stay, and may
-    return. `train.fit_humanlike` fits all parameters to people's next fixations.
+    return. `python -m eval.human habits` fits all parameters to people's next fixations.
 
     Args:
         pull: b, inverse temperature of the choice.

@@ -1,4 +1,4 @@
-"""`python -m train.fit_humanlike`: people's choices against loops, recovered habits, and a run."""
+"""`python -m eval.human habits`: people's choices against loops, recovered habits, and a run."""
 
 import json
 import math
@@ -10,6 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from eval.human import main
+from eval.human.habits.gaze_habits import GazeHabits, Habitual
+from eval.human.habits.habits import _ORDER, AGES, EDGES, Halves, fit_terms, habits_of
+from eval.human.habits.viewings import Choices, choices_in, fixated_cells, values_in
 from semfov import Detections, Grid, rollout
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
@@ -20,10 +24,6 @@ from semfov.gaze import acquisition
 from semfov.gaze.acquisition import NegativeEntropy
 from semfov.gaze.choice import drawn_by
 from semfov.observation.foveal import FovealObservationModel
-from train.fit_humanlike import main
-from train.humanlike.gaze_habits import GazeHabits, Habitual
-from train.humanlike.habits import _ORDER, AGES, EDGES, Halves, fit_terms, habits_of
-from train.humanlike.viewings import Choices, choices_in, fixated_cells, values_in
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -154,7 +154,7 @@ def write_viewing(folder, pictures=4, subjects=4):
 def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
     given = write_viewing(tmp_path)
     small = ["--belief.columns", "4", "--belief.rows", "3", "--policies", "[kl-raw,vocus2-raw]"]
-    assert main([*given, *small, "--out", str(tmp_path / "out")]) == 0
+    assert main(["habits", *given, *small, "--out", str(tmp_path / "out")]) == 0
     habits = GazeHabits.from_pretrained(tmp_path / "out/yolov3-tiny.safetensors")
     assert len(habits.place) == 12
     assert habits.metadata["policy"] in ("kl-raw", "vocus2-raw")
@@ -168,7 +168,7 @@ def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
     # With few fixations the penalty on the weights matters, but no term lowers the fit of the fitted half.
     for rows in (figures[:3], figures[3:7], figures[7:]):
         assert all(more["fitted"] >= less["fitted"] - 0.1 for less, more in pairwise(rows))
-    assert main([*given, *small, "--save", "kl-rw", "--out", str(tmp_path / "out")]) == 1
+    assert main(["habits", *given, *small, "--save", "kl-rw", "--out", str(tmp_path / "out")]) == 1
     assert "did you mean 'kl-raw'" in capsys.readouterr().err
 
 
@@ -177,5 +177,5 @@ def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
 def test_pictures_of_another_size_are_refused(tmp_path, capsys):
     given = write_viewing(tmp_path, pictures=2)
     Image.new("RGB", (640, 480)).save(tmp_path / "1.png")
-    assert main([*given, "--policies", "[vocus2-raw]", "--out", str(tmp_path / "out")]) == 1
+    assert main(["habits", *given, "--policies", "[vocus2-raw]", "--out", str(tmp_path / "out")]) == 1
     assert "expected all pictures to have 800 × 600 pixels, got another size for 1.png" in capsys.readouterr().err

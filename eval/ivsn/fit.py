@@ -1,8 +1,16 @@
-"""Fit class templates: the mean features of the objects of every class."""
+"""Fit class templates: `python -m eval.ivsn.fit` averages a detector's features over the objects of each class.
+
+    python -m eval.ivsn.fit --data.root DIR --data.annotations instances.json --out runs/fit_templates
+
+Every photograph is passed through the detector once, without foveation, and the features at the centres of the
+annotated objects are averaged. The folder `out` gets the model and a report on held-out photographs; use the model with
+`python -m eval.ivsn --templates FILE`. Without photographs, the command uses the embedded scenes.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +26,7 @@ from semfov.detection.detector import Detector
 from semfov.errors import DataError
 from semfov.fit.outputs import model_path, training_of, write_outputs
 from semfov.fit.settings import FitConfig
+from semfov.runs.command import command
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker
 from semfov.runs.tables import table
@@ -142,3 +151,9 @@ def _areas_under_roc(model: ClassTemplates, detector: Detector, scenes: Scenes, 
             more = (held[:, None] > others).double() + 0.5 * (held[:, None] == others).double()
             areas.append(float(more.mean()))
     return areas
+
+
+main = command(fit_templates, FitTemplatesConfig, __doc__)
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -9,12 +9,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from eval.human.habits.gaze_habits import GazeHabits, age_bins, standardised, step_bins
+from eval.human.habits.log_linear import fit_log_linear, log_probability
+from eval.human.habits.viewings import Choices
 from semfov.belief.grid import Grid
 from semfov.errors import DataError
 from semfov.metrics.averages import standard_error
-from train.humanlike.gaze_habits import GazeHabits, age_bins, standardised, step_bins
-from train.humanlike.log_linear import fit_log_linear, log_probability
-from train.humanlike.viewings import Choices
 
 EDGES = (0.05, 0.11, 0.16, 0.22, 0.3, 0.4, 0.55)
 """Borders of the bins of saccade length, in units of the image's longer side. The first bin is the cell itself."""
