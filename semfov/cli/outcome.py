@@ -80,5 +80,6 @@ def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[D
     with tempfile.TemporaryDirectory() as folder:
         drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
         if "animation" in drawings:
-            drawn += record.animate(boxes=boxes).save(Path(folder) / "animation.gif")
+            film: Any = record.animate(boxes=boxes)
+            drawn += film.save(Path(folder) / "animation.gif")
         return {path.name: path.read_bytes() for path in drawn}
