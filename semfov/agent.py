@@ -1,6 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
@@ -336,7 +336,9 @@ class ActivePerception(nn.Module):
         """
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        foveal = start is not None or boxes is not None or (not isinstance(target, str | int) and len(target) > 1)
+        # Class numbers may be those of NumPy or a tensor, which have no length.
+        targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
+        foveal = start is not None or boxes is not None or len(targets) > 1
         opened, kind, limits = self._begin(
             picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
         )
@@ -354,7 +356,6 @@ class ActivePerception(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
             )
-        targets = [target] if isinstance(target, str | int) else list(target)
         check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
               target)  # fmt: skip
         arguments = without_none(confirm=confirm, give_up=give_up, **limits)
@@ -499,7 +500,9 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(self.eye.detector, self._photograph(picture, color)[0], source=source)
+        return GazePrediction.of(
+            self.eye.detector, open_picture(picture, color).image(self.eye.sensor.like)[0], source=source
+        )
 
     def live(
         self,

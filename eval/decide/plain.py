@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from semfov.runs.results import ResultRecord
 from torch import Tensor
 
 from semfov.belief.grid import Grid
@@ -15,6 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.eye import Eye
 from semfov.fit.windows_certainty import logistic_regression
 from semfov.observation.matching import box_iou
+from semfov.runs.scene_run import ResultRecord
 
 PLAIN = {
     "one unfoveated pass": 0,

@@ -69,7 +69,7 @@ def _objects_lines(record: GazeRecord) -> list[str]:
 def _box_text(box: Sequence[float]) -> str:
     """Corners of a box in whole pixels.
 
-    >>> box_text((380.2, 190.0, 443.9, 276.4))
+    >>> _box_text((380.2, 190.0, 443.9, 276.4))
     '380,190–444,276'
     """
     x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)

@@ -10,7 +10,7 @@ from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.windows import action_of
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.exploration_protocol import explore_noise
-from semfov.runs.search_protocol import Episode, tie_noise
+from semfov.runs.search_protocol import Trial, tie_noise
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 
@@ -42,10 +42,10 @@ class PolicyAgent:
         """The next cell of the episode in a row, by its own scene and target."""
         gazes, scenery, episode = self.gazes, self.gazes.scenery, self.gazes.episodes[int(row)]
         grid, candidate = scenery.grid(episode.scene), scenery._looking.candidate(scenery.policy, episode.scene)
-        targets = gazes.targets[row] if isinstance(episode, Episode) else None
+        targets = gazes.targets[row] if isinstance(episode, Trial) else None
         visited = gazes.memory.visited[row]
         values = candidate.acquisition(targets, grid, gazes.cell[row])(gazes.belief[row], visited)
-        draw = tie_noise if isinstance(episode, Episode) else explore_noise
+        draw = tie_noise if isinstance(episode, Trial) else explore_noise
         noise = draw(scenery._data, episode, len(grid), scenery.protocol)
         # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.
         noise = noise[min(int(gazes.shift[row]), scenery.shifts)]
@@ -93,7 +93,7 @@ def run_agent(envs: GazeVectorEnv, agent, episodes):
                 each.cells.append(int(actions[row]))
                 each.results.append(float(infos["result"][row]))
                 each.over = bool(terminated[row] or truncated[row])
-                if terminated[row] and isinstance(part[row], Episode):
+                if terminated[row] and isinstance(part[row], Trial):
                     each.found_at = len(each.cells) - 1
         done += ran[: len(episodes) - first]
     return done

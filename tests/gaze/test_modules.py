@@ -62,15 +62,7 @@ for name, make in functions(2, model, rand(len(GRID))).items():
     (tester,) = made = make_testers(AcquisitionTester, {name: make})
     made[tester].autocast = AUTOCAST.get(name, AcquisitionTester.autocast)
     globals().update(made)
-globals().update(
-    make_testers(
-        AcquisitionTester,
-        {
-            "EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID),
-            "TemplateAttention": lambda: acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID),
-        },
-    )
-)
+globals().update(make_testers(AcquisitionTester, {"EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID)}))
 
 
 class TestCorrectLocalisation(AcquisitionTester, TensorTester):
@@ -120,6 +112,9 @@ for kind in (each for each in policies.POLICIES.values() if each.__module__.star
     if kind not in (policies.IdealObserver, policies.SaliencyMaximum) and not kind.needs_map:
         made = {kind.__name__: lambda kind=kind: kind.make(policies.Means(model().requires_grad_(False)))}
         globals().update(make_testers(PolicyTester, made))
+
+
+globals().update(make_testers(PolicyTester, {"SaliencyMaximum": lambda: policies.SaliencyMaximum(rand(len(GRID)))}))
 
 
 class TestGain(PolicyTester):

@@ -94,7 +94,8 @@ def test_a_similar_name_is_suggested(name, task, meant):
 
 
 def test_every_policy_class_is_public():
-    for name, kind in POLICIES.items():
+    for name in OWN:
+        kind = POLICIES[name]
         assert kind.name == name
         assert getattr(policies, kind.__name__) is kind
         assert kind.__name__ in policies.__all__
