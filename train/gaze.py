@@ -26,6 +26,7 @@ from semfov.fit.gaze import (
     folds,
     log_centre,
     maps_of,
+    people_score,
     score,
     summary_of,
     viewed,
@@ -101,7 +102,8 @@ def fit_gaze(config: FitGazeConfig) -> None:
     describe_viewing(model, groups)
     settings = {name: value for name, value in config.plain().items() if name not in _ELSEWHERE}
     people = {"pictures": sum(map(len, groups)), "scanpaths": sum(len(p) for group in groups for p in group.paths)}
-    model.metadata |= {"detector": detector.settings(), "data": fingerprints, "training": settings | people}
+    known = {name: detector.settings()[name] for name in ("name", "digest", "input_size", "stretch")}
+    model.metadata |= {"detector": known, "data": fingerprints, "training": settings | people}
     path = inside(config.out, f"{config.name or detector.name}.safetensors")
     model.save(path)
     write_outputs(config, gaze_report(rows), ("folds.json", json.dumps(rows, indent=2) + "\n"), path)
@@ -193,6 +195,7 @@ def _evaluate(
             "centre bias": summary_of(baseline, baseline),
             "map": summary_of(score(model, group, maps, held, conditional=False), baseline),
             "with oculomotor biases": summary_of(score(model, group, maps, held, conditional=True), baseline),
+            "inter-observer": summary_of(people_score(group, held, centre), baseline),
         })  # fmt: skip
     return rows
 
@@ -207,7 +210,7 @@ def gaze_report(rows: Sequence[Mapping[str, Any]]) -> str:
         total = sum(row["pictures"] for row in some)
         body = [
             [model, *(f"{sum(row[model][name] * row['pictures'] for row in some) / total:.3f}" for name in _FIGURES)]
-            for model in ("centre bias", "map", "with oculomotor biases")
+            for model in ("centre bias", "map", "inter-observer", "with oculomotor biases")
         ]
         lines += [f"Data set {source + 1}: {total} pictures, each held out once", ""]
         lines += [*table([["", "NSS", "AUC", "gain over the centre bias, bit/fixation"], *body]), ""]
