@@ -40,7 +40,6 @@ from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.runs.store import RememberedLooks
 from semfov.runs.zoom_store import StoredGlances
 from semfov.strategy import Strategy
-from semfov.zoom.decision import CLOSER
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glances
@@ -80,7 +79,7 @@ class DecideConfig(RunConfig):
             the detector, if one is shipped).
         verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
             one that is shipped for detector and sensor, if there is one).
-        plain: also measure plain rules: one unfoveated pass, with closer looks, and with quarters.
+        rules: also measure plain rules: one unfoveated pass, with closer looks, and with quarters.
         references: also search without closer looks, with random gaze and with the published belief, for which
             photographs are looked at from every cell; without them the agent's looks suffice.
         out: folder for tables, records and the figure.
@@ -96,7 +95,7 @@ class DecideConfig(RunConfig):
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     windows: str | None = None
     verification: str | None = None
-    plain: bool = True
+    rules: bool = True
     references: bool = True
     out: Path = Path("runs/decide")
 
@@ -186,7 +185,7 @@ class DecisionRun(PolicyLooking):
                 limits=EpisodeLimits(USUAL_PASSES),
                 confirm=config.confirm,
                 give_up=config.give_up,
-                closer=CLOSER if config.closer else 0,
+                closer=None if config.closer else 0,
             )
             .open(glances)
             .run()
@@ -209,7 +208,7 @@ class DecisionRun(PolicyLooking):
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
-        settings = [config.confirm, config.give_up, config.place, config.closer, config.plain, config.references]
+        settings = [config.confirm, config.give_up, config.place, config.closer, config.rules, config.references]
         return {
             **super().depends_on(),
             "decisions": settings,
@@ -231,7 +230,7 @@ class DecisionRun(PolicyLooking):
         with torch.inference_mode():
             image = self.scenes[index].image[None]
             sharp = self.eye.detector(image)
-            tiles = [self.eye.detector(tile) for tile in quarters(image)] if self.config.plain else []
+            tiles = [self.eye.detector(tile) for tile in quarters(image)] if self.config.rules else []
         watch.lap("look")
         store = self.store if self.config.store and everywhere is None else None
         remembered: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(

@@ -22,7 +22,7 @@ from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import candidates, closer_window, look_closely
-from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
+from semfov.zoom.decision import WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
@@ -126,7 +126,7 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int | None = None,
     ) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one (`WindowEpisode`).
 
@@ -144,8 +144,8 @@ class ZoomAgent(nn.Module):
                 evidence it is the least score of a detection; None takes 0.5.
             give_up: the search ends when no look shows the class with a probability of at least this value; None takes
                 the threshold of the evidence.
-            closer: largest number of closer looks, 0 to 100. 0 decides without them, as does evidence without fitted
-                verification.
+            closer: largest number of closer looks, 0 to 100; None takes 2 in a photograph, and in a larger picture as
+                many as there are passes for. 0 decides without them, as does evidence without fitted verification.
 
         Returns:
             The looks, the objects of the class, and the decision.
@@ -155,7 +155,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         check_thresholds(confirm, give_up)
-        check_whole(closer, "closer", 0, 100)
+        check_whole(0 if closer is None else closer, "closer", 0, 100)
         episode = self.episode(
             class_index(target, self.classes[1:], "target"),
             limits=EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look),
@@ -276,7 +276,7 @@ class WindowEpisode(Episode[ZoomPath]):
         rate: r, per frame, 0 or more; None for a picture (`open`).
         confirm: least probability for `found`, as for `ZoomAgent.search`.
         give_up: probability that a look shows the target, below which no look is worth a pass.
-        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames.
+        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames; None as for `search`.
         batch: number of windows that are chosen jointly and pass the detector together.
         worth: an exploration ends when no look is expected to find more new objects than this.
         least: probability or score from which on objects count; None takes 0.5 for probabilities and 0.3 for scores.
@@ -302,7 +302,7 @@ class WindowEpisode(Episode[ZoomPath]):
         rate: float | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int | None = None,
         batch: int = 1,
         worth: float = NEW_OBJECTS,
         least: float | None = None,

@@ -37,7 +37,7 @@ from semfov.zoom.slices import usual_slices
 _FOLDS = 5
 _ABSENT = 6
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
-_FALSE_ALARMS = 0.005
+_FALSE_ALARMS = 0.01
 """Maximum share of absent targets that may be reported as found; it determines the threshold."""
 
 _AREA = 0.2

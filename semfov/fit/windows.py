@@ -122,7 +122,7 @@ class FitZoomConfig(FitConfig):
     lost: Share = 0.02
     place: Share = 0.2
     photographs: Whole = 320
-    worth: Share = 0.15
+    worth: Share = 0.1
     evidence: Path | None = None
     refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision import MOST_CLOSER, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
@@ -114,7 +114,7 @@ class SearchFacts:
 
 
 CLOSER = 100
-"""Default for the largest number of closer looks: as many as there are passes for."""
+"""Largest number of closer looks in a large picture: as many as there are passes for."""
 
 _SCORE = 0.5
 """Default for the score from which on a detection alone counts as found."""
@@ -137,7 +137,7 @@ class WindowDecisions:
         *,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int | None = None,
         forgetting: Forgetting | None = None,
     ) -> None:
         self.evidence, self.target, self._close_up = evidence, target, close_up
@@ -156,7 +156,9 @@ class WindowDecisions:
         at = evidence.thresholds if photograph is None else photograph.verification.thresholds
         model = evidence.verification if photograph is None else photograph.verification
         self.thresholds = (at or _DEFAULTS).changed(give_up=give_up)
-        if self._most and model is not None and model.thresholds is not None:
+        usual = CLOSER if photograph is None else MOST_CLOSER
+        most = usual if self._most is None else self._most
+        if most and model is not None and model.thresholds is not None:
             worth = self.thresholds.give_up
             at = model.thresholds.changed(confirm, worth)
             places: CandidateBoxes
@@ -165,7 +167,7 @@ class WindowDecisions:
             else:
                 places = PhotographPlaces(self.target, self._forgetting)
                 at = at.changed(place=worth)  # all further looks are closer ones
-            self.verifier = Verifier(model, places, self._close_up, at, self._most)
+            self.verifier = Verifier(model, places, self._close_up, at, most)
         else:
             self.thresholds = self.thresholds.changed(confirm)
         return SearchFacts(belief)

@@ -78,7 +78,7 @@ def test_without_references_the_agent_searches_as_with_them(finished, tmp_path):
 
 def test_without_plain_rules_the_quarters_are_not_looked_at(tmp_path):
     model = ("--belief.model", "HERE/observation.safetensors")
-    out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--plain", "false", "--store", "false")
+    out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--rules", "false", "--store", "false")
     assert {(record["tiled"], record["plain"]) for record in records_in(out)} == {(None, None)}
     rows = rows_of((out / "decisions.md").read_text())
     assert [row[0] for row in rows[:3]] == ["target-evidence", SCORES[0], "class frequency"]
