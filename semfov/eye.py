@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.data.inputs import ImageLike, PointLike, as_image, as_points, as_positions
 from semfov.detection.crops import merge_crops
@@ -13,6 +13,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.placement import Placement, letterbox
 from semfov.errors import check, check_shape
+from semfov.io.state import StatedModule
 from semfov.sensor.base import Sensor
 from semfov.sensor.glimpse import glimpse, window_around
 
@@ -26,7 +27,7 @@ class View:
     state: Any
 
 
-class Eye(nn.Module):
+class Eye(StatedModule):
     """Applies a sensor to an image at the detector's resolution, and detects objects in the result.
 
     The image is first fitted into the detector's input, the canvas, and the sensor is applied there. An eye with a
@@ -56,6 +57,10 @@ class Eye(nn.Module):
         self.sensor = sensor
         self.detector = detector
         self.reference = reference
+
+    def _stated(self) -> dict[str, Any]:
+        """The size that the settings of the sensor are for."""
+        return {"reference": self.reference}
 
     def open(self, image: ImageLike) -> View:
         """Fit an image into the detector's input, and compute what the sensor needs once per image.

@@ -209,7 +209,8 @@ class FovealObservationModel(Pretrained):
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
         """Calibrated scores: the posterior probability of every class.
 
-        With a uniform prior and τ = 1 they are proportional to the likelihoods, and fusion needs no more.
+        With a uniform prior and τ = 1 they are proportional to the likelihoods, and fusion needs no more. They are
+        differentiable in the scores and the parameters. The distance chooses a level, so no gradient flows through it.
 
         Args:
             scores: `(..., K+1)`, points of the simplex; raised to at least `epsilon`.

@@ -570,11 +570,13 @@ class GazeRecord(Record):
         found = None if self.target is None else self.found
         return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
 
-    def compare(self, people: Sequence[Fixations]) -> Mapping[str, tuple[float, float]]:
+    def compare(
+        self, people: Fixations | Sequence[Fixations] | str | PathLike[str]
+    ) -> Mapping[str, tuple[float, float]]:
         """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
 
         Args:
-            people: their fixations.
+            people: their fixations, those of one person, or the path of a table (`semfov.data.fixations.read_table`).
 
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.

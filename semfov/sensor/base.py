@@ -5,13 +5,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, values_known
+from semfov.io.state import StatedModule
 
 
-class Sensor(nn.Module, ABC):
+class Sensor(StatedModule, ABC):
     """Base of the sensors of an eye: they compute the view of a canvas for a fixation.
 
     A canvas is an image that was resized and padded to the detector's input. `open` does the work that does not depend
@@ -132,6 +133,11 @@ class Sensor(nn.Module, ABC):
         Returns:
             JSON values by name.
         """
+
+    def _stated(self) -> dict[str, Any]:
+        """The settings by which commands make the sensor, without those that are parameters."""
+        learned = {name.removeprefix("log_") for name in self._parameters}
+        return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Self:

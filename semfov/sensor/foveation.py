@@ -95,9 +95,9 @@ class Foveation(Sensor):
     no scale of its own, and σ' = σ.)
 
     Args:
-        sigma: width of the fovea in image pixels.
+        sigma: width of the fovea in image pixels; a tensor with gradients stays in the graph.
         levels: number of bands of the pyramid.
-        growth: factor by which the window of each coarser band is wider.
+        growth: factor by which the window of each coarser band is wider; a tensor with gradients stays in the graph.
         convention: convention of the pyramid, `kornia` or `opencv`.
         learnable: make σ a learnable parameter (its logarithm is learned, so that σ stays positive).
 
@@ -111,28 +111,32 @@ class Foveation(Sensor):
 
     def __init__(
         self,
-        sigma: float,
+        sigma: float | Tensor,
         levels: int = 5,
-        growth: float = 2.0,
+        growth: float | Tensor = 2.0,
         convention: Convention = "kornia",
         *,
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check(sigma > 0, "sigma", "a positive number", sigma)
-        check(growth > 0, "growth", "a positive number", growth)
+        for name, value in (("sigma", sigma), ("growth", growth)):
+            check(torch.as_tensor(value).numel() == 1, name, "a number", f"shape {tuple(torch.as_tensor(value).shape)}")
+            check(bool(value > 0), name, "a positive number", value)
         check(levels >= 0, "levels", "0 or more", levels)
         lookup(convention, get_args(Convention), "pyramid convention")
         self.levels = levels
         self.growth = growth
         self.convention: Convention = convention
-        log_sigma = torch.tensor(float(sigma)).log()
-        self.log_sigma = nn.Parameter(log_sigma, requires_grad=learnable)
+        given = isinstance(sigma, Tensor) and sigma.requires_grad
+        check(not (given and learnable), "learnable", "False for a sigma that is learned outside", learnable)
+        self.given_sigma = sigma if given else None
+        log_sigma = None if given else torch.tensor(float(sigma)).log()
+        self.log_sigma = None if log_sigma is None else nn.Parameter(log_sigma, requires_grad=learnable)
 
     @property
     def sigma(self) -> Tensor:
         """Width of the fovea in image pixels."""
-        return self.log_sigma.exp()
+        return self.given_sigma if self.log_sigma is None else self.log_sigma.exp()
 
     def pyramid(self, image: ImageLike) -> Bands:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
@@ -160,7 +164,7 @@ class Foveation(Sensor):
         return {
             "sigma": float(self.sigma.detach()),
             "levels": self.levels,
-            "growth": float(self.growth),
+            "growth": float(torch.as_tensor(self.growth).detach()),
             "convention": self.convention,
         }
 

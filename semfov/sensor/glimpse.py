@@ -1,12 +1,13 @@
 """Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
 
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 
 _Padding = Literal["zeros", "border", "fill"]
@@ -118,7 +119,7 @@ def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1
     return tuple(steps)
 
 
-class Glimpse(nn.Module):
+class Glimpse(StatedModule):
     """A sensor that shows a window of the picture at a magnification, the module form of `glimpse`.
 
     Args:
@@ -139,6 +140,10 @@ class Glimpse(nn.Module):
         self.size = size
         self.padding_mode: _Padding = lookup(padding_mode, get_args(_Padding), "padding mode")
         self.fill_value = fill_value
+
+    def _stated(self) -> dict[str, Any]:
+        """All settings."""
+        return {"size": self.size, "padding_mode": self.padding_mode, "fill_value": self.fill_value}
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
         """Compute views of images at points and magnifications.

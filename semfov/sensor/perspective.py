@@ -1,13 +1,15 @@
 """Perspective views of a panorama, in any direction and with any field of view."""
 
 import math
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape
+from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
 
@@ -106,7 +108,7 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     return (F.avg_pool2d(view, times) if times > 1 else view)[0].to(source.dtype)
 
 
-class Perspective(nn.Module):
+class Perspective(StatedModule):
     """A camera in a panorama, the module form of `perspective`.
 
     Args:
@@ -121,6 +123,10 @@ class Perspective(nn.Module):
         super().__init__()
         check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
         self.size, self.antialias = size, antialias
+
+    def _stated(self) -> dict[str, Any]:
+        """All settings."""
+        return {"size": self.size, "antialias": self.antialias}
 
     def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
         """Compute views of panoramas.
