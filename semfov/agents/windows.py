@@ -327,7 +327,15 @@ class WindowEpisode(Episode[ZoomPath]):
         self._concluded: Decision | None = None
 
     def open(self, glances: Glances, *, told: bool = False) -> Self:
-        """Begin with a picture or the first frame of a stream; `told` leaves the choice of windows to `look`."""
+        """Begin with a picture, or with the first frame of a stream.
+
+        Args:
+            glances: the looks at it.
+            told: whether `look` is told each window, instead of choosing it.
+
+        Returns:
+            The episode.
+        """
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]

@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from semfov.agent import ActivePerception, How, PictureLike
+from semfov.agent import ActivePerception
+from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import ResultsFile, kind_of

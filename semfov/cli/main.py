@@ -55,7 +55,8 @@ def _run(name: str, options: Any) -> int | None:
     if name == "fit":
         from semfov.fit.detector import fit_folder
 
-        return fit_folder(options)
+        fit_folder(options)
+        return None
     if name == "live":
         from semfov.cli.live import look_live
 

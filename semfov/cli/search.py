@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, get_args
 
-from semfov.agent import PictureLike
+from semfov.agents.picture import PictureLike
 from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of

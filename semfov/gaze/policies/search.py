@@ -44,6 +44,7 @@ class SaliencyMaximum(Policy):
     Raises:
         InputError: the policy is used without the saliency of a scene.
 
+    >>> import torch
     >>> policy = SaliencyMaximum(torch.tensor([0.4, 0.2]))
     >>> policy(None, Grid(2, 1, (20, 10))).values
     tensor([0.4000, 0.2000])
