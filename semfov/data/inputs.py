@@ -76,11 +76,18 @@ def as_images(
 
     Shapes: → `(B, 3, H, W)`.
     """
-    pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
+    pixels = channels_first(pixels_of(images, argument), argument, choose=not isinstance(images, np.ndarray))
     pixels = in_rgb(pixels, images, color)
     pixels = _in_unit(pixels, like, argument)
     check_pixels(pixels, argument)
     return pixels
+
+
+def as_batch(images: ImageLike) -> Tensor:
+    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
+    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
+        return images
+    return as_images(images)
 
 
 def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:

@@ -6,7 +6,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, as_positions, is_batch
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions, is_batch
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
@@ -72,7 +72,7 @@ def foveate(
         points = gaze[None] if gaze.ndim == 2 else gaze
         bands = laplacian_pyramid(as_images(image), levels, convention)
         return foveate(bands, points, sigma=sigma, growth=growth)[0]
-    bands = image if isinstance(image, Bands) else laplacian_pyramid(_batch(image), levels, convention)
+    bands = image if isinstance(image, Bands) else laplacian_pyramid(as_batch(image), levels, convention)
     fixation, many = fixations(gaze, bands.base)
     if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
         for name, value in (("sigma", sigma), ("growth", growth)):
@@ -147,7 +147,7 @@ class Foveation(Sensor):
         Returns:
             The Laplacian pyramid.
         """
-        return laplacian_pyramid(_batch(image), self.levels, self.convention)
+        return laplacian_pyramid(as_batch(image), self.levels, self.convention)
 
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[Bands, Tensor]:
         """Compute the pyramid of a canvas, and scale the width of the fovea, `(1, 2)`."""
@@ -191,13 +191,6 @@ class Foveation(Sensor):
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
         )
-
-
-def _batch(images: ImageLike) -> Tensor:
-    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
-    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
-        return images
-    return as_images(images)
 
 
 def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:

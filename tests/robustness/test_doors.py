@@ -18,11 +18,13 @@ from semfov import (
     as_image,
     foveate,
 )
+from semfov.data import read_image
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector
 from semfov.errors import SemfovError
+from semfov.gaze.saliency import VOCUS2, IttiKoch
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -346,3 +348,12 @@ def test_pictures_in_the_order_of_opencv_have_the_same_colours(kind):
     assert torch.equal(open_large(given, color="bgr").read((3, 1, 9, 12)), expected[:, 1:12, 3:9])
     with pytest.raises(SemfovError, match="bgr"):
         as_image(given, color="brg")
+
+
+@pytest.mark.parametrize("model", [VOCUS2, IttiKoch])
+def test_saliency_takes_pictures_of_any_type(tmp_path, model):
+    picture = Image.fromarray(np.random.default_rng(0).integers(256, size=(48, 64, 3), dtype=np.uint8))
+    picture.save(tmp_path / "a.png")
+    expected = model()(read_image(tmp_path / "a.png")[None])
+    for source in (tmp_path / "a.png", str(tmp_path / "a.png"), picture, np.asarray(picture)):
+        assert torch.equal(model()(source), expected)

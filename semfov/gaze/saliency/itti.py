@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape
 from semfov.gaze.saliency.conspicuity import rescale
 from semfov.gaze.saliency.opponent import anchor, double_opponency
@@ -215,16 +216,16 @@ class IttiKoch(nn.Module):
         super().__init__()
         self.normalise = normalise
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, image: ImageLike) -> Tensor:
         """Compute the saliency of images.
 
         Args:
-            image: `(B, 3, H, W)`, RGB in [0, 1].
+            image: `(B, 3, H, W)`, RGB in [0, 1], or one picture of any common type (`semfov.as_image`).
 
         Returns:
             `(B, H, W)`.
         """
-        return itti_koch_saliency(image, normalise=self.normalise)
+        return itti_koch_saliency(as_batch(image), normalise=self.normalise)
 
     def extra_repr(self) -> str:
         """Whether maps are normalised."""

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import gaussian_blur
 from semfov.gaze.saliency.conspicuity import Fusion, combine_maps, rescale
@@ -182,17 +183,17 @@ class VOCUS2(nn.Module):
         self.color_space: _ColorSpace = color_space
         self.normalise = normalise
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, image: ImageLike) -> Tensor:
         """Compute the saliency of images.
 
         Args:
-            image: `(B, 3, H, W)`, RGB in [0, 1].
+            image: `(B, 3, H, W)`, RGB in [0, 1], or one picture of any common type (`semfov.as_image`).
 
         Returns:
             `(B, H, W)`.
         """
         return vocus2_saliency(
-            image,
+            as_batch(image),
             centre_sigma=self.centre_sigma,
             surround_sigma=self.surround_sigma,
             layers=self.layers,

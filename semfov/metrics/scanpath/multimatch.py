@@ -58,7 +58,8 @@ def multimatch(
     - position :math:`1 - \mathrm{med} \|p - q\| / D`, with the points p and q where the saccades start
     - duration :math:`1 - \mathrm{med} |s - t| / \max(s, t)`, with the durations s and t of the fixations there
 
-    The result equals that of `multimatch_gaze.docomparison` without grouping.
+    The result equals that of `multimatch_gaze.docomparison` without grouping where one path is the cheapest. Of equally
+    cheap paths, as between fixations at the centres of cells, the reference may take another one.
 
     Args:
         ours: `(n, 2)`, fixations of one scanpath.
