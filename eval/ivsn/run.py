@@ -63,6 +63,6 @@ class IVSNRun(SearchRun):
             view, points = self.eye.open(image[None]), grid.centres.to(image)
             for point in points:
                 canvas = self.eye.foveated(view, point[None])
-                maps = self.templates(self.eye.detector.features(canvas))
+                maps = self.templates(self.eye.detector.head_input(canvas))
                 tables.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
         return torch.cat(tables)

@@ -280,7 +280,7 @@ class FovealObservationModel(Pretrained):
     ) -> Self:
         """Set α to its maximum a posteriori estimate, given the statistics of a training set.
 
-        `semfov.observation.fitting.fit_table` explains the estimate and how it differs from that of the paper. A level
+        `semfov.observation.fitting.fit_tables` explains the estimate and how it differs from that of the paper. A level
         with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning reports it, and
         `metadata["fallback"]` records it.
 
