@@ -1,6 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
@@ -32,7 +32,7 @@ from semfov.io.schema import is_number
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.paths import GazeRecord
+from semfov.paths import GazePrediction, GazeRecord
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -98,7 +98,6 @@ class ActivePerception(nn.Module):
         sigma: float = 100.0,
         growth: float = 2.0,
         grid: tuple[int, int] = (10, 10),
-        context: bool = False,
         **options: Any,
     ) -> Self:
         """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
@@ -108,8 +107,6 @@ class ActivePerception(nn.Module):
             sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
             growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
-            context: whether search also uses the usual places of the target and its co-occurrence with other classes
-                (`ContextPrior`).
             options: options of `semfov.load_detector`.
 
         Returns:
@@ -119,7 +116,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_arguments, name, sigma, growth, grid, context, **options)
+        return cls._of(recommended_arguments, name, sigma, growth, grid, **options)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -338,7 +335,9 @@ class ActivePerception(nn.Module):
         """
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        foveal = start is not None or boxes is not None or (not isinstance(target, str | int) and len(target) > 1)
+        # Class numbers may be those of NumPy or a tensor, which have no length.
+        targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
+        foveal = start is not None or boxes is not None or len(targets) > 1
         opened, kind, limits = self._begin(
             picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
         )
@@ -356,7 +355,6 @@ class ActivePerception(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
             )
-        targets = [target] if isinstance(target, str | int) else list(target)
         check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
               target)  # fmt: skip
         arguments = without_none(confirm=confirm, give_up=give_up, **limits)
@@ -485,6 +483,25 @@ class ActivePerception(nn.Module):
             return _counting(self.head.explore(opened.world, seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
+
+    def gaze(self, picture: PictureLike, *, color: Color = "rgb") -> GazePrediction:
+        """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
+
+        Args:
+            picture: a photograph, as for `search`.
+            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+
+        Returns:
+            The density of fixations, from which scanpaths are drawn.
+
+        Raises:
+            InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
+            DataError: the file of the picture cannot be read.
+        """
+        source = fspath(picture) if isinstance(picture, str | PathLike) else None
+        return GazePrediction.of(
+            self.eye.detector, open_picture(picture, color).image(self.eye.sensor.like)[0], source=source
+        )
 
     def live(
         self,

@@ -211,7 +211,7 @@ APPS = {app: modules_of(ROOT / app) for app in ("train", "eval")}
         ("try:\n    pass\nexcept ImportError:\n    import eval.page", [("eval.page", "eval.page")]),
         ("importlib.import_module('semfov.viz')", [("semfov.viz", "semfov.viz")]),
         ("import_module(name='semfov.viz')", [("semfov.viz", "semfov.viz")]),
-        ("import_module('.context', __package__)", [("semfov.belief.context", "semfov.belief.context")]),
+        ("import_module('.fusion', __package__)", [("semfov.belief.fusion", "semfov.belief.fusion")]),
         ("import_module('.curves', package='semfov.viz')", [("semfov.viz.curves", "semfov.viz.curves")]),
         ("x = __import__('semfov.viz').viz", [("semfov.viz", "semfov.viz")]),
         ("text = 'import semfov.viz'  # from semfov import viz", []),

@@ -130,12 +130,23 @@ class Episode(ABC, Generic[_Record]):
         """The record of the looks so far."""
 
     def moment(self) -> Moment:
-        """What is known at the present frame of a stream."""
+        """What is known at the present frame of a stream.
+
+        Raises:
+            InputError: the episode takes no frames.
+        """
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
     @torch.inference_mode()
     def step(self, frame: ImageLike) -> Moment:
-        """Look at the next frame of a stream (`look`), and tell what is known then."""
+        """Look at the next frame of a stream (`look`), and tell what is known then.
+
+        Args:
+            frame: the frame.
+
+        Returns:
+            What is known.
+        """
         self.look(frame)
         return self.moment()
 

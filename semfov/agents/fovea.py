@@ -205,7 +205,14 @@ class FoveaEpisode(Episode[Scanpath]):
         self._concluded: Decision | None = None
 
     def open(self, image: Tensor) -> Grid:
-        """Begin with a picture `(1, 3, H, W)`, or the first frame of a stream; returns the cells over it."""
+        """Begin with a picture, or with the first frame of a stream.
+
+        Args:
+            image: `(1, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            The cells over it.
+        """
         self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
         start, generator = self._first
         self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target)
@@ -365,7 +372,10 @@ class FoveaEpisode(Episode[Scanpath]):
         assert self._looks is not None
         (step, _), grid, belief = self._last, self._looks.grid, self._last[0].belief
         cell, detections, seconds, closer = self._present
-        any_object = 1 - belief.class_probabilities()[0, :, 0] if self.target is None else None
+        if self.target is None:
+            probability = 1 - belief.class_probabilities()[0, :, 0]
+        else:
+            probability = belief.probability(self.target)[0]
         return FoveaMoment(
             classes=self.classes,
             target=self.target,
@@ -375,7 +385,7 @@ class FoveaEpisode(Episode[Scanpath]):
             cell=cell,
             fixation=grid.centres[cell].to(step.fixation),
             detections=detections,
-            probability=belief.probability(self.target)[0] if any_object is None else any_object,
+            probability=probability,
             belief=belief,
             visited=step.visited[0],
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,

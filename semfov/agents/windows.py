@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, isfinite
+from time import perf_counter
 from typing import Any, Self
 
 import torch
@@ -242,11 +243,12 @@ class ZoomAgent(nn.Module):
 
 @dataclass(frozen=True)
 class _Look:
-    """A look at a window, the number of its pass, and the value that it was chosen for."""
+    """A look at a window: the number of its pass, the value that it was chosen for, and the time at its end."""
 
     number: int
     glance: Glance
     value: float
+    seconds: float
     closely: bool = False
 
 
@@ -325,9 +327,18 @@ class WindowEpisode(Episode[ZoomPath]):
         self._last: WindowStep[Any] | None = None
         self._looks: list[_Look] = []
         self._concluded: Decision | None = None
+        self._began = perf_counter()
 
     def open(self, glances: Glances, *, told: bool = False) -> Self:
-        """Begin with a picture or the first frame of a stream; `told` leaves the choice of windows to `look`."""
+        """Begin with a picture, or with the first frame of a stream.
+
+        Args:
+            glances: the looks at it.
+            told: whether `look` is told each window, instead of choosing it.
+
+        Returns:
+            The episode.
+        """
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]
@@ -368,7 +379,8 @@ class WindowEpisode(Episode[ZoomPath]):
                 seen.glance.window.centre(lattice),
                 seen.glance.window.region(lattice),
                 seen.glance.detections,
-                value=seen.value if isfinite(seen.value) else None,
+                seen.seconds,
+                seen.value if isfinite(seen.value) else None,
             )
 
     def _show(self, frame: ImageLike | LargePicture) -> None:
@@ -389,7 +401,7 @@ class WindowEpisode(Episode[ZoomPath]):
         if turn is None:
             return False
         self._last = turn
-        self._looks.append(_Look(self.passes, turn.glance, turn.worth))
+        self._looks.append(_Look(self.passes, turn.glance, turn.worth, perf_counter() - self._began))
         if self.forgetting is not None:
             counting, oldest = {id(look) for look in turn.looks}, self.passes - self.forgetting.span
             self._looks = [
@@ -405,7 +417,7 @@ class WindowEpisode(Episode[ZoomPath]):
         """Spend a pass on a closer look at a box."""
         assert self._glances is not None
         glance = look_closely(self._glances, box)
-        self._looks.append(_Look(self.passes, glance, 0.0, closely=True))
+        self._looks.append(_Look(self.passes, glance, 0.0, perf_counter() - self._began, closely=True))
         self.passes += 1
         return candidates(glance)
 
@@ -488,6 +500,7 @@ class WindowEpisode(Episode[ZoomPath]):
             "decision": self.decision,
             "glances": tuple(glances),
             "values": tuple(look.value for look in self._looks),
+            "seconds": tuple(look.seconds for look in self._looks),
             "candidates": objects,
             "unseen": unseen,
             "least": self.least,

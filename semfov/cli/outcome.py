@@ -37,17 +37,12 @@ class PictureOutcome:
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
-def _drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
-    """The figures to draw: those that are named, or the usual ones if the output is a folder."""
-    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
-    return usual if options.draw is None else options.draw
-
-
 def picture_outcome(
     record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
 ) -> PictureOutcome:
     """Make the text, the row, the part of a page and the figures of a record, as the options say."""
-    drawings = _drawings_of(options)
+    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
+    drawings = usual if options.draw is None else options.draw
     text = outcome_text(record, source.name, seconds)
     row = episode = None
     if options.out is not None:
@@ -85,5 +80,6 @@ def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[D
     with tempfile.TemporaryDirectory() as folder:
         drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
         if "animation" in drawings:
-            drawn += record.animate(boxes=boxes).save(Path(folder) / "animation.gif")
+            film: Any = record.animate(boxes=boxes)
+            drawn += film.save(Path(folder) / "animation.gif")
         return {path.name: path.read_bytes() for path in drawn}

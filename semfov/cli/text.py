@@ -18,18 +18,14 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
-    lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
+    decision = record.decision
+    headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
+    lines = [f"{name}, {width} × {height} px: {headline}"]
     lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
     if record.decision is None:
         lines += _regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
         lines += _objects_lines(record)
     return "\n".join(lines)
-
-
-def _headline(record: GazeRecord) -> str:
-    if record.decision is not None:
-        return _decision_text(record, record.decision)
-    return record.objects_in_words()
 
 
 def _decision_text(record: GazeRecord, decision: Decision) -> str:
@@ -73,7 +69,7 @@ def _objects_lines(record: GazeRecord) -> list[str]:
 def _box_text(box: Sequence[float]) -> str:
     """Corners of a box in whole pixels.
 
-    >>> box_text((380.2, 190.0, 443.9, 276.4))
+    >>> _box_text((380.2, 190.0, 443.9, 276.4))
     '380,190–444,276'
     """
     x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
@@ -126,25 +122,6 @@ def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def columns(names: Sequence[str], width: int = 100) -> str:
-    r"""Names in columns, in order down each column.
-
-    Args:
-        names: the names.
-        width: width of the text in letters.
-
-    Returns:
-        Lines of text.
-
-    >>> columns(["cup", "fork", "oven"], 12)
-    'cup   oven\nfork'
-    """
-    wide = max(map(len, names)) + 2
-    across = max(1, width // wide)
-    down = -(-len(names) // across)
-    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
 
 
 def plain_name(name: str) -> str:

@@ -249,7 +249,7 @@ def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
 
     >>> box, scores = torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]])
     >>> detections = Detections(box, scores, torch.ones(1, 1).bool())
-    >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
+    >>> _follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
     tensor([ 3.,  0., 11.,  8.])
 
     Shapes: box `(4,)` → `(4,)`.

@@ -29,7 +29,7 @@ _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 class _WindowEpisode(NamedTuple):
     """A search in a large picture, or its exploration.
 
-    >>> WindowEpisode(scene=3, target=16).target
+    >>> _WindowEpisode(scene=3, target=16).target
     16
     """
 
@@ -181,7 +181,7 @@ class WindowGaze(Gazes):
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
     """The window of the lattice that is nearest to an action.
 
-    >>> window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
+    >>> _window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
     (12, 8, 20, 16)
     """
     level = round(float(action[2]) * (lattice.levels - 1))

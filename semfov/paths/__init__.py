@@ -2,6 +2,7 @@
 
 from semfov.paths.base import GazeRecord, Record
 from semfov.paths.endings import Ending
+from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
 from semfov.paths.look import RecordedLook, detections_in_words
 from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
@@ -12,6 +13,7 @@ from semfov.paths.windows import ZoomPath
 __all__ = [
     "Ending",
     "FoveaMoment",
+    "GazePrediction",
     "GazeRecord",
     "HeadPath",
     "RecordedLook",

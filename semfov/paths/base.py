@@ -26,7 +26,7 @@ from semfov.paths.conversion import Conversion
 from semfov.paths.endings import FIXATIONS, Ending
 from semfov.paths.files import Format
 from semfov.paths.look import LookView, RecordedLook, read_region, whole_pixels
-from semfov.paths.merging import confirm, distances_to, merge_fixations, number_of, places_confirmed
+from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
 
 if TYPE_CHECKING:
     import pandas
@@ -198,7 +198,15 @@ class Record(Conversion):
     @property
     def _confirmed_places(self) -> list[tuple[Tensor, int, float, int]]:
         """Box, class, probability and look of the places that closer looks and the decision confirmed."""
-        return places_confirmed(self.decision, self.target, self.closer_looks, len(self) - 1)
+        decision, closer = self.decision, self.closer_looks
+        box = decision.box if decision is not None and decision.outcome == "found" else None
+        others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
+        places = [(look.box, look.target, look.place, number_of(look)) for look in others]
+        if box is not None and decision is not None and self.target is not None:
+            number = next((number_of(look) for look in closer if look.box.equal(box)), len(self) - 1)
+            probability = decision.probability if decision.place is None else decision.place
+            places.append((box, self.target, probability, number))
+        return places
 
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
@@ -562,11 +570,13 @@ class GazeRecord(Record):
         found = None if self.target is None else self.found
         return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
 
-    def compare(self, people: Sequence[Fixations]) -> Mapping[str, tuple[float, float]]:
+    def compare(
+        self, people: Fixations | Sequence[Fixations] | str | PathLike[str]
+    ) -> Mapping[str, tuple[float, float]]:
         """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
 
         Args:
-            people: their fixations.
+            people: their fixations, those of one person, or the path of a table (`semfov.data.fixations.read_table`).
 
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.

@@ -70,7 +70,8 @@ def grid_values(grid: Grid) -> dict[str, Any]:
 
 def grid_from(record: Mapping[str, Any]) -> Grid:
     """The grid with these JSON values."""
-    return Grid(*record["grid"], tuple(record["size"]))
+    columns, rows = record["grid"]
+    return Grid(columns, rows, tuple(record["size"]))
 
 
 class Format:
@@ -127,7 +128,7 @@ class Format:
 
 def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:
     """Make the attributes of the base, and check that they fit each other."""
-    classes, target, lengths, targets = (record.get(name) for name in ("classes", "target", "lengths", "targets"))
+    classes, target, lengths, targets = record["classes"], record.get("target"), record["lengths"], record["targets"]
     check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
     check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
     check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)

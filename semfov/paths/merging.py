@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from semfov.decision import SAME, CloseUp, Decision
+from semfov.decision import SAME, CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
 from semfov.observation.matching import box_iou
 
-_CONFIRMED = 0.5
+CONFIRMED = 0.5
 """Probability from which on a closer look confirms that the target is there."""
 
 
@@ -75,19 +75,6 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
 def number_of(look: CloseUp) -> int:
     """Number of the look that a closer look is, or after which it was made."""
     return (look.fixation if look.number is None else look.number) or 0
-
-
-def places_confirmed(
-    decision: Decision | None, target: int | None, closer: Sequence[CloseUp], last: int
-) -> list[tuple[Tensor, int, float, int]]:
-    """Box, class, probability and look of the places that closer looks confirmed, and of that which was found."""
-    box = decision.box if decision is not None and decision.outcome == "found" else None
-    others = [look for look in closer if look.place >= _CONFIRMED and (box is None or not look.box.equal(box))]
-    places = [(look.box, look.target, look.place, number_of(look)) for look in others]
-    if box is not None and decision is not None and target is not None:
-        last = next((number_of(look) for look in closer if look.box.equal(box)), last)
-        places.append((box, target, decision.probability if decision.place is None else decision.place, last))
-    return places
 
 
 def confirm(

@@ -192,7 +192,7 @@ class ZoomPath(GazeRecord):
             person from probability 0.5 (about 8 ± 1 of them right)`.
         """
         text = super().objects_in_words()
-        if self.unseen is None or not self._sought():
+        if self.unseen is None or not self._sought:
             return text
         if not len(self.objects):
             return f"{text} (the detector hardly reacts, so no number is given)"

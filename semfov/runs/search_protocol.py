@@ -32,12 +32,8 @@ class Trial:
     commonest: bool
 
 
-@dataclass(frozen=True)
-class EpisodeOutcome:
-    """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
-
-    cells: tuple[int, ...]
-    found_at: int
+EpisodeOutcome = tuple[list[int], int]
+"""Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
 
 
 def episodes_of(
@@ -103,7 +99,7 @@ def choose_classes(
 
 @dataclass(frozen=True)
 class DrawnSearch:
-    """A search for a drawn class, which the photograph may hold or not.
+    """A search for a drawn class, which the photograph may hold or not; `spare` ones serve only some purposes of a fit.
 
     Shapes: goal `(X·Y,)`, start `(1,)`, noise `(1, shifts+1, X·Y)`.
     """
@@ -112,6 +108,7 @@ class DrawnSearch:
     goal: Tensor
     start: Tensor
     noise: Tensor
+    spare: bool = False
 
     @property
     def present(self) -> bool:
@@ -204,7 +201,7 @@ def _run_batch(
         number = seeking[step.episodes[going]]
         visits[number, step.shift + 1] = step.next_cell[going]
         found_at[number[lands(step)[going]]] = step.shift + 1
-    return [EpisodeOutcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
+    return [(row[row >= 0].tolist(), int(at)) for row, at in zip(visits, found_at, strict=True)]
 
 
 def search_steps(

@@ -34,9 +34,11 @@ LABEL = 6.5
 def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor:
     """The given picture, or the one that the record kept, `(3, h, w)`."""
     kept = record.image if isinstance(record, Record) else None
-    if image is None and kept is None:
+    if image is not None:
+        return as_image(image)
+    if kept is None:
         raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
-    return as_image(image) if kept is None or image is not None else kept
+    return kept
 
 
 def check_fixation(record: Record, fixation: int) -> int:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
+from semfov.data.inputs import ImageLike
 from semfov.errors import check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
@@ -38,7 +39,7 @@ _MOST_BOXES = 6
 @styled
 def plot_scanpath(
     scanpath: Record | Fixations,
-    image: Tensor | None = None,
+    image: ImageLike | None = None,
     *,
     boxes: Tensor | None = None,
     objects: bool = True,
@@ -52,8 +53,8 @@ def plot_scanpath(
 
     Args:
         scanpath: the record, or the fixations of a person (`semfov.data.fixations`).
-        image: `(3, H, W)`, RGB in [0, 1], the picture in any size, or another picture of any common kind
-            (`semfov.as_image`); None takes the record's own. Fixations of people need it.
+        image: the picture in any size, of any common kind (`semfov.as_image`); None takes the record's own. Fixations
+            of people need it.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
         objects: whether to draw the objects of the record.
         ax: axes to draw in; None makes a figure.

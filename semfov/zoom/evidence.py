@@ -118,7 +118,6 @@ class GlimpseEvidence(Pretrained):
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": SURVEY,
-            # Files of earlier versions have neither of these.
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
             "photograph": PHOTOGRAPH,

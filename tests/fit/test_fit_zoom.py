@@ -23,7 +23,6 @@ from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
-from semfov.runs.samples import SampleSettings
 from semfov.runs.zoom_samples import MosaicSampler
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -124,7 +123,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
     model.check_compatible(WindowEye(Tiles(name="bright")).settings())
     # The model was fitted on one of the two mosaics and evaluated on the other; all samples of the first are counted.
-    sampler = MosaicSampler(SampleSettings.of(config), tmp_path / "out" / "samples")
+    sampler = MosaicSampler(config, tmp_path / "out" / "samples")
     samples = sampler.load(1)
     assert sum(map(sum, model.metadata["counts"])) == len(samples)
     size = sampler.scenes.annotation(1).size

@@ -9,8 +9,7 @@ from scipy.integrate import quad
 from scipy.stats import beta as beta_distribution
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition, dirichlet, fusion, policies
-from semfov.gaze.acquisition.lookahead import look_ahead_by_samples
-from semfov.gaze.acquisition.samples import sampled_likelihoods
+from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
 from semfov.gaze.policies import POLICIES, Means, named_policy
 from semfov.runs.candidates import _Models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig

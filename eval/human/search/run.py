@@ -18,7 +18,7 @@ from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
 
@@ -111,11 +111,11 @@ class PeopleSearchRun(PolicyLooking):
         for policy in self.policies:
             candidate = self.candidate(policy, index)
             with torch.inference_mode():
-                (outcome,) = run_episodes(
+                ((cells, found_at),) = run_episodes(
                     [episode], candidate, looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(policy)
-            path = {"cells": list(outcome.cells), "found_at": outcome.found_at}
+            path = {"cells": cells, "found_at": found_at}
             records.append({"policy": policy, "scene": name, "target_name": search.target, **path})
         return records, watch.seconds
 

@@ -9,17 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import mannwhitneyu, multivariate_normal
+from scipy.stats import entropy, mannwhitneyu, multivariate_normal
 
 from semfov.errors import InputError
 from semfov.metrics.scanpath import (
     auc,
+    auc_borji,
     auc_judd,
     auc_shuffled,
+    correlation,
     information_gain,
+    kullback_leibler,
     log_density,
     log_likelihood,
     nss,
+    similarity,
 )
 
 SHAPE = (12, 17)
@@ -235,3 +239,80 @@ def test_one_fixation_and_one_other_pixel_are_enough():
     assert auc_judd([[1.0, 0.0]], [1], [0]) == 0.5
     assert auc_shuffled([[0.0, 1.0]], [1], [0], [0], [0]) == 1
     assert auc_shuffled([[0.0, 1.0]], [0], [0], [1], [0]) == 0
+
+
+def test_correlation_equals_numpy():
+    rng = np.random.default_rng(3)
+    first, second = rng.random((2, 4, *SHAPE))
+    expected = [np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(first, second, strict=True)]
+    np.testing.assert_allclose(correlation(first, second), expected)
+    assert correlation(np.ones(SHAPE), first[0]) == 0
+    with pytest.raises(InputError, match="maps"):
+        correlation(first, second[:, :-1])
+
+
+def test_kl_divergence_equals_scipy():
+    first, second = np.random.default_rng(4).random((2, *SHAPE)) + 0.01
+    assert kullback_leibler(first, second) == pytest.approx(entropy(first.ravel(), second.ravel()))
+    assert kullback_leibler(first, 7 * first) == pytest.approx(0)
+    hole = second.copy()
+    hole[0, 0] = 0
+    assert kullback_leibler(first, hole) == np.inf
+    first[0, 0] = 0
+    assert np.isfinite(kullback_leibler(first, hole))
+    with pytest.raises(InputError, match="maps"):
+        kullback_leibler(-first, second)
+
+
+def test_similarity_is_one_minus_the_total_variation():
+    first, second = np.random.default_rng(5).random((2, *SHAPE))
+    distance = np.abs(first / first.sum() - second / second.sum()).sum() / 2
+    assert similarity(first, second) == pytest.approx(1 - distance)
+    assert similarity(first, 3 * first) == pytest.approx(1)
+
+
+def test_the_expectation_of_auc_borji_is_the_mean_auc():
+    rng = np.random.default_rng(6)
+    saliency, x, y = rng.random(SHAPE), rng.integers(17, size=30), rng.integers(12, size=30)
+    mean = auc(saliency, x, y).mean()
+    # The standard deviation of a draw is below .08, that of the mean of 400 below .004.
+    assert auc_borji(saliency, x, y, draws=400) == pytest.approx(mean, abs=0.016)
+    assert auc_borji(saliency, x, y, seed=1) == auc_borji(saliency, x, y, seed=1)
+
+
+NAN = float("nan")
+MAP = [[0.1, 0.2], [0.3, 0.4]]
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: auc([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN in 1 of 4 pixels"),
+        (lambda: nss([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
+        (lambda: auc_judd([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
+        (lambda: auc_shuffled([[0.1, NAN], [0.3, 0.4]], [1], [1], [0], [0]), "maps: expected numbers, got NaN"),
+        (lambda: log_density([[0.1, NAN]]), "maps: expected finite numbers"),
+        (lambda: nss(log_density([[0.0, 0.2], [0.3, 0.5]]), [1], [1]), "maps: expected finite numbers, got infinity"),
+        (lambda: auc(MAP, [NAN], [1]), "x, y: expected points inside"),
+        (lambda: log_density(MAP, floor=1.5), "floor: expected a number from 0 to 1, got 1.5"),
+        (lambda: log_density(MAP, floor=-0.1), "floor: expected a number from 0 to 1"),
+        (lambda: log_density(MAP, floor=NAN), "floor: expected a number from 0 to 1"),
+        (
+            lambda: information_gain(log_density(np.ones((4, 4))), log_density(np.ones((40, 40))), [1], [1]),
+            r"baseline: expected densities over \(4, 4\) pixels, as `density`, got \(40, 40\)",
+        ),
+    ],
+)  # fmt: skip
+def test_figures_are_not_made_better_by_what_is_no_map(call, named):
+    with pytest.raises(InputError, match=named):
+        call()
+
+
+def test_maps_of_any_type_have_the_same_figures():
+    """Halves, whole numbers and tensors; the baseline may be one for all maps."""
+    for kind in (np.float16, np.uint8, np.int64, np.float32):
+        maps = np.array([[1, 2], [3, 4]]).astype(kind)
+        assert auc(maps, [1], [1]) == auc(torch.tensor(maps), [1], [1]) == 0.875
+        assert information_gain(log_density(maps), log_density(np.ones((2, 2))), [1], [1])[0] == pytest.approx(
+            np.log2(0.4 / 0.25)
+        )
