@@ -30,6 +30,7 @@ from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
+from semfov.zoom.closer import PART, PhotographPlaces
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
@@ -120,6 +121,9 @@ KNOWN = {
     },
     "docs/zoom.md": {
         f"confidence of {FAINT}": "code",
+        f"hints of {PhotographPlaces.least}": "code",
+        f"window is {PART} times as long": "code",
+        "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
         f"probability {LIKELY} on": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
@@ -145,6 +149,10 @@ KNOWN = {
         "is 0.356 ± 0.051 higher (331 held-out": "a study that was removed; the page names the commits",
     },
     "docs/decisions/closer_looks.md": {
+        f"shows {PART} of the longer side": "code",
+        "there and at none of the places looked at before is 0.1": "in the file of the model",
+        "this takes 1.99 passes, and looks at every place from a probability of 0.1 on 2.21, with": "tried on the fit set",
+        "curve (0.966)": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",
         "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
         "between 86 and 88 % where 60 %": "tried on photographs of the fit, without a command",

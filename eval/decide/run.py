@@ -101,8 +101,9 @@ class DecideConfig(RunConfig):
 
     def complete(self, folder: ModelFolder) -> Self:
         """The settings with the folder's models that its agent uses, where none are given explicitly."""
-        own = [name for name in ("windows", "verification") if getattr(self, name) is None and folder.used(name)]
-        return replace(self, **{name: str(folder.file(name)) for name in own})
+        own = {name: folder.file(name) for name in ("windows", "verification") if folder.used(name)}
+        missing = {name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None}
+        return replace(self, **missing)
 
 
 class DecisionRun(PolicyLooking):

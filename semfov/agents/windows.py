@@ -314,8 +314,7 @@ class WindowEpisode(Episode[ZoomPath]):
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
         self.certainty = None if evidence is None else evidence.certainty
-        usual = LEAST if self.certainty is None else LIKELY
-        self.batch, self.worth, self.least = batch, worth, usual if least is None else least
+        self.batch, self.worth, self._least = batch, worth, least
         self._confirm = confirm
         self._decisions: WindowDecisions | None = None
         if evidence is not None and target is not None:
@@ -438,6 +437,12 @@ class WindowEpisode(Episode[ZoomPath]):
         usual: Ending = "windows" if self.searches or self._slicing else "worth"
         over = found or (self._decisions is not None and self._decisions.outcome > 0)
         self.ending = decided if over else limit or usual
+
+    @property
+    def least(self) -> float:
+        """Probability, or score, from which on objects count."""
+        usual = LEAST if self.certainty is None else LIKELY
+        return usual if self._least is None else self._least
 
     @property
     def _slicing(self) -> bool:

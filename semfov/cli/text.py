@@ -30,8 +30,8 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
 
 def _decision_text(record: GazeRecord, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    what = "probability that the picture holds it" if record.decided_by == "probability" else record.decided_by
-    name, probability = record.target_name, f"{what}: {decision.probability:.2f}"
+    what = "probability that the picture holds it:" if record.decided_by == "probability" else record.decided_by
+    name, probability = record.target_name, f"{what} {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"

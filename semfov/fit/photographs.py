@@ -138,6 +138,8 @@ def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, co
     """
     canvas = eye.detector.input_size
     single = [n for n in range(len(pictures)) if Lattice.over(pictures.annotation(n).size, canvas).levels == 1]
+    if not single:
+        return "None, since no photograph is shown at more than half its size by one look.\n"
     count, held = len(pictures), torch.zeros(len(pictures), model.classes, dtype=torch.bool)
     for index in range(count):
         held[index, pictures.annotation(index).labels - 1] = True
