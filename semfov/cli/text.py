@@ -105,8 +105,6 @@ def looks_text(record: GazeRecord) -> str:
         for look in record
     ]
     head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
-    if not any(row[-1] for row in rows):  # windows have no times
-        rows, head = [row[:-1] for row in rows], head[:-1]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
