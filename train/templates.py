@@ -131,7 +131,7 @@ def objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, 
     """
     with torch.inference_mode():
         canvas, placement = detector.fit(scenes[index].image[None])
-        features = unit(detector.features(canvas))
+        features = unit(detector.head_input(canvas))
         annotation = scenes.annotation(index)
         centres = (annotation.boxes[:, :2] + annotation.boxes[:, 2:]) / 2 - 0.5
         size = canvas.shape[-1], canvas.shape[-2]
@@ -157,7 +157,7 @@ def areas_under_roc(model: ClassTemplates, detector: Detector, scenes: Scenes, i
     covered = grid.footprint(annotation.boxes)
     with torch.inference_mode():
         canvas, placement = detector.fit(scenes[index].image[None])
-        maps = model(detector.features(canvas))
+        maps = model(detector.head_input(canvas))
         attention = at_points(maps, grid.centres, placement, (canvas.shape[-1], canvas.shape[-2]))[0]
     areas = []
     for label in annotation.labels.unique().tolist():

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.darknet_config import Section
+from semfov.detection.feature_maps import Step, landmarks
 from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
 from semfov.io.files import check_regular
@@ -377,6 +378,19 @@ class Darknet(nn.Module):
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
         last = self.sources[self.sources[head][0]][0]
         return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, last + 1)[last]
+
+    def landmarks(self) -> dict[str, int]:
+        """Numbers of the layers whose maps have a name by their place (`semfov.detection.feature_maps`)."""
+        steps = []
+        same: dict[int, int] = {}  # layers that hand on the map of another one
+        for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
+            reads = [same.get(source, source) for source in sources]
+            if len(reads) == 1 and (isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)):
+                same[index] = reads[0]
+                continue
+            names = tuple(str(read) for read in reads if read >= 0)
+            steps.append(Step(str(index), round(float(self.steps[index])), names, isinstance(layer, Convolution)))
+        return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:
         """sha256 of the sections."""

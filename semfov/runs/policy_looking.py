@@ -103,7 +103,7 @@ class PolicyLooking(Looking):
             view, points = self.eye.open(image[None]), grid.centres.to(image)
             for point in points:
                 canvas = self.eye.foveated(view, point[None])
-                maps = templates(self.eye.detector.features(canvas))
+                maps = templates(self.eye.detector.head_input(canvas))
                 tables.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
             return torch.cat(tables)
 

@@ -96,4 +96,4 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
 
 def test_a_detector_without_access_to_its_features_is_refused():
     with pytest.raises(InputError, match=r"access to its features.*fixed"):
-        Fixed().features(torch.zeros(1, 3, 32, 32))
+        Fixed().head_input(torch.zeros(1, 3, 32, 32))
