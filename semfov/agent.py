@@ -36,6 +36,7 @@ from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazeRecord
+from semfov.paths.gaze import GazePrediction
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -501,6 +502,23 @@ class ActivePerception(nn.Module):
             return _counting(self.head.explore(open_scene(picture, color), seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(_large(picture, color), **without_none(worth=worth, least=least, **limits))
+
+    def gaze(self, picture: PictureLike, *, color: Color = "rgb") -> GazePrediction:
+        """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
+
+        Args:
+            picture: a photograph, as for `search`.
+            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+
+        Returns:
+            The density of fixations, from which scanpaths are drawn.
+
+        Raises:
+            InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
+            DataError: the file of the picture cannot be read.
+        """
+        source = fspath(picture) if isinstance(picture, str | PathLike) else None
+        return GazePrediction.of(self.eye.detector, self._photograph(picture, color)[0], source=source)
 
     def live(
         self,

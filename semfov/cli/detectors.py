@@ -11,6 +11,7 @@ from semfov.cli.options import DetectorsOptions
 from semfov.cli.text import columns, table_lines
 from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, cache_folder
+from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
 from semfov.zoom import GlimpseEvidence
@@ -20,6 +21,7 @@ _PURPOSES: dict[str, type[Pretrained]] = {
     "closer looks": Verification,
     "explore": MapEvidence,
     "large pictures": GlimpseEvidence,
+    "gaze": FixationDensity,
 }
 """Models that are shipped for some detectors, by what they are for."""
 

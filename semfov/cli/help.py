@@ -11,6 +11,7 @@ semfov: active perception with any detector, in photographs, large pictures, sce
   semfov search kitchen.jpg --target cup            is there a cup, and where?
   semfov find harbour.tif --target person           all people in a large picture, and how many
   semfov explore street.jpg --report street.html    what is where, as a page with every look
+  semfov gaze poster.jpg --report poster.html       where people look, and in what order
   semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
   semfov detectors                                  detectors that can be named, and their licences
@@ -19,12 +20,13 @@ Commands:
   search      search pictures for a class, and decide whether it is there
   find        find all objects of one class, of several or of all
   explore     learn what is where, without a target
+  gaze        predict where people look
   live        search or explore a video, a camera or a network stream
   fit         fit all models to your own detector
   detectors   list detectors, or the classes of one
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
-Without a picture, search, find and explore take an embedded scene, so `semfov search --target cup` tries it out.
+Without a picture, search, find, explore and gaze take an embedded scene, so `semfov search --target cup` tries it out.
 """
 
 _AGENT = """\
@@ -106,6 +108,28 @@ usage: semfov explore [PICTURE ...] [options]
                        picture to show this many new objects (default 0.1 and 0.01)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
+"""
+
+GAZE = """\
+semfov gaze: where people look in a picture that they view freely
+
+  semfov gaze poster.jpg --report poster.html
+  semfov gaze drafts/*.png --people 30 --seconds 5 --out drafts.csv
+  semfov gaze poster.jpg --out density.npy
+
+usage: semfov gaze [PICTURE ...] [options]
+
+  PICTURE              photographs, or folders of them (none: an embedded scene)
+  --detector NAME      the detector whose features are read: yolov3-tiny (default), yolox-nano, nanodet-plus-m-1.5x
+  --weights FILE       its weights, where they are not downloaded
+  --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
+  --seconds S          time for which each views a picture (default 3)
+  --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
+  --out FOLDER         scanpaths, and a heat map of each picture
+  --report PAGE.html   a page with heat map, contours and scanpaths, in which to step through the fixations
+
+It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
+pages of text or to interfaces. --help-all: all options.
 """
 
 LIVE = f"""\

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli import help as texts
-from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
+from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, GazeOptions, LiveOptions, SearchOptions
 from semfov.runs.command import GOES_ON, make_parser, run_command
 from semfov.version import __version__
 
@@ -39,6 +39,12 @@ def _live(options: Any) -> int:
     from semfov.cli.live import look_live
 
     return look_live(options)
+
+
+def _gaze(options: Any) -> int:
+    from semfov.cli.gaze import predict_gaze
+
+    return predict_gaze(options)
 
 
 def _fit_options() -> type[Any]:
@@ -67,6 +73,7 @@ _SUBCOMMANDS: dict[str, _Subcommand] = {
     "find": _Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
     "explore": _Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
     "live": _Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
+    "gaze": _Subcommand(texts.GAZE, lambda: GazeOptions, _gaze, _PICTURES),
     "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
     "detectors": _Subcommand(
         texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")

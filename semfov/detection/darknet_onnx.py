@@ -156,9 +156,7 @@ class _NetworkGraph(Graph):
         return self.add("Cast", self.add("Concat", *pair, axis=2), to=1)
 
 
-def network_model(
-    network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()
-) -> Any:
+def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()) -> Any:
     """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None).
 
     The maps of `layers` are further outputs, `layer_0`, `layer_1`, ….

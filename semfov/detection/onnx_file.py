@@ -244,7 +244,7 @@ def with_outputs(path: Path, names: Iterable[str]) -> bytes:
 
 
 def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[Step]:
-    """The steps of a model in order, with the strides of the maps computed from its input `image` of `(width, height)`."""
+    """The steps of a model in order, with the strides of the maps that follow from `image`, of `(width, height)`."""
     import onnx
 
     model = _without_weights(onnx.load(path, load_external_data=False))

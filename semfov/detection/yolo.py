@@ -127,7 +127,8 @@ class YoloV3(Detector):
         """Compute all boxes and feature maps in one pass; layers are also named by their number in the cfg."""
         named = self.network.landmarks()
         numbers = {**{str(n): n for n in range(len(self.network.layers))}, **named}
-        wanted = {layer: numbers[layer] for layer in chosen([*named] if layers is None else layers, [*numbers], self.name)}
+        asked = [*named] if layers is None else layers
+        wanted = {layer: numbers[layer] for layer in chosen(asked, [*numbers], self.name)}
         if self._onnxruntime(canvas):
             assert self._twin is not None
             return self._twin.with_features(self.network, canvas, wanted)

@@ -101,7 +101,7 @@ def viewed(
 
 
 def log_centre(counts: Sequence[Tensor], *, blur: float = 2.5, floor: float = 0.02) -> Tensor:
-    """Log density of all fixations of data sets with equal weights, blurred, on 39 × 52 cells mixed with a uniform one."""
+    """Log density of all fixations of data sets, all alike, blurred and mixed with a uniform one, on 39 × 52 cells."""
     total = torch.zeros(39, 52)
     for each in counts:
         smooth = _blurred(F.interpolate(each.sum(0)[None, None], total.shape, mode="bilinear")[0, 0], blur)
@@ -226,8 +226,8 @@ def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, 
     """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
     before, cell, person = [], [], []
     for number, path in enumerate(paths):
-        for last in range(1, len(path)):
-            before.append(F.pad(path[:last].t(), (LONGEST - 1 - last, 0), value=math.nan).t())
+        for_each = range(1, len(path))
+        before += [F.pad(path[:last].t(), (LONGEST - 1 - last, 0), value=math.nan).t() for last in for_each]
         cell.append(_cells(path[1:], size, cells))
         person.append(torch.full((len(path) - 1,), number))
     return Events(torch.stack(before), torch.cat(cell), torch.cat(person))

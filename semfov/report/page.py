@@ -122,17 +122,17 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
         "pictures": list(numbers),
         "colours": {
-            "time": _colour_steps(TIME),
-            "overlay": _colour_steps(overlay_colours()),
-            "probability": _colour_steps(PROBABILITY, _OPACITY),
-            "uncertainty": _colour_steps(UNCERTAINTY, _OPACITY),
+            "time": colour_steps(TIME),
+            "overlay": colour_steps(overlay_colours()),
+            "probability": colour_steps(PROBABILITY, _OPACITY),
+            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
     contents = {
         "title": escape(title),
         "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
         "program": (_FOLDER / "page.js").read_text(encoding="utf-8"),
-        "data": _json_script(data),
+        "data": json_script(data),
         "sections": sections,
         "about": _about_html(episodes),
         "looks": "".join(
@@ -181,7 +181,7 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
     return {**about, "article": _place(number), "looks": looks}
 
 
-def _json_script(data: Any) -> str:
+def json_script(data: Any) -> str:
     r"""JSON text that is safe inside a script element.
 
     Args:
@@ -197,7 +197,7 @@ def _json_script(data: Any) -> str:
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def _colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
+def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
     """Red, green and blue from 0 to 255 and opacity from 0 to 1 of a colour map of matplotlib, at equal steps."""
     from matplotlib import colormaps
 

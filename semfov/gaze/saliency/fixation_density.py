@@ -251,6 +251,43 @@ class FixationDensity(Pretrained):
             "oculomotor biases": bias,
         }
 
+    @torch.no_grad()
+    def sample(
+        self,
+        terms: Mapping[str, Tensor],
+        size: tuple[int, int],
+        start: Tensor,
+        fixations: int,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw scanpaths, one fixation after the other, each from the density after those before.
+
+        Args:
+            terms: `terms` of one picture without a scanpath.
+            size: `(height, width)` of the picture in pixels.
+            start: `(n, 2)`, first fixations in pixels of the picture.
+            fixations: number of fixations of each scanpath, the first included.
+            generator: random generator of the draws.
+
+        Returns:
+            `(n, fixations, 2)`, in pixels of the picture, anywhere in the drawn cells.
+
+        >>> model = FixationDensity({"backbone8": 3})
+        >>> terms = model.terms({"backbone8": torch.rand(1, 3, 6, 8)}, (60, 80))
+        >>> model.sample(terms, (60, 80), torch.full((5, 2), 30.0), 4).shape
+        torch.Size([5, 4, 2])
+        """
+        rows, columns = cells_of(size)
+        cell = torch.tensor([size[1] / columns, size[0] / rows]).to(start)
+        path = start[:, None]
+        for _ in range(fixations - 1):
+            log = torch.stack([*self.given(terms, size, path).values()]).sum(0)
+            drawn = log.flatten(1).double().softmax(1).multinomial(1, generator=generator)[:, 0]
+            corner = torch.stack([drawn % columns, drawn // columns], 1).to(start)
+            within = torch.rand(corner.shape, generator=generator).to(start)
+            path = torch.cat([path, ((corner + within) * cell - 0.5)[:, None]], 1)
+        return path
+
     def extra_repr(self) -> str:
         """Its layers and readouts."""
         return f"layers={self.layers}, readouts={self.mix.shape[0]}, units={self.mix.shape[1]}"
