@@ -2,6 +2,7 @@
 
 from semfov.paths.base import GazeRecord, Record, RecordedLook, detections_in_words
 from semfov.paths.endings import Ending
+from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
 from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
 from semfov.paths.scanpath import Scanpath, Trace, trace
@@ -11,6 +12,7 @@ from semfov.paths.windows import ZoomPath
 __all__ = [
     "Ending",
     "FoveaMoment",
+    "GazePrediction",
     "GazeRecord",
     "HeadPath",
     "RecordedLook",

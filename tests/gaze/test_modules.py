@@ -177,6 +177,43 @@ class TestGain(PolicyTester):
         return TestExpectedGain.call(module(None, GRID), scores, boxes, fixation)
 
 
+class TestFixationDensity(GraphTester):
+    """After scanpaths of three fixations, on the cells of the picture."""
+
+    batched = (0, 1, 2)
+    differentiable = (0, 1, 2)
+
+    def make(self):
+        density = saliency.FixationDensity({"fine": 3, "coarse": 2}, readouts=2, units=4, centre=-rand(3, 4))
+        with torch.no_grad():
+            for parameter in density.oculomotor.parameters():
+                parameter.add_(0.2 * torch.randn_like(parameter))
+        return density
+
+    def inputs(self):
+        return rand(2, 3, 6, 8), rand(2, 2, 3, 4), 60 * rand(2, 3, 2)
+
+    @staticmethod
+    def call(module, fine, coarse, scanpath):
+        return module({"fine": fine, "coarse": coarse}, (39, 52), scanpath).flatten(1)[:, ::97]
+
+
+class TestOculomotorBias(GraphTester):
+    batched = (0,)
+    differentiable = (0, 1)
+    autocast = 0.05
+
+    def make(self):
+        bias = saliency.OculomotorBias()
+        with torch.no_grad():
+            for parameter in bias.parameters():
+                parameter.add_(torch.randn_like(parameter))
+        return bias
+
+    def inputs(self):
+        return rand(2, 4, 2), rand(5, 2)
+
+
 class TestGazeHabits(TensorTester):
     """Log probabilities of the next cell, given the present one."""
 

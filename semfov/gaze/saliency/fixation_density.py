@@ -235,19 +235,32 @@ class FixationDensity(Pretrained):
         cells = F.interpolate(centre, cells_of(size), mode="bilinear", align_corners=False)[0, 0]
         return self.centre_weight * cells
 
-    def given(self, terms: Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor) -> dict[str, Tensor]:
-        """The terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases."""
+    def given(
+        self, terms: Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor, corner: tuple[int, int, int] = (0, 0, 1)
+    ) -> dict[str, Tensor]:
+        """The terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
+
+        Args:
+            terms: map and centre bias `(B, rows, columns)` or `(1, rows, columns)`.
+            size: `(height, width)` of the picture in pixels.
+            scanpath: as for `forward`.
+            corner: first row, first column and step of the cells that are kept.
+
+        Returns:
+            The terms of `terms` with a scanpath.
+        """
         longer = max(size)
         path = (scanpath.to(self.read) + 0.5) / longer
         rows, columns = cells_of(size)
-        x = (torch.arange(columns, device=path.device, dtype=path.dtype) + 0.5) * (size[1] / columns / longer)
-        y = (torch.arange(rows, device=path.device, dtype=path.dtype) + 0.5) * (size[0] / rows / longer)
-        places = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+        top, left, step = corner
+        x = (torch.arange(left, columns, step).to(path) + 0.5) * (size[1] / columns / longer)
+        y = (torch.arange(top, rows, step).to(path) + 0.5) * (size[0] / rows / longer)
+        places = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1).flatten(0, 1)
         gains = self.oculomotor.gains((~path[..., 0].isnan()).sum(1))
-        bias = self.oculomotor(path, places).unflatten(-1, (rows, columns))
+        bias = self.oculomotor(path, places).unflatten(-1, (len(y), len(x)))
         return {
-            "map": gains[:, 0, None, None] * terms["map"],
-            "centre bias": gains[:, 1, None, None] * terms["centre bias"],
+            "map": gains[:, 0, None, None] * terms["map"][:, top::step, left::step],
+            "centre bias": gains[:, 1, None, None] * terms["centre bias"][:, top::step, left::step],
             "oculomotor biases": bias,
         }
 

@@ -13,6 +13,8 @@ _DIRECTIONS = 7
 _TURNS = 3
 _AGES = 4
 _NUMBERS = 12
+_MEMORY = 8
+"""Number of earlier fixations that refixation depends on, the latest ones."""
 
 
 class OculomotorBias(nn.Module):
@@ -22,7 +24,7 @@ class OculomotorBias(nn.Module):
               + \sum_{i<n} b_{n-i}(\|u - f_i\|)
 
     r and θ are length and direction of the saccade from the last fixation :math:`f_n` to u, and τ is the turn from the
-    saccade before. φ are 1, cos θ, sin θ, cos 2θ, sin 2θ, cos 4θ and sin 4θ. The functions s, t and b are tables,
+    saccade before. The last sum is over the eight fixations before the last one. φ are 1, cos θ, sin θ, cos 2θ, sin 2θ, cos 4θ and sin 4θ. The functions s, t and b are tables,
     interpolated linearly, in longer sides of the picture; b differs by the age of a fixation up to four. Gains of the
     map and of the centre bias depend on the number n of fixations so far.
 
@@ -39,23 +41,19 @@ class OculomotorBias(nn.Module):
     torch.Size([2, 5])
     """
 
-    lengths: Tensor
-    near: Tensor
-
     def __init__(self) -> None:
         super().__init__()
         self.saccade = nn.Parameter(torch.zeros(_DIRECTIONS, len(_LENGTHS)))
         self.turn = nn.Parameter(torch.zeros(_TURNS, len(_LENGTHS)))
         self.back = nn.Parameter(torch.zeros(_AGES, len(_NEAR) - 1))
         self.gain = nn.Parameter(torch.ones(2, _NUMBERS))
-        self.register_buffer("lengths", torch.tensor(_LENGTHS), persistent=False)
-        self.register_buffer("near", torch.tensor(_NEAR), persistent=False)
 
     def forward(self, path: Tensor, places: Tensor) -> Tensor:
         """Log bias of every place as the next fixation, up to a constant."""
         check_shape(path, "path", None, None, 2)
         check_shape(places, "places", None, 2)
         check(path.shape[1] > 0, "path", "at least one fixation", tuple(path.shape))
+        lengths, near = path.new_tensor(_LENGTHS), path.new_tensor(_NEAR)
         last = path[:, -1]
         ahead = places - last[:, None]
         length = _norm(ahead)
@@ -63,7 +61,7 @@ class OculomotorBias(nn.Module):
         double = across.square() - down.square(), 2 * across * down
         quadruple = double[0].square() - double[1].square(), 2 * double[0] * double[1]
         directions = torch.stack([torch.ones_like(across), across, down, *double, *quadruple], -2)
-        bias = (_interpolated(self.saccade, self.lengths, length) * directions).sum(-2)
+        bias = (_interpolated(self.saccade, lengths, length) * directions).sum(-2)
         if path.shape[1] == 1:
             return bias
         before = path[:, -2]
@@ -72,13 +70,13 @@ class OculomotorBias(nn.Module):
         along = across * unit[:, None, 0] + down * unit[:, None, 1]
         turns = torch.stack([along, 2 * along.square() - 1, 4 * along**3 - 3 * along], -2)
         known = (~before[:, :1].isnan()).to(bias)
-        bias = bias + known * (_interpolated(self.turn, self.lengths, length) * turns).sum(-2)
-        earlier = path[:, :-1].flip(1)
+        bias = bias + known * (_interpolated(self.turn, lengths, length) * turns).sum(-2)
+        earlier = path[:, :-1].flip(1)[:, :_MEMORY]
         seen = ~earlier[..., 0].isnan()
         distance = _norm(places[:, None] - torch.where(seen[..., None], earlier, 0.0)[:, None])
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
         tables = torch.cat([self.back, self.back.new_zeros(_AGES, 1)], 1)[ages]
-        return bias + (_rowwise(tables, self.near, distance) * seen[:, None]).sum(-1)
+        return bias + (_rowwise(tables, near, distance) * seen[:, None]).sum(-1)
 
     def gains(self, number: Tensor) -> Tensor:
         """Gains `(B, 2)` of the map and of the centre bias after a number `(B,)` of fixations."""
