@@ -1,4 +1,4 @@
-"""Fit where people look: a `FixationDensity` by maximum likelihood of fixations, with folds over pictures and people."""
+"""Fit where people look: a `FixationDensity` by maximum likelihood of fixations, over folds of pictures and people."""
 
 from __future__ import annotations
 
@@ -254,7 +254,10 @@ def fit_oculomotor(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=0.2)
     places = [{picture: row for row, picture in enumerate(some)} for some in pictures]
     events = [
-        {picture: _of_people(events_of(group.paths[picture], group.size, cells_of(group.size)), people) for picture in some}
+        {
+            picture: _of_people(events_of(group.paths[picture], group.size, cells_of(group.size)), people)
+            for picture in some
+        }
         for group, some in zip(groups, pictures, strict=True)
     ]
     for epoch in range(epochs):

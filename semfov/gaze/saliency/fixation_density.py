@@ -236,7 +236,11 @@ class FixationDensity(Pretrained):
         return self.centre_weight * cells
 
     def given(
-        self, terms: Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor, corner: tuple[int, int, int] = (0, 0, 1)
+        self,
+        terms: Mapping[str, Tensor],
+        size: tuple[int, int],
+        scanpath: Tensor,
+        corner: tuple[int, int, int] = (0, 0, 1),
     ) -> dict[str, Tensor]:
         """The terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
 

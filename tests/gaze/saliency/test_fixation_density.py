@@ -10,9 +10,9 @@ from scipy.ndimage import map_coordinates
 from semfov import Detections, InputError
 from semfov.detection import FeatureMaps, Placement
 from semfov.errors import DataError
+from semfov.gaze.saliency import FixationDensity, OculomotorBias
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.gaze.saliency.oculomotor import _LENGTHS, _NEAR
-from semfov.gaze.saliency import FixationDensity, OculomotorBias
 from tests.small import rand
 
 
@@ -120,7 +120,9 @@ def oculomotor_by_loops(bias, path, place):
     length, angle = math.hypot(*ahead), math.atan2(ahead[1], ahead[0])
     waves = [1, math.cos(angle), math.sin(angle), math.cos(2 * angle), math.sin(2 * angle)]
     waves += [math.cos(4 * angle), math.sin(4 * angle)]
-    total = sum(np.interp(length, _LENGTHS, table) * wave for table, wave in zip(bias.saccade.tolist(), waves, strict=True))
+    total = sum(
+        np.interp(length, _LENGTHS, table) * wave for table, wave in zip(bias.saccade.tolist(), waves, strict=True)
+    )
     if len(path) > 1:
         step = last - path[-2]
         turn = angle - math.atan2(step[1], step[0])
@@ -180,7 +182,11 @@ def test_weights_of_other_layers_are_refused(model):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"fine": None}, "'fine'"), ({"fine": torch.rand(2, 4, 12, 16)}, "fine"), ({"coarse": torch.rand(5, 6, 8)}, "coarse")],
+    [
+        ({"fine": None}, "'fine'"),
+        ({"fine": torch.rand(2, 4, 12, 16)}, "fine"),
+        ({"coarse": torch.rand(5, 6, 8)}, "coarse"),
+    ],
 )
 def test_wrong_features_are_named(model, maps, change, words):
     given = {name: each for name, each in {**maps, **change}.items() if each is not None}
