@@ -24,9 +24,10 @@ class OculomotorBias(nn.Module):
               + \sum_{i<n} b_{n-i}(\|u - f_i\|)
 
     r and θ are length and direction of the saccade from the last fixation :math:`f_n` to u, and τ is the turn from the
-    saccade before. The last sum is over the eight fixations before the last one. φ are 1, cos θ, sin θ, cos 2θ, sin 2θ, cos 4θ and sin 4θ. The functions s, t and b are tables,
-    interpolated linearly, in longer sides of the picture; b differs by the age of a fixation up to four. Gains of the
-    map and of the centre bias depend on the number n of fixations so far.
+    saccade before. The last sum is over the eight fixations before the last one. φ are 1, cos θ, sin θ, cos 2θ,
+    sin 2θ, cos 4θ and sin 4θ. The functions s, t and b are tables, interpolated linearly, in longer sides of the
+    picture; b differs by the age of a fixation up to four. Gains of the map and of the centre bias depend on the number
+    n of fixations so far.
 
     The form follows DeepGaze III (Kümmerer, Bethge and Wallis, 2022), whose part is a network on distances and
     differences to the last four fixations; tables can be read.
