@@ -90,7 +90,7 @@ def _write(options: GazeOptions, kind: str | None, drawn: list[DrawnGaze]) -> li
         write_table(out / "scanpaths.csv", paths)
         written.append(out / "scanpaths.csv")
         for number, each in enumerate(drawn):
-            name = plain_name(each.prediction.name)
+            name = plain_name(Path(each.prediction.name).stem)
             start = f"{number:03d}-" if len(drawn) > 1 else ""
             written.append(each.prediction.save_density(out / f"{start}{name}.png"))
     if options.report is not None:
