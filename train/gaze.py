@@ -26,6 +26,7 @@ from semfov.fit.gaze import (
     folds,
     log_centre,
     maps_of,
+    people_score,
     score,
     summary_of,
     viewed,
@@ -193,6 +194,7 @@ def _evaluate(
             "centre bias": summary_of(baseline, baseline),
             "map": summary_of(score(model, group, maps, held, conditional=False), baseline),
             "with oculomotor biases": summary_of(score(model, group, maps, held, conditional=True), baseline),
+            "inter-observer": summary_of(people_score(group, held, centre), baseline),
         })  # fmt: skip
     return rows
 
@@ -207,7 +209,7 @@ def gaze_report(rows: Sequence[Mapping[str, Any]]) -> str:
         total = sum(row["pictures"] for row in some)
         body = [
             [model, *(f"{sum(row[model][name] * row['pictures'] for row in some) / total:.3f}" for name in _FIGURES)]
-            for model in ("centre bias", "map", "with oculomotor biases")
+            for model in ("centre bias", "map", "inter-observer", "with oculomotor biases")
         ]
         lines += [f"Data set {source + 1}: {total} pictures, each held out once", ""]
         lines += [*table([["", "NSS", "AUC", "gain over the centre bias, bit/fixation"], *body]), ""]

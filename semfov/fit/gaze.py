@@ -358,12 +358,39 @@ def score(
             log = torch.zeros_like(one)[None]
         density = cell_saliency((log - log.flatten(1).logsumexp(1)[:, None, None]).exp(), *raster)
         density = (density / density.sum(1, keepdim=True)).expand(len(events.cell), -1)
-        at = density.gather(1, events.cell[:, None])[:, 0]
-        z = (at - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
-        below = (density < at[:, None]).float().mean(1) + (density == at[:, None]).float().mean(1) / 2
-        bits = (at * density.shape[1]).log2()
-        rows.append(torch.stack([z.mean(), below.mean(), bits.mean()]))
+        rows.append(_scores(density, events.cell))
     return torch.stack(rows)
+
+
+@torch.no_grad()
+def people_score(
+    group: Viewed, pictures: Sequence[int], centre: Tensor, *, blur: float = 1.0, share: float = 0.05
+) -> Tensor:
+    """Inter-observer scores `(P, 3)` as of `score`: each person by the fixations of all others in the picture.
+
+    Their counts in 40 × 30 bins without first fixations are blurred by `blur` bins, and mixed with a `share` of the
+    centre bias, a log density `(rows, columns)`.
+    """
+    shape = (30, 40)
+    bias = F.interpolate(centre[None, None], shape, mode="bilinear")[0, 0].flatten().softmax(0)
+    rows = []
+    for picture in pictures:
+        events = events_of(group.paths[picture], group.size, shape)
+        counts = torch.zeros(len(group.paths[picture]), shape[0] * shape[1])
+        counts.index_put_((events.person, events.cell), torch.ones(len(events.cell)), accumulate=True)
+        others = (counts.sum(0) - counts).unflatten(1, shape)
+        smooth = torch.stack([_blurred(each, blur) for each in others]).flatten(1)
+        density = (1 - share) * smooth / smooth.sum(1, keepdim=True) + share * bias
+        rows.append(_scores(density[events.person], events.cell))
+    return torch.stack(rows)
+
+
+def _scores(density: Tensor, cell: Tensor) -> Tensor:
+    """Means of NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`."""
+    at = density.gather(1, cell[:, None])[:, 0]
+    z = (at - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
+    below = (density < at[:, None]).float().mean(1) + (density == at[:, None]).float().mean(1) / 2
+    return torch.stack([z.mean(), below.mean(), (at * density.shape[1]).log2().mean()])
 
 
 def folds(number: int, count: int, fold: int) -> tuple[list[int], list[int]]:

@@ -109,9 +109,10 @@ def _facts(prediction: GazePrediction, number: int) -> str:
         f'<section class="facts-of" id="facts-{number}"><h2>{escape(prediction.name)}</h2>'
         f'<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
         f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
+        '<div class="wide" tabindex="0" role="region" aria-label="Places">'
         '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
         f'<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 %</th></tr></thead><tbody>{rows}'
-        "</tbody></table></section>"
+        "</tbody></table></div></section>"
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from torch.nn import functional as F
 
 from semfov import Detector, saliency
@@ -20,6 +21,7 @@ from semfov.fit.gaze import (
     folds,
     log_centre,
     maps_of,
+    people_score,
     score,
     summary_of,
     viewed,
@@ -103,6 +105,21 @@ def test_scores_equal_the_measures_of_scanpaths(group):
     x, y = cell % 52, cell // 52
     expected = [nss(log.exp(), x, y).mean(), auc(log, x, y).mean(), log_likelihood(log, x, y).mean()]
     np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-4)
+
+
+def test_people_are_scored_by_the_others(group):
+    """Twin: the density of the others of one person by `scipy.ndimage.gaussian_filter`, far from the border."""
+    scored = people_score(group, [5], torch.zeros(39, 52), share=0.05)[0]
+    bits = []
+    for person, path in enumerate(group.paths[5]):
+        counts = np.zeros((30, 40))
+        for other, theirs in enumerate(group.paths[5]):
+            if other != person:
+                np.add.at(counts, tuple(((theirs[1:].numpy()[:, ::-1] + 0.5) / 2).astype(int).T), 1)
+        density = gaussian_filter(counts, 1.0, mode="constant", truncate=6)
+        density = 0.95 * density / density.sum() + 0.05 / 1200
+        bits += [math.log2(1200 * density[int((y + 0.5) / 2), int((x + 0.5) / 2)]) for x, y in path[1:].tolist()]
+    assert float(scored[2]) == pytest.approx(np.mean(bits), abs=0.05)
 
 
 def test_oculomotor_biases_recover_a_known_saccade_length():
