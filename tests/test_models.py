@@ -20,7 +20,7 @@ from semfov.zoom.evidence import CASE, features
 
 KINDS = (
     FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, ContextPrior, ClassTemplates,
-    GazeHabits, GlimpseEvidence,
+    GazeHabits, GlimpseEvidence, semfov.saliency.FixationDensity,
 )  # fmt: skip
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -28,7 +28,7 @@ MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
-LARGEST = {FovealObservationModel: 1_100_000, ClassTemplates: 200_000, GazeHabits: 10_000}
+LARGEST = {FovealObservationModel: 1_100_000, ClassTemplates: 200_000, GazeHabits: 10_000, semfov.saliency.FixationDensity: 160_000}
 SHIPPED = [(kind, path) for kind in KINDS for path in sorted(kind.shipped.glob("*.safetensors"))]
 
 

@@ -102,7 +102,8 @@ def fit_gaze(config: FitGazeConfig) -> None:
     describe_viewing(model, groups)
     settings = {name: value for name, value in config.plain().items() if name not in _ELSEWHERE}
     people = {"pictures": sum(map(len, groups)), "scanpaths": sum(len(p) for group in groups for p in group.paths)}
-    model.metadata |= {"detector": detector.settings(), "data": fingerprints, "training": settings | people}
+    known = {name: detector.settings()[name] for name in ("name", "digest", "input_size", "stretch")}
+    model.metadata |= {"detector": known, "data": fingerprints, "training": settings | people}
     path = inside(config.out, f"{config.name or detector.name}.safetensors")
     model.save(path)
     write_outputs(config, gaze_report(rows), ("folds.json", json.dumps(rows, indent=2) + "\n"), path)

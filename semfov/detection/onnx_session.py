@@ -117,7 +117,8 @@ class OnnxSession:
         if short:
             source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])
         runs = [self._run(part.contiguous()) for part in source.split(size)]
-        return {name: torch.cat([run[name] for run in runs])[:batch].to(image) for name, _ in self.outputs}
+        joined = runs[0] if len(runs) == 1 else {name: torch.cat([run[name] for run in runs]) for name in runs[0]}
+        return {name: joined[name][:batch].to(image) for name, _ in self.outputs}
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         feed = {self.image: image.numpy()} | {name: _EXTRA_INPUTS[name](image).numpy() for name in self._extra}

@@ -17,6 +17,7 @@ from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Pair, Schema, Text
 from semfov.io.schema import Number as JsonNumber
+from semfov.sensor.lines import constant
 
 CELLS = 52
 """Cells along the longer side of a picture in which densities are computed."""
@@ -43,7 +44,8 @@ class FixationDensity(Pretrained):
         readouts: number of readouts whose mean is the map.
         units: number of channels of a readout.
         centre: `(rows, columns)`, log density of the centre bias; None for none.
-        metadata: JSON values to keep with the model; `detector` holds the settings of the detector it was fitted for.
+        metadata: JSON values to keep with the model; `detector` holds those settings of the detector that the feature
+            maps depend on.
 
     Shape:
         - features: maps `(B, C, h, w)` by name
@@ -143,7 +145,8 @@ class FixationDensity(Pretrained):
 
     def check_compatible(self, detector: Detector) -> None:
         """Raise `InputError` for another detector than the model was fitted for; warn where a setting differs."""
-        check_same_detector(self.metadata.get("detector", {}), detector.settings(), self.title)
+        fitted, settings = self.metadata.get("detector", {}), detector.settings()
+        check_same_detector(fitted, {name: settings.get(name) for name in fitted}, self.title)
 
     def forward(
         self,
@@ -220,8 +223,11 @@ class FixationDensity(Pretrained):
             joined[shape] = joined[shape] + value if shape in joined else value
         hidden = self.shift[:, None, None]
         for shape, value in joined.items():
-            down, across = _placed(features, shape, (rows, columns), value)
-            hidden = hidden + down @ value @ across.mT
+            for axis, (start, end) in enumerate(_placed(features, shape)):
+                if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
+                    line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
+                    value = value @ line.mT if axis else line @ value
+            hidden = hidden + value
         units = self.mix.shape[-1]
         hidden = F.relu(hidden).flatten(2).unflatten(1, (-1, units))
         hidden = F.relu(self.mix @ hidden + self.mix_shift[..., None])
@@ -357,27 +363,28 @@ def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
 
 
 def _placed(
-    features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int], cells: tuple[int, int], like: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Matrices from the rows and columns of a feature map to those of the cells of the picture."""
+    features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First and last edge of the picture on a feature map, in rows and in columns of the map."""
     if not isinstance(features, FeatureMaps):
-        return tuple(_interpolation(n, 0.0, float(m), m, like) for n, m in zip(cells, shape, strict=True))  # type: ignore[return-value]
+        return (0, shape[0]), (0, shape[1])
     placement: Placement = features.placement
-    lines = []
-    for axis, (n, m) in enumerate(zip(cells, shape, strict=True)):
-        side = 1 - axis
-        pixels = features.canvas[side] / m
+    edges = []
+    for side, length in ((1, shape[0]), (0, shape[1])):
+        pixels = features.canvas[side] / length
         start = placement.offset[side] / pixels
-        end = (placement.offset[side] + placement.size[side] * placement.scale[side]) / pixels
-        lines.append(_interpolation(n, start, end, m, like))
-    return lines[0], lines[1]
+        edges.append((start, start + placement.size[side] * placement.scale[side] / pixels))
+    return edges[0], edges[1]
 
 
-def _interpolation(cells: int, start: float, end: float, length: int, like: Tensor) -> Tensor:
+@constant
+def _interpolation(
+    cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     """Bilinear interpolation at the centres of cells between two edges of a line of pixels, `(cells, length)`."""
-    centres = torch.arange(cells, device=like.device, dtype=like.dtype) + 0.5
+    centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
     place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
-    pixels = torch.arange(length, device=like.device, dtype=like.dtype)
+    pixels = torch.arange(length, device=device, dtype=dtype)
     return (1 - (place[:, None] - pixels).abs()).clamp(min=0)
 
 
