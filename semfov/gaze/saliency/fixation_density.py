@@ -68,7 +68,7 @@ class FixationDensity(Pretrained):
         {
             "read": Field(("U", "C"), _HALF),
             "shift": Field(("U",), low=-1e4, high=1e4),
-            "mix": Field(("R", "N", "N"), low=-1e4, high=1e4),
+            "mix": Field(("R", "N", "N"), _HALF),
             "mix_shift": Field(("R", "N"), low=-1e4, high=1e4),
             "out": Field(("R", "N"), low=-1e4, high=1e4),
             "blur": Field((), low=-10, high=5),
@@ -324,9 +324,9 @@ class FixationDensity(Pretrained):
         check(state["layers"] == self.layers, "state_dict", f"weights of {self.layers}", state["layers"])
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Tensors that are saved; the largest in half precision."""
+        """Tensors that are saved; the weights of the convolutions in half precision."""
         tensors = {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
-        return tensors | {"read": tensors["read"].to(_HALF)}
+        return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
 
     def digest(self) -> str:
         """Checksum of everything that results depend on."""

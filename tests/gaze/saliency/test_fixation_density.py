@@ -163,7 +163,7 @@ def test_a_saved_model_gives_the_same_density(model, maps, tmp_path):
     assert loaded.layers == model.layers
     path = 40 * rand(2, 3, 2)
     single = {name: each.float() for name, each in maps.items()}
-    # The largest tensor is stored with 11 significant bits.
+    # Weights are stored with 11 significant bits.
     torch.testing.assert_close(loaded(single, (39, 52), path), model(single, (39, 52), path), atol=1e-2, rtol=1e-3)
     loaded.save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
