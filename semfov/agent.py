@@ -35,8 +35,7 @@ from semfov.io.schema import is_number
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.paths import GazeRecord
-from semfov.paths.gaze import GazePrediction
+from semfov.paths import GazePrediction, GazeRecord
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye

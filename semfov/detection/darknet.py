@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.darknet_config import Section
-from semfov.detection.feature_maps import Step, landmarks
+from semfov.detection.feature_maps import NetworkStep, landmarks
 from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
 from semfov.io.files import check_regular
@@ -389,7 +389,8 @@ class Darknet(nn.Module):
                 same[index] = reads[0]
                 continue
             names = tuple(str(read) for read in reads if read >= 0)
-            steps.append(Step(str(index), round(float(self.steps[index])), names, isinstance(layer, Convolution)))
+            stride, convolution = round(float(self.steps[index])), isinstance(layer, Convolution)
+            steps.append(NetworkStep(str(index), stride, names, convolution))
         return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:

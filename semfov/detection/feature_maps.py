@@ -39,7 +39,7 @@ class FeatureMaps:
     detections: Detections
 
 
-class Step(NamedTuple):
+class NetworkStep(NamedTuple):
     """A step of a network: the map that it computes, its stride (None if it is no map), and the maps that it reads."""
 
     name: str
@@ -48,7 +48,7 @@ class Step(NamedTuple):
     convolution: bool
 
 
-def landmarks(steps: Sequence[Step]) -> dict[str, str]:
+def landmarks(steps: Sequence[NetworkStep]) -> dict[str, str]:
     """Names `backbone8`, `head8`, … of maps by the structure of a network, from its steps in order of computation.
 
     `backbone` is the first map of a stride that a coarser one is computed from (the coarsest: that a finer one is).

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semfov.detection.feature_maps import Step, stride_of
+from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_heads import cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
@@ -243,7 +243,7 @@ def with_outputs(path: Path, names: Iterable[str]) -> bytes:
     return model.SerializeToString()
 
 
-def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[Step]:
+def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[NetworkStep]:
     """The steps of a model in order, with the strides of the maps that follow from `image`, of `(width, height)`."""
     import onnx
 
@@ -260,5 +260,5 @@ def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[Step]
             shape = shapes.get(output, [])
             is_map = output in reached and len(shape) == 4 and min(shape[2:]) > 1
             stride = stride_of(canvas[0], shape[3]) if is_map else None
-            steps.append(Step(output, stride, tuple(node.input), node.op_type == "Conv"))
+            steps.append(NetworkStep(output, stride, tuple(node.input), node.op_type == "Conv"))
     return steps

@@ -11,14 +11,14 @@ from torch import nn
 from semfov import InputError, load_detector
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _yolov3_tiny
-from semfov.detection.feature_maps import Step, landmarks, stride_of
+from semfov.detection.feature_maps import NetworkStep, landmarks, stride_of
 from semfov.detection.onnx import load_onnx
 from semfov.detection.yolo import YoloV3
 from tests.small import Fixed, rand
 
 
 def step(name, stride, *reads, convolution=True):
-    return Step(name, stride, reads, convolution)
+    return NetworkStep(name, stride, reads, convolution)
 
 
 def test_landmarks_of_a_pyramid():

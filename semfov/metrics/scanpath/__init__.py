@@ -7,7 +7,7 @@ sequences need `pip install semfov[human]`.
 
 from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
-from semfov.metrics.scanpath.maps import auc_borji, auc_judd, auc_shuffled, correlation, kl_divergence, similarity
+from semfov.metrics.scanpath.maps import auc_borji, auc_judd, auc_shuffled, correlation, kullback_leibler, similarity
 from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
 from semfov.metrics.scanpath.performance import (
     found_at,
@@ -40,7 +40,7 @@ __all__ = [
     "edit_distance",
     "found_at",
     "information_gain",
-    "kl_divergence",
+    "kullback_leibler",
     "log_density",
     "log_likelihood",
     "mean_performance",

@@ -9,7 +9,7 @@ import numpy as np
 from semfov.data.fixations.record import Fixations, warn_outside
 from semfov.metrics.scanpath.beside import people_density
 from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
-from semfov.metrics.scanpath.maps import auc_judd, correlation, kl_divergence, similarity
+from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity
 from semfov.paths.gaze import GazePrediction
 
 
@@ -31,5 +31,5 @@ def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> 
         "log likelihood": float(log_likelihood(np.log(cells), x, y).mean()),
         "CC": float(correlation(cells, theirs)),
         "SIM": float(similarity(cells, theirs)),
-        "KL": float(kl_divergence(theirs, cells)),
+        "KL": float(kullback_leibler(theirs, cells)),
     }

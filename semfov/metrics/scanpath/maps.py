@@ -140,7 +140,7 @@ def similarity(first: ArrayLike, second: ArrayLike) -> _Array:
     return np.asarray(np.minimum(*_densities(first, second)).sum(-1))
 
 
-def kl_divergence(people: ArrayLike, model: ArrayLike) -> _Array:
+def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
     r"""Kullback-Leibler divergence of a model's density from that of people: :math:`\sum_u q(u) \ln (q(u) / p(u))`.
 
     Without the small constants that some programs add (Bylinskii et al., 2019, section 3.2).
@@ -155,8 +155,8 @@ def kl_divergence(people: ArrayLike, model: ArrayLike) -> _Array:
     Raises:
         InputError: the shapes differ, or a map has negative values or none above 0.
 
-    >>> kl_divergence([[1.0, 0.0]], [[1.0, 1.0]]).round(3)
-    array(0.693)
+    >>> float(kullback_leibler([[1.0, 0.0]], [[1.0, 1.0]]).round(3))
+    0.693
     """
     q, p = _densities(people, model)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -19,7 +19,7 @@ from semfov.metrics.scanpath import (
     auc_shuffled,
     correlation,
     information_gain,
-    kl_divergence,
+    kullback_leibler,
     log_density,
     log_likelihood,
     nss,
@@ -253,15 +253,15 @@ def test_correlation_equals_numpy():
 
 def test_kl_divergence_equals_scipy():
     first, second = np.random.default_rng(4).random((2, *SHAPE)) + 0.01
-    assert kl_divergence(first, second) == pytest.approx(entropy(first.ravel(), second.ravel()))
-    assert kl_divergence(first, 7 * first) == pytest.approx(0)
+    assert kullback_leibler(first, second) == pytest.approx(entropy(first.ravel(), second.ravel()))
+    assert kullback_leibler(first, 7 * first) == pytest.approx(0)
     hole = second.copy()
     hole[0, 0] = 0
-    assert kl_divergence(first, hole) == np.inf
+    assert kullback_leibler(first, hole) == np.inf
     first[0, 0] = 0
-    assert np.isfinite(kl_divergence(first, hole))
+    assert np.isfinite(kullback_leibler(first, hole))
     with pytest.raises(InputError, match="maps"):
-        kl_divergence(-first, second)
+        kullback_leibler(-first, second)
 
 
 def test_similarity_is_one_minus_the_total_variation():
