@@ -79,7 +79,8 @@ def test_another_picture_can_be_chosen(opened, hostile):
 def test_the_heat_map_has_the_densities(opened):
     """The most opaque pixel is the cell of the largest probability."""
     cells = drawn("b.png").prediction.cells
-    read = """each => [...each.getContext("2d").getImageData(0, 0, each.width, each.height).data].filter((_, n) => n % 4 == 3)"""
+    context = 'each.getContext("2d").getImageData(0, 0, each.width, each.height).data'
+    read = f"each => [...{context}].filter((_, n) => n % 4 == 3)"
     opacity = torch.tensor(opened.locator("#map").evaluate(read)).view(39, 52)
     assert int(opacity.max()) == int(opacity.flatten()[cells.argmax()])
     assert float(torch.corrcoef(torch.stack([opacity.flatten().float(), cells.flatten()]))[0, 1]) > 0.6
