@@ -187,14 +187,14 @@ def test_another_number_of_threads_or_process_opens_a_new_session(make_small, th
     detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     for number in threads():
         detector.propose(canvas)
-        session = detector._twin._opened[1]
+        session = detector._twin._opened[()][1]
         assert session.threads == number
         detector.propose(canvas)
-        assert detector._twin._opened[1] is session
+        assert detector._twin._opened[()][1] is session
     pid = os.getpid()
     monkeypatch.setattr(os, "getpid", lambda: pid + 1)
     detector.propose(canvas)
-    assert detector._twin._opened[1] is not session
+    assert detector._twin._opened[()][1] is not session
 
 
 @pytest.mark.parametrize("damage", [b"", b"half", None])
