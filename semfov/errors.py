@@ -1,6 +1,7 @@
 """Errors that a user can act on, and the checks that raise them."""
 
 import math
+import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -14,8 +15,20 @@ _ROUNDING = 1e-3
 Name = TypeVar("Name", bound=str)
 
 
+def printable(text: str) -> str:
+    """Text in which control characters, and bytes of names that are not UTF-8, are escaped; lines stay."""
+    steering = ("Cc", "Cf", "Cs")  # controls, marks of direction and lone surrogates
+    return "".join(
+        ascii(each)[1:-1] if unicodedata.category(each) in steering and each not in "\n\t" else each for each in text
+    )
+
+
 class SemfovError(Exception):
     """Base of every error that semfov raises on purpose; the message names what is wrong and how to correct it."""
+
+    def __str__(self) -> str:
+        """The message, in which names of files cannot steer a terminal."""
+        return printable(super().__str__())
 
 
 class InputError(SemfovError, ValueError):
@@ -184,8 +197,9 @@ def check_finite(tensor: Tensor, argument: str) -> None:
     Traceback (most recent call last):
     semfov.errors.InputError: gaze: expected finite numbers, got 1 of 2 that are not finite
     """
-    bad = int((~torch.isfinite(tensor)).sum())
-    check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
+    if values_known(tensor):
+        bad = int((~torch.isfinite(tensor)).sum())
+        check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[Name], what: str) -> Name:

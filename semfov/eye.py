@@ -4,14 +4,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from torch import Tensor, nn
+import torch
+from torch import Tensor
 
-from semfov.data.inputs import ImageLike, PointLike, as_image, as_points
+from semfov.data.inputs import ImageLike, PointLike, as_image, as_points, as_positions
 from semfov.detection.crops import merge_crops
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector, check_images
 from semfov.detection.placement import Placement, letterbox
 from semfov.errors import check, check_shape
+from semfov.io.state import StatedModule
 from semfov.sensor.base import Sensor
 from semfov.sensor.glimpse import glimpse, window_around
 
@@ -25,7 +27,7 @@ class View:
     state: Any
 
 
-class Eye(nn.Module):
+class Eye(StatedModule):
     """Applies a sensor to an image at the detector's resolution, and detects objects in the result.
 
     The image is first fitted into the detector's input, the canvas, and the sensor is applied there. An eye with a
@@ -56,6 +58,10 @@ class Eye(nn.Module):
         self.detector = detector
         self.reference = reference
 
+    def _stated(self) -> dict[str, Any]:
+        """The size that the settings of the sensor are for."""
+        return {"reference": self.reference}
+
     def open(self, image: ImageLike) -> View:
         """Fit an image into the detector's input, and compute what the sensor needs once per image.
 
@@ -73,7 +79,9 @@ class Eye(nn.Module):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.fit(image)
-        scale = canvas.new_tensor(placement.scale) * (max(placement.size) / self.reference)
+        scale = as_positions(torch.tensor(placement.scale, dtype=torch.float64), canvas) * (
+            max(placement.size) / self.reference
+        )
         return View(canvas, placement, self.sensor.open(canvas, scale))
 
     def fit(self, image: Tensor) -> tuple[Tensor, Placement]:
@@ -212,7 +220,7 @@ class Eye(nn.Module):
 
 def _points(fixations: PointLike, view: View) -> Tensor:
     """Fixations as `(F, 2)`; a single point becomes a batch of one."""
-    points = as_points(fixations, "fixations").to(view.canvas)
+    points = as_positions(as_points(fixations, "fixations"), view.canvas)
     points = points[None] if points.ndim == 1 else points
     check_shape(points, "fixations", None, 2)
     return points

@@ -269,6 +269,11 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_parameters(beta)
     soft = footprint.is_floating_point()
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
+    if soft and footprint.numel() and values_known(footprint):
+        # The minimum and the maximum of a tensor with a NaN are NaN.
+        least, most = footprint.detach().aminmax()
+        got = f"{float(least):g} to {float(most):g}"
+        check(bool((least >= 0) & (most <= 1)), "footprint", "weights from 0 to 1", got)
     return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
 
 

@@ -18,14 +18,15 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from semfov.agent import ActivePerception, How, PictureLike
+from semfov.agent import ActivePerception
+from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import ResultsFile, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.sources import embedded_picture
-from semfov.errors import InputError, SemfovError, check
+from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.head.world import World
 from semfov.io.code import package_digest
 from semfov.io.files import sha256, write_bytes
@@ -34,8 +35,7 @@ from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
 from semfov.report import write_page
 from semfov.runs.config import WHERE
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
+from semfov.runs.scene_run import SceneResults, digest_of
 from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 
@@ -99,6 +99,12 @@ class PictureJob(ABC):
                 return picture_outcome(record, source, self.options, seconds, self.agent.eye.settings())
         except SemfovError as error:
             return error
+        except Exception as error:
+            if not self.several:
+                raise
+            # One picture of many, whatever is wrong with it, is not the end of the command.
+            reason = " ".join(str(error).split()) or "no message"
+            return DataError(f"{source.name}: cannot be looked at ({type(error).__name__}: {reason})")
 
     def _shared(self, picture: PictureLike, source: PictureSource) -> dict[str, Any]:
         """Arguments that all subcommands share, and a bar for the passes in a single picture."""

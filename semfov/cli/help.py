@@ -49,7 +49,8 @@ _OUTPUT = """\
 A picture of several that cannot be read is reported and skipped; the exit code is then 1. If the command is stopped,
 the same command continues with the pictures that are left. --help-all: all options."""
 
-SEARCH = f"""\
+HELP = {
+    "search": f"""\
 semfov search: is it there, and where?
 
   semfov search kitchen.jpg --target cup
@@ -68,9 +69,8 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
   --closer N           most closer looks at places that seem to hold the target (0: none)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
-"""
-
-FIND = f"""\
+""",
+    "find": f"""\
 semfov find: all objects, and how many
 
   semfov find harbour.tif --target person
@@ -89,9 +89,8 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
   --least P            objects count from this probability on, in small pictures from this score on
   --batch N            windows that are looked at together
 {_OUTPUT}
-"""
-
-EXPLORE = f"""\
+""",
+    "explore": f"""\
 semfov explore: what is where
 
   semfov explore street.jpg
@@ -108,9 +107,8 @@ usage: semfov explore [PICTURE ...] [options]
                        picture to show this many new objects (default 0.1 and 0.01)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
-"""
-
-GAZE = """\
+""",
+    "gaze": """\
 semfov gaze: where people look in a picture that they view freely
 
   semfov gaze poster.jpg --report poster.html
@@ -130,9 +128,8 @@ usage: semfov gaze [PICTURE ...] [options]
 
 It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
 pages of text or to interfaces. --help-all: all options.
-"""
-
-LIVE = f"""\
+""",
+    "live": f"""\
 semfov live: one look at each frame of a video, a camera or a network stream
 
   semfov live --camera 0 --target cup
@@ -156,9 +153,8 @@ usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] 
   --out FILE           video to write, with gaze and belief, or windows and objects
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
-"""
-
-FIT = """\
+""",
+    "fit": """\
 semfov fit: fit all models to your own detector
 
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
@@ -179,9 +175,8 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
 scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
-"""
-
-LIST_DETECTORS = """\
+""",
+    "detectors": """\
 semfov detectors: detectors that can be named, or the classes of one
 
   semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
@@ -194,7 +189,9 @@ usage: semfov detectors [NAME]
 
 Weights are downloaded when a detector is first used, into $SEMFOV_CACHE or the user's cache folder. A detector without
 shipped models runs with --agent raw, or after semfov fit.
-"""
+""",
+}
+"""The help of each subcommand: one screen."""
 
 _COMMANDS = {
     "agent.classes lists": "`semfov detectors NAME` lists",

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from semfov.agent import How
-from semfov.agents.limits import MOST_PASSES
+from semfov.agents.episode import MOST_PASSES
+from semfov.agents.picture import How
 from semfov.errors import InputError
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
 from semfov.runs.workers import Where

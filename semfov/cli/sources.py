@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.agent import ActivePerception, How, PictureLike
+from semfov.agent import ActivePerception
+from semfov.agents.picture import How, PictureLike
 from semfov.belief.grid import Grid
 from semfov.data.large import picture_size
 from semfov.data.sources import Picture, is_video, picture_files
-from semfov.errors import check
+from semfov.errors import check, printable
 from semfov.head import Flat, Panorama
 
 
@@ -42,8 +43,11 @@ class PictureSource:
         """What changes with the file: its name, size and time of change."""
         if self.file is None:
             return [self.name]
-        status = self.file.stat()
-        return [str(self.file.resolve()), status.st_size, status.st_mtime_ns]
+        try:
+            status = self.file.stat()
+        except OSError:  # a link to nothing is skipped when it is opened
+            return [self.name]
+        return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
 
 def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
@@ -53,7 +57,7 @@ def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
-        sources += [PictureSource(str(each), each) for each in picture_files(path)]
+        sources += [PictureSource(printable(str(each)), each) for each in picture_files(path)]
     return sources
 
 

@@ -15,7 +15,8 @@ from semfov.io.files import check_regular, inside
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
 
-_MOST_SIDE = 2**20  # pixels
+MOST_SIDE = 2**20
+"""Longest side in pixels of a picture that is read by windows."""
 
 _BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
 # Files beside a raster (.ovr, .aux.xml) may be rasters of any driver themselves, or name others. Threads of a mosaic
@@ -64,10 +65,10 @@ def open_raster(path: str | PathLike[str]) -> Any:
     driver = _DRIVERS[path.suffix.lower()]
     source = io.BytesIO(mosaic_text(path)) if driver == "VRT" else path.absolute()
     file = _without_others(rasterio.open(source, driver=driver), path)
-    if max(file.width, file.height) > _MOST_SIDE:
+    if max(file.width, file.height) > MOST_SIDE:
         got = f"{file.width} × {file.height}"
         file.close()
-        raise DataError(f"{path}: expected at most {_MOST_SIDE:,} pixels along a side, got {got}; divide it")
+        raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}; divide it")
     return file
 
 

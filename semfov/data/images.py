@@ -1,5 +1,6 @@
 """Reading image files of any common format into RGB tensors."""
 
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +25,9 @@ FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "BM
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
+_SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
+_SMALL = 2**24  # pixels of a picture that may be blank
+_MOST_A_BYTE = 2**11  # pixels; the best of the common packers keeps about a thousand numbers in a byte
 _ORIENTATION_TAG = 0x0112
 _PHOTOMETRIC_TAG = 0x0106
 # Moves that turn a picture with this orientation upright. All are their own inverse except 6 and 8, which are inverse
@@ -72,9 +76,9 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
         try:
-            check_regular(path, name)
             with open_pillow(path) as image:
                 _check_pixels(image.size, name)
+                check_proportion(image, path)
                 array = _pixels(image, name, upright=oriented)
         except DataError:
             raise
@@ -87,7 +91,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
                 f"{name}: not an image in a format that is read ({', '.join(FORMATS)}); convert it"
             ) from None
         except Image.DecompressionBombError:
-            raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; reduce the image") from None
+            raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; {_SMALLER}") from None
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"{name}: truncated, damaged or of an unsupported kind ({reason}); replace it") from error
@@ -99,10 +103,34 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
     """The Pillow image of a file in one of `FORMATS`, not decoded yet."""
     from PIL import Image
 
+    check_regular(path, f"image {Path(path)}")
     Image.init()
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, Image.open(file, formats=[n for n in FORMATS if n in Image.OPEN]) as image:
+        if image.format == "TIFF":
+            tags = image.tag_v2
+            side = (tags[322], tags[323]) if 322 in tags else (image.width, tags.get(278, image.height))
+            bits = tags.get(258, (1,))
+            size = math.prod(side) * max(tags.get(277, 1), len(bits)) * max(bits) // 8
+            for count in tags.get(325 if 322 in tags else 279, ()):
+                check_tile(size, count, f"image {Path(path)}")
         yield image
+
+
+def check_proportion(image: Any, path: str | PathLike[str]) -> None:
+    """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
+    pixels, size = math.prod(image.size), Path(path).stat().st_size
+    if pixels > _SMALL and pixels > _MOST_A_BYTE * size:
+        got = f"{pixels:,} pixels in {size:,} bytes"
+        raise DataError(f"image {Path(path)}: expected a file in proportion, got {got}; replace it")
+
+
+def check_tile(size: int, stored: int, name: str) -> None:
+    """Raise `DataError` for a tile (or strip) that is stored in far more or far fewer bytes than its pixels take."""
+    if stored > 2 * size + 2**16:
+        raise DataError(f"{name}: expected tiles of {size:,} bytes, got one that is stored in {stored:,}; replace it")
+    if stored and size > 3 * _SMALL and size > _MOST_A_BYTE * stored:
+        raise DataError(f"{name}: expected tiles in proportion, got {size:,} bytes stored in {stored:,}; replace it")
 
 
 def from_pillow(image: Any, name: str) -> Tensor:
@@ -143,7 +171,7 @@ def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
 def _check_pixels(size: tuple[int, int], name: str) -> None:
     width, height = size
     if not 0 < width * height <= MAX_PIXELS:
-        raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; reduce or replace it")
+        raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; {_SMALLER}")
 
 
 def orientation(image: Any) -> int:
@@ -175,17 +203,22 @@ def _pixels(image: Any, name: str, *, upright: bool) -> NDArray[np.float32]:
 
 def _rgb(image: Any, name: str) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1] of a Pillow image of any mode."""
-    from PIL import Image
-
     if image.mode in _SIXTEEN_BITS or image.mode == "F":
         grey = np.asarray(image, dtype=np.float32)
         white = 1.0 if image.mode == "F" else 65535.0
         if not (grey.min() >= 0 and grey.max() <= white):  # also refuses NaN
             raise DataError(f"{name}: expected values from 0 to {white:g} in mode {image.mode}; convert it to 8 bits")
         return np.repeat(grey[..., None] / np.float32(white), 3, axis=-1)
-    if "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
-        if image.mode == "La":
-            image = image.convert("LA")
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
+    return np.asarray(over_white(image).convert("RGB"), dtype=np.float32) / np.float32(255)
+
+
+def over_white(image: Any) -> Any:
+    """A Pillow image, whose transparent pixels are blended with white."""
+    from PIL import Image
+
+    if not ("transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")):
+        return image
+    if image.mode == "La":
+        image = image.convert("LA")
+    image = image.convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)

@@ -76,11 +76,18 @@ def as_images(
 
     Shapes: → `(B, 3, H, W)`.
     """
-    pixels = channels_first(pixels_of(images, argument), argument, choose=isinstance(images, Tensor))
+    pixels = channels_first(pixels_of(images, argument), argument, choose=not isinstance(images, np.ndarray))
     pixels = in_rgb(pixels, images, color)
     pixels = _in_unit(pixels, like, argument)
     check_pixels(pixels, argument)
     return pixels
+
+
+def as_batch(images: ImageLike) -> Tensor:
+    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
+    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
+        return images
+    return as_images(images)
 
 
 def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
@@ -160,6 +167,15 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
         raise InputError(f"{argument}: expected numbers (x, y), or several such pairs, got {points!r}") from None
     check(array.shape[-1:] == (2,), argument, "(x, y), or several such pairs", points)
     return torch.from_numpy(array.copy())
+
+
+def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
+    """Positions with the device and precision of a tensor (None: their own), but float32 at least.
+
+    Half precision is off by pixels from 2,048 pixels on, and whole numbers cut the fractions of what is added to them.
+    """
+    base = values if like is None else like
+    return values.to(base.device, torch.promote_types(base.dtype, torch.float32))
 
 
 def _from_numpy(array: NDArray[Any], argument: str) -> Tensor:

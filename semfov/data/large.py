@@ -1,7 +1,9 @@
 """Large pictures that are read window by window: arrays, memory maps, TIFFs, rasters, and files decoded when needed."""
 
+import lzma
 import warnings
 import weakref
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,8 +17,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.gdal import open_raster, raster_settings
-from semfov.data.images import open_pillow, orientation, read_image, turned
+from semfov.data.gdal import MOST_SIDE, open_raster, raster_settings
+from semfov.data.images import (
+    MAX_PIXELS,
+    check_proportion,
+    check_tile,
+    open_pillow,
+    orientation,
+    over_white,
+    read_image,
+    turned,
+)
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.reduction import (
     FIRST,
@@ -39,8 +50,14 @@ RASTERS = (".vrt", ".jp2")
 
 _ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
 _TILED = (".tif", ".tiff")
-_PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
-_WHITE_IS_ZERO, _PALETTE = 0, 3  # photometric interpretations of a TIFF
+_PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
+_WHITE_IS_ZERO, _PALETTE, _YCBCR = 0, 3, 6  # photometric interpretations of a TIFF
+_PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a fourth channel
+_JPEG = 7
+_WIDTH, _HEIGHT, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES = 256, 257, 259, 262, 274, 277
+_INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
+_INFLATERS = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+"""Decoders of compressions whose data may inflate a thousandfold, by their numbers in a TIFF."""
 
 
 class LargePicture(ABC):
@@ -152,6 +169,7 @@ class _PhotographPicture(LargePicture):
         self.path = Path(path)
         self._array: NDArray[np.uint8] | None = None
         with _opening(self.path, "opened"), open_pillow(self.path) as image:
+            check_proportion(image, self.path)
             self.size = _upright_size(image)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
@@ -162,7 +180,7 @@ class _PhotographPicture(LargePicture):
     def _whole(self) -> NDArray[np.uint8]:
         if self._array is None:
             with _opening(self.path, "decoded"), open_pillow(self.path) as image:
-                if image.mode in _PLAIN and "transparency" not in image.info:
+                if image.mode in _PLAIN:
                     stored = orientation(image)
                     image.load()
                     self._array = _rgb(turned(image, stored, orientation(image), upright=True))
@@ -177,7 +195,7 @@ def _rgb(image: "Image") -> NDArray[np.uint8]:
     array = np.empty((height, width, 3), np.uint8)
     for top in range(0, height, _ROWS):
         rows = image.crop((0, top, width, min(top + _ROWS, height)))
-        array[top : top + _ROWS] = np.asarray(rows.convert("RGB"))
+        array[top : top + _ROWS] = np.asarray(over_white(rows).convert("RGB"))
     return array
 
 
@@ -209,8 +227,10 @@ class _TiffPicture(LargePicture):
         if page.compression not in tifffile.TIFF.DECOMPRESSORS:
             packed = page.compression.name
             raise DataError(f"{path}: expected imagecodecs for {packed} compression; pip install imagecodecs")
-        self._page = page
+        self._page, self._alpha = page, shape[2:] == (4,) and [*page.extrasamples][:1]
         self.size = shape[1], shape[0]
+        if max(self.size) > MOST_SIDE:
+            raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {shape[1]} × {shape[0]}")
 
     @property
     def has_overviews(self) -> bool:
@@ -228,7 +248,7 @@ class _TiffPicture(LargePicture):
         x1, y1, x2, y2 = box
         page = self._page
         wide, high = (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
-        across = -(-self.size[0] // wide)
+        across, size = -(-self.size[0] // wide), wide * high * page.samplesperpixel * page.dtype.itemsize
         window = np.zeros((y2 - y1, x2 - x1, 3), np.uint8)
         numbers = [
             row * across + column
@@ -240,7 +260,9 @@ class _TiffPicture(LargePicture):
             if not count:
                 continue  # a tile that is not stored in the file is black
             self._file.filehandle.seek(offset)
+            check_tile(size, count, f"image {self.path}")
             data = self._file.filehandle.read(count)
+            _check_inflated(data, page.compression, size, self.path)
             tile = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
             top, left = number // across * high, number % across * wide
             tile = tile[: self.size[1] - top, : self.size[0] - left]
@@ -248,12 +270,17 @@ class _TiffPicture(LargePicture):
             columns = slice(max(x1 - left, 0), min(x2 - left, tile.shape[1]))
             at = slice(top + rows.start - y1, top + rows.stop - y1)
             along = slice(left + columns.start - x1, left + columns.stop - x1)
-            window[at, along] = self._bytes(tile[rows, columns, : min(3, tile.shape[-1])])
+            window[at, along] = self._bytes(tile[rows, columns])
         return window
 
     def _bytes(self, tile: NDArray[Any]) -> NDArray[np.uint8]:
-        """Grey or RGB bytes, in which 0 is black."""
+        """Grey or RGB bytes, in which 0 is black; transparent pixels are blended with white."""
         tile = _from_16(tile)
+        if self._alpha in ([_PREMULTIPLIED], [_UNASSOCIATED]):
+            share = tile[..., 3:].astype(np.uint16)
+            colour = tile[..., :3] if self._alpha == [_PREMULTIPLIED] else (tile[..., :3] * share + 127) // 255
+            return np.minimum(colour + (255 - share), 255).astype(np.uint8)
+        tile = tile[..., : min(3, tile.shape[-1])]
         return 255 - tile if self._page.photometric == _WHITE_IS_ZERO else tile
 
 
@@ -335,15 +362,27 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
     if not isinstance(source, str | PathLike):
         return _MemoryPicture(source, color=color)
     check_local(source, "picture")
-    if Path(source).suffix.lower() in RASTERS:
-        return _RasterPicture(source)
-    if Path(source).suffix.lower() in _TILED:
-        return _tiff(source)
-    return _PhotographPicture(source)
+    kind = Path(source).suffix.lower()
+    if kind in RASTERS:
+        return _raster(source)
+    return _tiff(source) if kind in _TILED else _PhotographPicture(source)
+
+
+def _raster(path: str | PathLike[str]) -> LargePicture:
+    """A raster read by windows; JPEG 2000 by Pillow where rasterio is not there."""
+    try:
+        return _RasterPicture(path)
+    except DataError:
+        if Path(path).suffix.lower() == ".jp2":
+            with suppress(DataError):
+                return _PhotographPicture(path)
+        raise
 
 
 def _tiff(path: str | PathLike[str]) -> LargePicture:
     """A TIFF read by windows; by rasterio if it has overviews, or of a kind that `tifffile` leaves; else by Pillow."""
+    if _is_converted(path):
+        return _PhotographPicture(path)
     try:
         tiff = _TiffPicture(path)
         if not tiff.has_overviews:
@@ -360,6 +399,26 @@ def _tiff(path: str | PathLike[str]) -> LargePicture:
         return _RasterPicture(path)
     except DataError:
         return tiff
+
+
+def _is_converted(path: str | PathLike[str]) -> bool:
+    """Whether a TIFF is turned, or of other colours than grey and RGB, or grey with alpha: Pillow converts these."""
+    try:
+        with open_pillow(path) as image:
+            tags = getattr(image, "tag_v2", {})
+    except Exception:  # files that Pillow does not read are left to other readers
+        return False
+    kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
+    unusual = kind > _PALETTE and (kind, packed) != (_YCBCR, _JPEG)
+    return unusual or tags.get(_ORIENTATION, 1) != 1 or tags.get(_SAMPLES, 1) == 2
+
+
+def _check_inflated(data: bytes, compression: int, size: int, path: Path) -> None:
+    """Raise `DataError` for a tile that inflates to far more bytes than its pixels take."""
+    make = _INFLATERS.get(int(compression))
+    most = 2 * size + 2**16
+    if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
+        raise DataError(f"image {path}: expected tiles of {size:,} bytes, got one that inflates to more; replace it")
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
@@ -389,8 +448,12 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
 
 def _upright_size(image: "Image") -> tuple[int, int]:
     """Size of a Pillow image after it is turned upright."""
-    width, height = image.size
-    return (height, width) if orientation(image) >= 5 else (width, height)
+    if orientation(image) < 5:
+        return image.size
+    # Pillow swaps the sides of TIFFs itself before it turns them.
+    tags = getattr(image, "tag_v2", {})
+    width, height = tags.get(_WIDTH, image.size[0]), tags.get(_HEIGHT, image.size[1])
+    return height, width
 
 
 def _by_rows(shape: tuple[int, ...]) -> bool:
@@ -411,5 +474,8 @@ def _opening(path: Path, what: str) -> Iterator[None]:
         except SemfovError:
             raise
         except Exception as error:  # decoders of damaged files raise errors of many kinds
+            if type(error).__name__ == "DecompressionBombError":
+                most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
+                raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None

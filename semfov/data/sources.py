@@ -17,7 +17,10 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+PHOTOGRAPHS = (
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".heic", ".heif", ".bmp", ".dib", ".tif", ".tiff"),
+    *(".gif", ".jp2", ".j2k", ".jpx", ".ppm", ".pgm", ".pnm"),
+)
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 
 _PLAYLIST = b"#EXTM3U"
@@ -38,7 +41,9 @@ def picture_files(source: Path) -> list[Path]:
     _check_there(source)
     if not source.is_dir():
         return [source]
-    files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
+    # Names that begin with a dot are notes of the system, such as the ._a.jpg of an Apple disk.
+    there = (path for path in source.iterdir() if not path.name.startswith("."))
+    files = sorted(path for path in there if path.suffix.lower() in PHOTOGRAPHS)
     if not files:
         kinds = f"({', '.join(PHOTOGRAPHS)})"
         raise DataError(f"picture: expected photographs {kinds} in {source}, got none; folders in it are not searched")

@@ -3,9 +3,10 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps, no_features
@@ -15,6 +16,7 @@ from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
 from semfov.errors import InputError, check, check_pixels, check_whole
+from semfov.io.state import StatedModule
 
 FAINT = 0.002
 """Confidence from which on a candidate is a hint, unless the head has another one."""
@@ -22,7 +24,7 @@ FAINT = 0.002
 _LARGEST = 65_536  # largest side of a canvas in pixels
 
 
-class Detector(nn.Module, ABC):
+class Detector(StatedModule, ABC):
     """Base of detectors: from images to `Detections` with the full score vector of every box.
 
     A subclass implements `propose`, which takes canvases (images already fitted to the detector's input) and returns
@@ -224,6 +226,10 @@ class Detector(nn.Module, ABC):
         raise InputError(
             f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"
         )
+
+    def _stated(self) -> dict[str, Any]:
+        """Names of the classes, in the order of the scores."""
+        return {"classes": self.classes}
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
 
 _Column = NDArray[np.float32]
@@ -131,6 +132,7 @@ def merge_boxes(
     check_shape(box, "boxes", None, 4)
     check_shape(value, "scores", len(box))
     check_shape(label, "labels", len(box))
+    check(bool((box[:, :2] <= box[:, 2:]).all()), "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")
     check(bool(((value >= 0) & (value <= 1)).all()), "scores", "numbers from 0 to 1", value.tolist()[:3])
     for name, number in (("score", score), ("iou", iou), ("inside", inside)):
         check_number(number, name, 0, 1)
@@ -224,6 +226,9 @@ def _unlike(
     area = ((x2 - x1) * (y2 - y1))[:count]
     union = area[first] + area[second] - shared
     same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    # Boxes without area share none; equal ones are one object all the same.
+    empty = np.flatnonzero(union <= 0)
+    same[empty] = (corners[first[empty]] == corners[second[empty]]).all(-1)
     part = shared / np.maximum(area, 1e-6)[second]
     same |= (part >= np.float32(inside)) & broken[second] & (looks[first] != looks[second])
     return torch.from_numpy(_survivors(count, first[same], second[same]))
@@ -235,7 +240,7 @@ def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
         tensor = torch.as_tensor(values, device="cpu").detach()
     except (TypeError, ValueError, RuntimeError):
         raise InputError(f"{name}: expected numbers, got {values!r:.80}") from None
-    tensor = tensor if tensor.is_floating_point() else tensor.float()
+    tensor = as_positions(tensor)
     check(bool(tensor.isfinite().all()), name, "finite numbers", "infinite ones or NaN")
     return tensor
 
@@ -249,7 +254,7 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     Shapes: start `(N,)`, end `(N,)` → `(P,)`.
     """
     stop = start.searchsorted(end, side="right")
-    count = stop - np.arange(1, len(start) + 1)
+    count = np.maximum(stop - np.arange(1, len(start) + 1), 0)
     first = np.arange(len(start)).repeat(count)
     # The pairs of an interval stand together, and the last of them is with interval `stop - 1`.
     second = np.arange(len(first)) + (stop - count.cumsum()).repeat(count)
@@ -267,7 +272,7 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
     """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
 
-    >>> survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
+    >>> _survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
     array([0, 2])
 
     Shapes: better `(P,)`, worse `(P,)`.

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape
 
 
@@ -43,6 +44,7 @@ class Placement:
             `(..., 2)` in canvas pixels.
         """
         check_shape(points, "points", 2)
+        points = as_positions(points)
         scale, offset = points.new_tensor(self.scale), points.new_tensor(self.offset)
         return (points + 0.5) * scale + offset - 0.5
 
@@ -56,6 +58,7 @@ class Placement:
             `(..., 4)` in image pixels.
         """
         check_shape(boxes, "boxes", 4)
+        boxes = as_positions(boxes)
         scale, offset = boxes.new_tensor(self.scale * 2), boxes.new_tensor(self.offset * 2)
         image = (boxes - offset) / scale
         limit = boxes.new_tensor(self.size * 2, dtype=boxes.dtype)

@@ -6,11 +6,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.errors import DataError, InputError, check
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import METADATA, Schema, Text
+from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, find, read, write_file
 from semfov.version import __version__
 
@@ -18,7 +19,7 @@ _COMMON = ("kind", "version", "metadata")
 _ENVELOPE = Schema({}, {"version": Text(), "metadata": METADATA})
 
 
-class Pretrained(nn.Module):
+class Pretrained(StatedModule):
     """Base of modules that are saved to a file: tensors, and JSON values that describe them."""
 
     kind: ClassVar[str]
@@ -33,7 +34,11 @@ class Pretrained(nn.Module):
 
     def _tensors(self) -> dict[str, Tensor]:
         """Tensors that are saved."""
-        return self.state_dict()
+        return without_settings(self.state_dict())
+
+    def _stated(self) -> dict[str, Any]:
+        """The values of the record that tell what the numbers are of."""
+        return {name: value for name, value in self._record().items() if name in ("classes", "edges", "epsilon")}
 
     @classmethod
     @abstractmethod
@@ -55,7 +60,7 @@ class Pretrained(nn.Module):
         Returns:
             The sha256 in hexadecimal.
         """
-        return checksum(self.state_dict(), {"kind": self.kind, **self._record()})
+        return checksum(without_settings(self.state_dict()), {"kind": self.kind, **self._record()})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:

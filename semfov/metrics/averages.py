@@ -21,6 +21,7 @@ def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
     >>> standard_error(np.array([1.0, 3.0]))
     array(1.)
     """
+    values = np.asarray(values, dtype=np.float64)
     count = values.shape[axis]
     if count < 2:
         return np.full(np.delete(values.shape, axis), np.nan)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check
+from semfov.metrics.labels import as_labels
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,17 @@ class Bootstrap:
         cls, measure: Callable[[Tensor], Tensor], groups: Sequence[Hashable], *, samples: int = 1000, seed: int = 0
     ) -> Self:
         """Measure all cases, and samples of them; measure `(M,)`."""
-        check(len(groups) > 0, "groups", "the group of at least one case", "none")
+        names = as_labels(groups, "groups")
+        check(len(names) > 0, "groups", "the group of at least one case", "none")
         check(samples >= 2, "samples", "2 or more", samples)
         members: dict[Hashable, list[int]] = {}
-        for case, group in enumerate(groups):
+        for case, group in enumerate(names):
             members.setdefault(group, []).append(case)
         cases = [torch.tensor(group) for group in members.values()]
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.randint(len(cases), (samples, len(cases)), generator=generator).tolist()
         figures = [measure(torch.cat([cases[group] for group in sample])) for sample in drawn]
-        return cls(measure(torch.arange(len(groups))), torch.stack(figures))
+        return cls(measure(torch.arange(len(names))), torch.stack(figures))
 
     @property
     def error(self) -> Tensor:

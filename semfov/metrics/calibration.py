@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape
+from semfov.metrics.labels import as_numbers, as_outcomes
+
+_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,22 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
 
     Shapes: probabilities `(M, K+1)`, labels `(M,)`.
     """
-    check_shape(probabilities, "probabilities", None, None)
-    check_shape(labels, "labels", probabilities.shape[0])
+    p = _probabilities(probabilities, "probabilities")
+    check_shape(p, "probabilities", None, None)
+    numbers = as_numbers(labels, "labels")
+    labels = numbers.to(p.device, torch.int64)
+    broken = numbers[numbers != numbers.floor()].tolist()
+    check(not broken, "labels", "whole numbers", broken[0] if broken else "")
+    check_shape(labels, "labels", p.shape[0])
     check(bins >= 1, "bins", "at least 1", bins)
-    p = probabilities.double()
     if not len(labels):
         return Calibration(0, *[float("nan")] * 5)
+    total, last = p.detach().sum(1), p.shape[1] - 1
+    least, most = float(total.min()), float(total.max())
+    sums = least >= 1 - _ROUNDING and most <= 1 + _ROUNDING
+    check(sums, "probabilities", "rows that sum to 1", f"sums from {least:g} to {most:g}; give logits.softmax(-1)")
+    low, high = int(labels.min()), int(labels.max())
+    check(low >= 0 and high <= last, "labels", f"numbers of classes from 0 to {last}", f"{low} to {high}")
     true = p.gather(1, labels[:, None])[:, 0]
     confidence, predicted = p.max(1)
     return Calibration(
@@ -53,6 +66,17 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
         ),
         accuracy=float((predicted == labels).double().mean()),
     )
+
+
+def _probabilities(values: Tensor, argument: str) -> Tensor:
+    """Probabilities as float64; refuses numbers outside [0, 1] and NaN."""
+    p = as_numbers(values, argument).double()
+    least, most = (float(p.detach().min()), float(p.detach().max())) if p.numel() else (0.0, 0.0)
+    inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
+    check(
+        inside, argument, "probabilities from 0 to 1", f"{least:g} to {most:g}; give logits.sigmoid() or .softmax(-1)"
+    )
+    return p
 
 
 def surprisal(probability: Tensor) -> Tensor:
@@ -104,7 +128,7 @@ def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000,
     >>> errors_by_chance(torch.tensor([1.0, 0.0])).max()
     tensor(0., dtype=torch.float64)
     """
-    p = confidence.detach().to("cpu", torch.float64)
+    p = _probabilities(confidence, "confidence").detach().cpu()
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.rand(samples, len(p), generator=generator, dtype=torch.float64) < p
     return torch.stack([calibration_error(p, outcome, bins) for outcome in drawn])
@@ -113,7 +137,7 @@ def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000,
 def _error_of(bins: Tensor) -> Tensor:
     """Expected calibration error from the sums of `reliability`.
 
-    >>> error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
+    >>> _error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
     tensor(0.1500)
 
     Shapes: bins `(3, bins)`.
@@ -133,8 +157,10 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
     Shapes: confidence `(M,)`, correct `(M,)` → `(3, bins)`.
     """
     edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
-    p = confidence.detach().to("cpu", torch.float64).contiguous()
-    values = torch.stack([torch.ones_like(p), p, correct.to(p)])
+    p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
+    right = as_outcomes(correct, "correct")
+    check_shape(right, "correct", len(p))
+    values = torch.stack([torch.ones_like(p), p, right.to(p)])
     return torch.zeros(3, len(edges) + 1, dtype=torch.float64).index_add_(1, torch.bucketize(p, edges), values)
 
 
@@ -176,12 +202,13 @@ class BinarySums:
     @classmethod
     def of(cls, probability: Tensor, outcome: Tensor) -> Self:
         """Sum over predictions; probability `(M,)`, outcome `(M,)`."""
-        check_shape(probability, "probability", None)
-        check_shape(outcome, "outcome", len(probability))
-        p = probability.detach().double()
-        cost = surprisal(torch.where(outcome, p, 1 - p))
-        square = (p - outcome.double()).square()
-        return cls(reliability(p, outcome, cls.EDGES), float(cost.sum()), float(square.sum()))
+        p = _probabilities(probability, "probability").detach()
+        came = as_outcomes(outcome, "outcome").to(p.device)
+        check_shape(p, "probability", None)
+        check_shape(came, "outcome", len(p))
+        cost = surprisal(torch.where(came, p, 1 - p))
+        square = (p - came.double()).square()
+        return cls(reliability(p, came, cls.EDGES), float(cost.sum()), float(square.sum()))
 
     @classmethod
     def nothing(cls) -> Self:

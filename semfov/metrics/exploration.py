@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation
+from semfov.metrics.labels import as_outcomes
 
 _Array = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
     """
     best = beta == beta.amax(-1, keepdim=True)
     # Sums of a short dimension take a seventh of the time of `any`.
-    return ((best & answers).sum(-1) > 0) & (best.sum(-1) == 1)
+    return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
 
 
 def success_rate(right: Sequence[int], cells: int) -> _Array:

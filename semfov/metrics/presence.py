@@ -3,10 +3,21 @@
 import math
 from bisect import bisect_right
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.errors import check
+from semfov.errors import check, check_number, check_shape
+from semfov.metrics.labels import as_numbers, as_outcomes
+
+
+def _cases(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Scores of the cases with the target, and of those without; there is at least one of each."""
+    scores = as_numbers(score, "score")
+    there = as_outcomes(present, "present").to(scores.device)
+    check_shape(there, "present", *scores.shape)
+    check(bool(there.any() and not there.all()), "present", "both true and false values", "only one of the two")
+    return scores[there].double(), scores[~there].double()
 
 
 def area_under_roc(score: Tensor, present: Tensor) -> float:
@@ -21,8 +32,8 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
     Shapes: score `(M,)`, present `(M,)`.
     """
-    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
-    hit, miss = score[present].double(), score[~present].double().sort().values
+    hit, miss = _cases(score, present)
+    miss = miss.sort().values
     below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
     return float(below.double().mean() / (2 * len(miss)))
 
@@ -30,12 +41,13 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 def _threshold_for(absent: Tensor, share: float) -> float:
     """The lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
 
-    >>> threshold_for(torch.tensor([0.1, 0.2, 0.3, 0.9]), 0.25) <= 0.31
+    >>> _threshold_for(torch.tensor([0.1, 0.2, 0.3, 0.9]), 0.25) <= 0.31
     True
 
     Shapes: absent `(M,)`.
     """
     check(len(absent) > 0, "absent", "at least one case without the target", "none")
+    check_number(share, "share", 0, 1)
     count = len(absent)
     # A product of floats can fall on the wrong side of a whole number: 0.29 · 100 is less than 29.
     allowed = bisect_right(range(1, count + 1), share, key=lambda alarms: alarms / count)
@@ -53,7 +65,8 @@ def hits_at(score: Tensor, present: Tensor, share: float) -> float:
 
     Shapes: score `(M,)`, present `(M,)`.
     """
-    return float((score[present].double() >= _threshold_for(score[~present], share)).double().mean())
+    hit, miss = _cases(score, present)
+    return float((hit >= _threshold_for(miss, share)).double().mean())
 
 
 def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
@@ -64,8 +77,8 @@ def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
 
     Shapes: score `(M,)`, present `(M,)`.
     """
-    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
-    levels = score.unique(sorted=True).flip(0)[:, None]
-    positive = score >= levels
-    shares = [(positive[:, kind].double().mean(1)).tolist() for kind in (~present, present)]
-    return [0.0, *shares[0]], [0.0, *shares[1]]
+    # NumPy sorts faster than torch on one thread.
+    hit, miss = (np.sort(kind.detach().cpu().numpy()) for kind in _cases(score, present))
+    levels = np.unique(np.concatenate([hit, miss]))[::-1]
+    shares = [1 - np.searchsorted(kind, levels) / len(kind) for kind in (miss, hit)]
+    return [0.0, *shares[0].tolist()], [0.0, *shares[1].tolist()]

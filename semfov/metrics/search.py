@@ -17,7 +17,8 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> _Array:
     Shapes: found_at `(..., episodes)` → `(..., shifts+1)`.
     """
     steps = np.arange(shifts + 1)
-    found = (found_at[..., None] >= 0) & (found_at[..., None] <= steps)
+    when = np.asarray(found_at)[..., None]
+    found = (when >= 0) & (when <= steps)
     return np.asarray(found.mean(-2), dtype=np.float64)
 
 

@@ -41,8 +41,7 @@ def log_normaliser(alpha: Tensor) -> Tensor:
     >>> log_normaliser(torch.tensor([1.0, 1.0, 1.0]))
     tensor(-0.6931)
     """
-    _check_parameters(alpha, "alpha")
-    return alpha.lgamma().sum(-1) - alpha.sum(-1).lgamma()
+    return _log_normaliser(alpha, "alpha").to(alpha.dtype)
 
 
 def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
@@ -66,7 +65,11 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
     tensor(0.6931)
     """
     check_shape(log_scores, "log_scores", alpha.shape[-1])
-    return ((alpha - 1) * log_scores).sum(-1) - log_normaliser(alpha)
+    constant = _log_normaliser(alpha, "alpha")
+    # A score of 0 counts for nothing where its parameter is 1: 0 · ln 0 is 0 there.
+    scores = torch.where((alpha == 1) & log_scores.isneginf(), 0.0, log_scores)
+    dtype = torch.promote_types(alpha.dtype, log_scores.dtype)
+    return (((alpha.double() - 1) * scores.double()).sum(-1) - constant).to(dtype)
 
 
 def mean(alpha: Tensor) -> Tensor:
@@ -146,8 +149,9 @@ def entropy(alpha: Tensor) -> Tensor:
     >>> entropy(torch.tensor([1.0, 1.0]))
     tensor(0.)
     """
-    surprise = alpha.digamma() - alpha.sum(-1, keepdim=True).digamma()
-    return log_normaliser(alpha) - ((alpha - 1) * surprise).sum(-1)
+    constant, exact = _log_normaliser(alpha, "alpha"), alpha.double()
+    surprise = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
+    return (constant - ((exact - 1) * surprise).sum(-1)).to(alpha.dtype)
 
 
 def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
@@ -173,8 +177,10 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
     tensor(0.1931)
     """
     check_shape(other, "other", alpha.shape[-1])
-    expected = alpha.digamma() - alpha.sum(-1, keepdim=True).digamma()
-    return log_normaliser(other) - log_normaliser(alpha) + ((alpha - other) * expected).sum(-1)
+    constants = _log_normaliser(other, "other") - _log_normaliser(alpha, "alpha")
+    exact, dtype = alpha.double(), torch.promote_types(alpha.dtype, other.dtype)
+    expected = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
+    return (constants + ((exact - other.double()) * expected).sum(-1)).to(dtype)
 
 
 def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
@@ -200,6 +206,7 @@ def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
     tensor(0.1931)
     """
     check(parameter > 0, "parameter", "a positive number", parameter)
+    _check_parameters(alpha, "alpha")
     base = alpha.shape[-1] * parameter
     # There are few sums and their terms are large: double precision costs little here.
     total = alpha.sum(-1).double()
@@ -235,7 +242,17 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     return raised / raised.sum(-1, keepdim=True)
 
 
+def _log_normaliser(alpha: Tensor, argument: str) -> Tensor:
+    """`log_normaliser` in float64: ln Γ of large parameters is far larger than the differences that are wanted."""
+    _check_parameters(alpha, argument)
+    exact = alpha.double()
+    return exact.lgamma().sum(-1) - exact.sum(-1).lgamma()
+
+
 def _check_parameters(alpha: Tensor, argument: str) -> None:
     check_shape(alpha, argument, None)
     if alpha.numel() and values_known(alpha):
-        check(bool((alpha > 0).all()), argument, "positive parameters", alpha.detach().amin().tolist())
+        # The minimum and the maximum of a tensor with a NaN are NaN.
+        least, most = alpha.detach().aminmax()
+        got = f"{float(least):g} to {float(most):g}"
+        check(bool((least > 0) & (most < torch.inf)), argument, "positive, finite parameters", got)

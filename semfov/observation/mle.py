@@ -82,7 +82,10 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
     capped = _reaches(rows, total, max_precision)
     alpha = torch.empty_like(rows)
     alpha[capped] = _at_precision(rows[capped], max_precision)
-    alpha[~capped] = solve(rows[~capped])
+    # L-BFGS needs gradients of its own, which inference mode does not record.
+    with torch.inference_mode(False):
+        solved = solve(rows[~capped].clone())
+    alpha[~capped] = solved
     if mean_log.requires_grad and torch.is_grad_enabled():
         moved = mean_log.to(torch.float64).reshape(-1, components)
         alpha = alpha + _response(alpha, moved - rows, capped)

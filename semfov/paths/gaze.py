@@ -21,7 +21,6 @@ from semfov.detection.detector import Detector
 from semfov.errors import check, check_number, check_whole
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.files import write_bytes
-from semfov.paths.drawing import drawing_of
 from semfov.paths.stimulus import reduced_copy
 
 if TYPE_CHECKING:
@@ -229,8 +228,9 @@ class GazePrediction:
         for each in people:
             same = abs(each.size[0] * height - each.size[1] * width) <= max(width, height) + max(each.size)
             check(same, "people", f"fixations in a frame with the proportions of {width} × {height}", each.size)
-        scores: dict[str, float] = drawing_of("compare", type(self))(self, people)
-        return scores
+        from semfov.metrics.scanpath.density import compare_density
+
+        return compare_density(self, people)
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the density over the picture, with its peaks.
@@ -242,8 +242,9 @@ class GazePrediction:
         Returns:
             The figure.
         """
-        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
-        return figure
+        from semfov.viz.gaze import plot_gaze
+
+        return plot_gaze(self, ax=ax, **options)
 
     def report(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> Path:
         """Write an HTML page with the density, contours and scanpaths, a single file that loads nothing from elsewhere.
@@ -261,8 +262,10 @@ class GazePrediction:
             InputError: the file does not end in `.html` or `.htm`, or an argument is out of range.
             DataError: the file cannot be written.
         """
-        written: Path = drawing_of("report", type(self))(self, path, people=people, seconds=seconds, seed=seed)
-        return written
+        from semfov.report.gaze import DrawnGaze, write_gaze_page
+
+        drawn = DrawnGaze(self, tuple(self.scanpaths(people, seconds=seconds, seed=seed)))
+        return write_gaze_page(path, f"semfov: where people look in {self.name}", [drawn])
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
         """Write drawn scanpaths as a table that `semfov.data.fixations.read_table` reads.

@@ -16,12 +16,10 @@ from torch import Tensor
 
 from semfov.data.fixations import Fixations
 from semfov.io.files import write_text
-from semfov.metrics.scanpath.density import compare_density
-from semfov.paths.drawing import draws
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
 from semfov.report.page import colour_steps, json_script, page_path
-from semfov.viz.gaze import MASSES, plot_gaze
+from semfov.viz.gaze import MASSES
 from semfov.viz.style import COLOURS, overlay_colours
 
 _FOLDER = Path(__file__).parent
@@ -114,14 +112,3 @@ def _facts(prediction: GazePrediction, number: int) -> str:
         f'<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 %</th></tr></thead><tbody>{rows}'
         "</tbody></table></div></section>"
     )
-
-
-def _report(prediction: GazePrediction, path: str | PathLike[str], *, people: int, seconds: float, seed: int) -> Path:
-    """The page of one prediction."""
-    paths = tuple(prediction.scanpaths(people, seconds=seconds, seed=seed))
-    return write_gaze_page(path, f"semfov: where people look in {prediction.name}", [DrawnGaze(prediction, paths)])
-
-
-draws("plot", GazePrediction, plot_gaze)
-draws("report", GazePrediction, _report)
-draws("compare", GazePrediction, compare_density)

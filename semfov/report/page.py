@@ -6,21 +6,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
-from semfov.data.inputs import ImageLike, as_image
-from semfov.data.large import LargePicture
 from semfov.errors import check
 from semfov.io.files import write_text
-from semfov.paths import Record, Scanpath
-from semfov.report.episode import Data, episode_data
+from semfov.report.episode import Data
 from semfov.report.looks import ABOUT, looks_html
-from semfov.report.zoom import zoom_data
-from semfov.viz.drawing import photograph_of
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
 if TYPE_CHECKING:
@@ -54,39 +46,6 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
     """
     write_text(page_path(path), page_html(title, episodes, sections=sections))
     return path
-
-
-def write_record(
-    record: Record,
-    path: str | PathLike[str],
-    *,
-    picture: LargePicture | ImageLike | None = None,
-    name: str | None = None,
-) -> Path:
-    """Write the page of a record with its windows, objects and looks."""
-    data = zoom_data(record, picture, name=_name(record, name))
-    return write_page(Path(path), f"semfov: {record.describe()}", [data])
-
-
-def write_scanpath(
-    scanpath: Scanpath,
-    path: str | PathLike[str],
-    *,
-    picture: ImageLike | None = None,
-    name: str | None = None,
-    boxes: Tensor | None = None,
-) -> Path:
-    """Write the page on which a reader steps through a scanpath; boxes `(M, 4)`."""
-    image = photograph_of(scanpath, None if picture is None else as_image(picture))
-    views = None if scanpath.stimulus is None else scanpath.views()
-    data = episode_data(scanpath, image, views, name=_name(scanpath, name), boxes=boxes)
-    return write_page(Path(path), f"semfov: {scanpath.describe()}", [data])
-
-
-def _name(record: Record, name: str | None) -> str:
-    """Name of the picture of a record."""
-    width, height = record.size
-    return name or (Path(record.source).name if record.source else f"{width} × {height} px")
 
 
 def page_path(path: Path) -> Path:

@@ -5,12 +5,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from semfov.errors import InputError, check, check_finite, values_known
+from semfov.data.inputs import as_positions
+from semfov.errors import check, check_finite, values_known
+from semfov.io.state import StatedModule
 
 
-class Sensor(nn.Module, ABC):
+class Sensor(StatedModule, ABC):
     """Base of the sensors of an eye: they compute the view of a canvas for a fixation.
 
     A canvas is an image that was resized and padded to the detector's input. `open` does the work that does not depend
@@ -132,6 +134,11 @@ class Sensor(nn.Module, ABC):
             JSON values by name.
         """
 
+    def _stated(self) -> dict[str, Any]:
+        """The settings by which commands make the sensor, without those that are parameters."""
+        learned = {name.removeprefix("log_") for name in self._parameters}
+        return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}
+
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Self:
         """Make the sensor from its settings.
@@ -153,16 +160,15 @@ class Sensor(nn.Module, ABC):
     def width(cls, settings: Mapping[str, Any]) -> float:
         """Tell the width of the fovea, in pixels of the image that the settings are for.
 
+        Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
+
         Args:
             settings: settings of the sensor.
 
         Returns:
             The width.
-
-        Raises:
-            InputError: the sensor has no fovea.
         """
-        raise InputError(f"sensor: expected a sensor with a fovea, got {cls.__name__}, which has none")
+        return 100.0
 
     @classmethod
     def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:
@@ -189,6 +195,12 @@ class Sensor(nn.Module, ABC):
         numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
+    def extra_repr(self) -> str:
+        """The settings as text."""
+        settings = self.settings()
+        named = ((name, settings[name]) for name in self.names)
+        return ", ".join(f"{name}={v:g}" if isinstance(v, float) else f"{name}={v!r}" for name, v in named)
+
 
 def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
     """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""
@@ -198,11 +210,12 @@ def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, emp
 
 
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:
-    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as `(B, G, 2)` like the images, and whether they had G."""
+    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as positions `(B, G, 2)` beside the images, and whether they had G."""
     batch = like.shape[0]
     fits = 1 <= gaze.ndim <= 3 and gaze.shape[-1] == 2 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch)
     check(fits, "gaze", f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)", tuple(gaze.shape))
     if values_known(gaze):
         check_finite(gaze, "gaze")
     many = gaze.ndim == 3
-    return (gaze.to(like) if many else gaze.to(like).expand(batch, 2)[:, None]), many
+    points = as_positions(gaze, like)
+    return (points if many else points.expand(batch, 2)[:, None]), many

@@ -1,13 +1,12 @@
 """The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, is_batch
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions, is_batch
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
@@ -73,19 +72,14 @@ def foveate(
         points = gaze[None] if gaze.ndim == 2 else gaze
         bands = laplacian_pyramid(as_images(image), levels, convention)
         return foveate(bands, points, sigma=sigma, growth=growth)[0]
-    bands = image if isinstance(image, Bands) else laplacian_pyramid(_batch(image), levels, convention)
+    bands = image if isinstance(image, Bands) else laplacian_pyramid(as_batch(image), levels, convention)
     fixation, many = fixations(gaze, bands.base)
-    _check_values(sigma, growth)
+    if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
+        for name, value in (("sigma", sigma), ("growth", growth)):
+            positive = bool((torch.as_tensor(value) > 0).all())
+            check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
     result = _collapse(bands, fixation, _widths(sigma, bands.base), growth)
     return result if many else result[:, 0]
-
-
-@dataclass(frozen=True)
-class _FoveationCanvas:
-    """A canvas that `Foveation.open` has prepared; sigma `(1, 2)`."""
-
-    bands: Bands
-    sigma: Tensor
 
 
 class Foveation(Sensor):
@@ -101,9 +95,9 @@ class Foveation(Sensor):
     no scale of its own, and σ' = σ.)
 
     Args:
-        sigma: width of the fovea in image pixels.
+        sigma: width of the fovea in image pixels; a tensor with gradients stays in the graph.
         levels: number of bands of the pyramid.
-        growth: factor by which the window of each coarser band is wider.
+        growth: factor by which the window of each coarser band is wider; a tensor with gradients stays in the graph.
         convention: convention of the pyramid, `kornia` or `opencv`.
         learnable: make σ a learnable parameter (its logarithm is learned, so that σ stays positive).
 
@@ -117,28 +111,32 @@ class Foveation(Sensor):
 
     def __init__(
         self,
-        sigma: float,
+        sigma: float | Tensor,
         levels: int = 5,
-        growth: float = 2.0,
+        growth: float | Tensor = 2.0,
         convention: Convention = "kornia",
         *,
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        check(sigma > 0, "sigma", "a positive number", sigma)
-        check(growth > 0, "growth", "a positive number", growth)
+        for name, value in (("sigma", sigma), ("growth", growth)):
+            check(torch.as_tensor(value).numel() == 1, name, "a number", f"shape {tuple(torch.as_tensor(value).shape)}")
+            check(bool(value > 0), name, "a positive number", value)
         check(levels >= 0, "levels", "0 or more", levels)
         lookup(convention, get_args(Convention), "pyramid convention")
         self.levels = levels
         self.growth = growth
         self.convention: Convention = convention
-        log_sigma = torch.tensor(float(sigma)).log()
-        self.log_sigma = nn.Parameter(log_sigma, requires_grad=learnable)
+        given = isinstance(sigma, Tensor) and sigma.requires_grad
+        check(not (given and learnable), "learnable", "False for a sigma that is learned outside", learnable)
+        self.given_sigma = sigma if given else None
+        log_sigma = None if given else torch.tensor(float(sigma)).log()
+        self.log_sigma = None if log_sigma is None else nn.Parameter(log_sigma, requires_grad=learnable)
 
     @property
     def sigma(self) -> Tensor:
         """Width of the fovea in image pixels."""
-        return self.log_sigma.exp()
+        return self.given_sigma if self.log_sigma is None else self.log_sigma.exp()
 
     def pyramid(self, image: ImageLike) -> Bands:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
@@ -149,23 +147,24 @@ class Foveation(Sensor):
         Returns:
             The Laplacian pyramid.
         """
-        return laplacian_pyramid(_batch(image), self.levels, self.convention)
+        return laplacian_pyramid(as_batch(image), self.levels, self.convention)
 
-    def open(self, canvas: Tensor, scale: Tensor) -> _FoveationCanvas:
-        """Compute the pyramid of a canvas, and scale the width of the fovea."""
+    def open(self, canvas: Tensor, scale: Tensor) -> tuple[Bands, Tensor]:
+        """Compute the pyramid of a canvas, and scale the width of the fovea, `(1, 2)`."""
         shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
-        return _FoveationCanvas(self.pyramid(canvas), self.sigma * shrink)
+        return self.pyramid(canvas), self.sigma * shrink
 
-    def look(self, state: _FoveationCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: tuple[Bands, Tensor], gaze: Tensor) -> Tensor:
         """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
-        return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
+        bands, sigma = state
+        return foveate(bands, gaze[None], sigma=sigma, growth=self.growth)[0]
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
         return {
-            "sigma": float(self.sigma),
+            "sigma": float(self.sigma.detach()),
             "levels": self.levels,
-            "growth": float(self.growth),
+            "growth": float(torch.as_tensor(self.growth).detach()),
             "convention": self.convention,
         }
 
@@ -192,18 +191,6 @@ class Foveation(Sensor):
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
         )
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        settings = f"levels={self.levels}, growth={self.growth:g}, convention={self.convention!r}"
-        return f"sigma={float(self.sigma.detach()):g}, {settings}"
-
-
-def _batch(images: ImageLike) -> Tensor:
-    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
-    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
-        return images
-    return as_images(images)
 
 
 def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:
@@ -236,7 +223,8 @@ def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tens
     least = torch.finfo(sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
     widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
     offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
-    pieces = offset.square().mul(-0.5).exp().split([n for size in sizes for n in reversed(size)], -1)
+    weights = offset.square().mul(-0.5).exp().to(bands.base.dtype)
+    pieces = weights.split([n for size in sizes for n in reversed(size)], -1)
     return list(zip(pieces[0::2], pieces[1::2], strict=True))
 
 
@@ -260,16 +248,8 @@ def _layout(
 
 def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
     """σ along x and y for every image, `(B, 2)`."""
-    width = torch.as_tensor(sigma).to(like)
+    width = as_positions(torch.as_tensor(sigma), like)
     batch = like.shape[0]
     fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
     check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
     return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
-
-
-def _check_values(sigma: float | Tensor, growth: float | Tensor) -> None:
-    if not values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
-        return
-    for name, value in (("sigma", sigma), ("growth", growth)):
-        positive = bool((torch.as_tensor(value) > 0).all())
-        check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())

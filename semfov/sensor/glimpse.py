@@ -1,11 +1,13 @@
 """Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
 
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 
 _Padding = Literal["zeros", "border", "fill"]
@@ -64,7 +66,7 @@ def glimpse(
         check_finite(boxes.detach(), "boxes")
         full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
         check(full, "boxes", "windows with a positive width and height", "an empty window")
-    windows = boxes.to(image) if boxes.ndim == 3 else boxes[:, None].to(image)
+    windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image)
     value = 0.0 if padding_mode == "zeros" else fill_value
 
     def view(b: int, g: int) -> Tensor:
@@ -75,22 +77,12 @@ def glimpse(
 
 
 def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Compute the windows that are centred at points and fill a canvas at given magnifications.
+    r"""Windows `(..., 4)` that are centred at points and fill a canvas of `(w, h)` pixels at given magnifications.
 
     .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
-
-    Args:
-        points: `(..., 2)`, pixel centres at integers.
-        magnification: m, canvas pixels per picture pixel, `(...)`.
-        size: `(w, h)` of the canvas.
-
-    Returns:
-        Windows `(..., 4)`, `(x1, y1, x2, y2)`, edges between pixels.
-
-    >>> windows_at(torch.tensor([[9.5, 9.5]]), torch.tensor([2.0]), (10, 20))
-    tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
     """
     check_shape(points, "points", 2)
+    points = as_positions(points)
     return torch.cat(edges_at(points, magnification[..., None], points.new_tensor(size)), -1)
 
 
@@ -101,18 +93,14 @@ def edges_at(point: _Length, magnification: _Length, length: _Length) -> tuple[_
 
 
 def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:
-    """Compute the window that shows a box closely, with some of its surroundings.
+    """The window `(4,)` that shows a box closely, with some of its surroundings.
 
     The window is a square, `context` times as large as the longer side of the box, and at least `least` times as large
     as the longer side of the picture. It is moved to lie inside the picture. Where the picture is narrower, it is cut.
-
-    >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 80))
-    tensor([ 0., 10., 60., 70.])
-
-    Shapes: box `(4,)`, picture `(width, height)` → `(4,)`.
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
+    box = as_positions(box)
     low, high = box[:2], box[2:]
     whole = box.new_tensor(picture)
     side = torch.minimum((context * (high - low).amax()).clamp(min=least * max(picture)), whole)
@@ -121,13 +109,7 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
 
 
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """List magnifications one octave apart, from the one that shows the whole picture up to a finest one.
-
-    >>> ladder((2560, 1920), (416, 416))
-    (0.1625, 0.325, 0.65)
-
-    Shapes: picture `(width, height)`, size `(width, height)`.
-    """
+    """Magnifications one octave apart, from the one that shows the whole picture up to a finest one."""
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
     check(finest > 0, "finest", "a positive magnification", finest)
     whole = min(size[0] / picture[0], size[1] / picture[1])
@@ -137,7 +119,7 @@ def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1
     return tuple(steps)
 
 
-class Glimpse(nn.Module):
+class Glimpse(StatedModule):
     """A sensor that shows a window of the picture at a magnification, the module form of `glimpse`.
 
     Args:
@@ -158,6 +140,10 @@ class Glimpse(nn.Module):
         self.size = size
         self.padding_mode: _Padding = lookup(padding_mode, get_args(_Padding), "padding mode")
         self.fill_value = fill_value
+
+    def _stated(self) -> dict[str, Any]:
+        """All settings."""
+        return {"size": self.size, "padding_mode": self.padding_mode, "fill_value": self.fill_value}
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
         """Compute views of images at points and magnifications.
@@ -183,6 +169,7 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
     part = image[:, top:bottom, left:right]
+    across, down = across.to(part), down.to(part)
     if value:
         return down @ (part - value) @ across.mT + value
     return down @ part @ across.mT

@@ -142,14 +142,6 @@ def from_log_polar(
     return result if many else result[:, 0]
 
 
-@dataclass(frozen=True)
-class _LogPolarCanvas:
-    """A canvas that `LogPolar.open` has prepared."""
-
-    levels: _Levels
-    retina: _Retina
-
-
 class LogPolar(Sensor):
     """A sensor with receptors on rings, see `log_polar`; its views are back-projections of the cortical images.
 
@@ -223,18 +215,18 @@ class LogPolar(Sensor):
         finest = image[0] if isinstance(image, tuple) else image
         return self.back(self.cortical(image, gaze), gaze, _size(finest))
 
-    def open(self, canvas: Tensor, scale: Tensor) -> _LogPolarCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
         own = self.retina
         retina = _Retina(own.fovea, own.spacing, own.pooling, (across, down))
-        return _LogPolarCanvas(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
+        return gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina
 
-    def look(self, state: _LogPolarCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
-        fixation, _ = fixations(gaze[None], state.levels[0])
-        cortical = _sample(state.levels, fixation, state.retina)
-        return _project(cortical, fixation, _size(state.levels[0]), state.retina)[0]
+        levels, retina = state
+        fixation, _ = fixations(gaze[None], levels[0])
+        return _project(_sample(levels, fixation, retina), fixation, _size(levels[0]), retina)[0]
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
@@ -246,11 +238,6 @@ class LogPolar(Sensor):
         """Tell the eccentricity at which acuity is half the acuity at the fixation."""
         return float(settings["fovea"])
 
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        own = self.retina
-        return f"fovea={own.fovea:g}, spacing={own.spacing:g}, pooling={own.pooling:g}"
-
 
 def _size(image: Tensor) -> tuple[int, int]:
     check_shape(image, "image", None, None, None, None)
@@ -261,9 +248,9 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
     """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
     finest = levels[0]
     size = _size(finest)
-    offset = _places(retina, size, finest.dtype, finest.device)
+    offset = _places(retina, size, fixation.dtype, finest.device)
     # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
-    place = (2 * (fixation[:, :, None, None] + offset) + 1) / finest.new_tensor(size) - 1
+    place = (2 * (fixation[:, :, None, None] + offset) + 1) / fixation.new_tensor(size) - 1
     rings, many = offset.shape[0], fixation.shape[1]
     by_level = []
     for level, first, weight in _shares(retina, size, finest.dtype, finest.device):
@@ -271,8 +258,8 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
             break
         last = first + len(weight)
         where = place[:, :, first:last].flatten(1, 2)
-        responses = F.grid_sample(levels[level], where, "bicubic", "border", align_corners=False)
-        responses = responses.unflatten(2, (many, last - first)) * weight[:, None]
+        responses = F.grid_sample(levels[level].to(where), where, "bicubic", "border", align_corners=False)
+        responses = responses.to(finest).unflatten(2, (many, last - first)) * weight[:, None]
         by_level.append(F.pad(responses, (0, 0, first, rings - last)))
     return torch.stack(by_level).sum(0).transpose(1, 2)
 
@@ -300,8 +287,8 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     whole = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
     whole = torch.cat([whole[..., -1:], whole, whole[..., :2]], -1).flatten(0, 1)
     where = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
-    images = F.grid_sample(whole, where, "bicubic", "border", align_corners=True)
-    return images.unflatten(0, (batch, many))
+    images = F.grid_sample(whole.to(where), where, "bicubic", "border", align_corners=True)
+    return images.to(cortical).unflatten(0, (batch, many))
 
 
 @constant

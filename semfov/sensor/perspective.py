@@ -1,12 +1,15 @@
 """Perspective views of a panorama, in any direction and with any field of view."""
 
 import math
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape
+from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
 
@@ -46,7 +49,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     check_shape(pose, "pose", 3)
     fits = pose.ndim in (2, 3) and pose.shape[0] == batch
     check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
-    poses = (pose if pose.ndim == 3 else pose[:, None]).to(panorama)
+    poses = as_positions(pose if pose.ndim == 3 else pose[:, None], panorama)
     source = go_around(even_rows(panorama) if antialias else panorama)
 
     def view(b: int, g: int) -> Tensor:
@@ -65,17 +68,11 @@ def go_around(panorama: Tensor) -> Tensor:
 
 
 def even_rows(panorama: Tensor) -> Tensor:
-    r"""Smooth every row of a panorama to the resolution of the horizon.
+    r"""Smooth every row of a panorama `(..., H, W)` to the resolution of the horizon.
 
     A pixel at latitude φ covers cos φ times the width of a pixel at the horizon. Each pixel becomes the mean of the row
     over :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is
     exact for any width.
-
-    Args:
-        panorama: `(..., H, W)`.
-
-    Returns:
-        The smoothed panorama, `(..., H, W)`.
     """
     high, wide = panorama.shape[-2:]
     latitude = (torch.arange(high, dtype=torch.float64, device=panorama.device) + 0.5) / high - 0.5
@@ -106,11 +103,12 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
     points = panorama_points(camera.directions(grid.flatten(0, 1)), (wide, high)).unflatten(0, grid.shape[:2])
     place = (2 * points + 3) / points.new_tensor([wide + 2, high + 2]) - 1
-    view = F.grid_sample(source[None], place[None].to(source), mode="bilinear", align_corners=False)
-    return F.avg_pool2d(view, times)[0] if times > 1 else view[0]
+    place = as_positions(place, source)
+    view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
+    return (F.avg_pool2d(view, times) if times > 1 else view)[0].to(source.dtype)
 
 
-class Perspective(nn.Module):
+class Perspective(StatedModule):
     """A camera in a panorama, the module form of `perspective`.
 
     Args:
@@ -125,6 +123,10 @@ class Perspective(nn.Module):
         super().__init__()
         check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
         self.size, self.antialias = size, antialias
+
+    def _stated(self) -> dict[str, Any]:
+        """All settings."""
+        return {"size": self.size, "antialias": self.antialias}
 
     def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
         """Compute views of panoramas.

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape, lookup, values_known
 from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 from semfov.threads import one_thread_if_small
@@ -58,7 +59,7 @@ class Bands:
             Positions `(n,)` in image pixels.
         """
         band = self.details[k]
-        return pixel_positions(band.shape[axis], self.size[axis], k, self.convention).to(band)
+        return as_positions(pixel_positions(band.shape[axis], self.size[axis], k, self.convention), band)
 
 
 def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:

@@ -87,7 +87,7 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert lines[0] == "red.avi: searching for “red”"
     assert re.match(r"     0  at \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at", lines[1])
     assert re.search(r"\d frames/s$", lines[4])
-    assert re.match(r"4 frames, [\d.]+ per second", lines[5])
+    assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[5])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
     run("live", path, "--frames", 2, "--out", tmp_path / "seen.avi")
     assert len(read(tmp_path / "seen.avi")) == 2

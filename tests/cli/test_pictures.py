@@ -2,7 +2,9 @@
 
 import csv
 import json
+import os
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +12,8 @@ from PIL import Image
 
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
+from semfov.data import read_image
+from semfov.data.sources import picture_files
 from tests.colours import write_network
 
 
@@ -181,6 +185,62 @@ def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp
     assert [each["name"] for each in episodes_of(tmp_path / "page.html")] == ["a.png", "c.png"]
 
 
+def test_any_fault_of_one_picture_is_a_skip_with_its_reason(run, photo, tmp_path, agent, monkeypatch):
+    """Names that are not UTF-8, links to nothing, and errors that nobody expected; nothing steers the terminal."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    names = [b"a.png", b"b\xff.png", b"c\x1b[31m.png", b"d\n.png", b"e.png"]
+    for name in names:
+        photo_bytes = photo.read_bytes()
+        (folder / os.fsdecode(name)).write_bytes(photo_bytes)
+    (folder / "f.png").symlink_to("nothing.png")
+    (folder / "g\x1b[2J.png").write_bytes(b"no picture")
+    (folder / "._h.png").write_bytes(b"no picture")
+    find_all = agent.find_all
+
+    def failing(picture, *arguments, **options):
+        if picture.endswith("e.png"):
+            raise ZeroDivisionError("an unknown\x1b fault")
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", failing)
+    page = tmp_path / "page.html"
+    code, printed = run("find", folder, "--out", tmp_path / "boxes.json", "--report", page, "--passes", 1)
+    assert code == 1
+    assert "7 pictures: 4 looked at; 3 skipped" in printed.out
+    for said in (
+        r"e\.png: \S+e\.png: cannot be looked at \(ZeroDivisionError: an unknown",
+        r"f\.png: .*no such file",
+        "g",
+    ):
+        assert re.search(rf"skipped \S+{said}", printed.err)
+    assert "\x1b" not in printed.out + printed.err
+    result = json.loads((tmp_path / "boxes.json").read_text(encoding="utf-8"))
+    assert [Path(each["picture"]).name for each in result["pictures"]] == [
+        "a.png", "b\\udcff.png", "c\\x1b[31m.png", "d\n.png",
+    ]  # fmt: skip
+    assert len(result["skipped"]) == 3
+    for kind in ("csv", "geojson", "coco.json"):
+        assert run("find", folder, "--out", tmp_path / f"boxes.{kind}", "--passes", 1)[0] == 1
+
+
+def test_folders_have_pictures_of_all_formats_that_are_read_alone(tmp_path):
+    picture = Image.new("RGB", (8, 6), "red")
+    kinds = {
+        "jpg": "JPEG",
+        "jpe": "JPEG",
+        "jfif": "JPEG",
+        "JP2": "JPEG2000",
+        "ppm": "PPM",
+        "avif": "AVIF",
+        "bmp": "BMP",
+    }
+    for suffix, kind in kinds.items():
+        picture.save(tmp_path / f"a.{suffix}", kind)
+    assert len(picture_files(tmp_path)) == len(kinds)
+    assert all(read_image(path).shape == (3, 6, 8) for path in picture_files(tmp_path))
+
+
 @pytest.fixture
 def folder(photo, tmp_path):
     """Three pictures, each with a red square at another place."""
@@ -327,7 +387,9 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     code, printed = run(*search, "--out", tmp_path / "out", "--report", tmp_path / "page.html")
     assert code == 0
     assert re.search(
-        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, probability 0\.50", printed.out
+        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, "
+        r"probability that the picture holds it: 0\.50",
+        printed.out,
     )
     assert "A closer look confirmed the target." in printed.out
     assert re.search(r"^  look +at \(x, y\) +shows +detections +value$", printed.out, re.M)

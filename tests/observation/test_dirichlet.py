@@ -5,6 +5,7 @@ Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of t
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
 import scipy.integrate
@@ -13,6 +14,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov.belief import DirichletBelief
+from semfov.belief.fusion import fuse
 from semfov.errors import InputError
 from semfov.observation import dirichlet
 
@@ -175,3 +178,61 @@ def test_floor_makes_logarithms_finite_and_keeps_the_simplex(dtype):
 def test_bad_arguments_are_named(call):
     with pytest.raises(InputError, match="expected"):
         call()
+
+
+def exact_divergence(alpha, other):
+    """With 60 digits."""
+    with mpmath.workdps(60):
+        a, b = [mpmath.mpf(each) for each in alpha], [mpmath.mpf(each) for each in other]
+        total, base = mpmath.fsum(a), mpmath.fsum(b)
+        parts = [mpmath.loggamma(y) - mpmath.loggamma(x) for x, y in zip(a, b, strict=True)]
+        slopes = [(x - y) * (mpmath.digamma(x) - mpmath.digamma(total)) for x, y in zip(a, b, strict=True)]
+        return float(mpmath.loggamma(total) - mpmath.loggamma(base) + mpmath.fsum(parts) + mpmath.fsum(slopes))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_large_parameters_do_not_cancel(size, dtype):
+    draw = np.random.default_rng(0)
+    alpha = torch.tensor(draw.random(81) * size + 0.5).to(dtype)
+    other = (alpha.double() * 1.001).to(dtype)
+    expected = exact_divergence(alpha.tolist(), other.tolist())
+    assert float(dirichlet.kl_divergence(alpha, other)) == pytest.approx(expected, rel=1e-4, abs=5e-7)
+    exact = scipy.stats.dirichlet(alpha.double().numpy())
+    assert float(dirichlet.entropy(alpha)) == pytest.approx(exact.entropy(), rel=1e-6)
+    scores = torch.softmax(alpha / size, 0)
+    plain = scores.double() / scores.double().sum()
+    got = float(dirichlet.log_prob(alpha, plain.log().to(dtype)))
+    assert got == pytest.approx(exact.logpdf(plain.numpy()), rel=1e-4 if dtype == torch.float32 else 1e-9)
+
+
+def test_a_score_of_zero_counts_for_nothing_where_its_parameter_is_one():
+    for alpha, scores in (([1.0, 1.0, 1.0], [0.0, 0.4, 0.6]), ([1.0, 2.0, 1.0], [0.0, 0.3, 0.7]), ([1.0, 1.0], [0, 1])):
+        got = dirichlet.log_prob(torch.tensor(alpha), torch.tensor(scores, dtype=torch.float32).log())
+        assert float(got) == pytest.approx(scipy.stats.dirichlet(alpha).logpdf(scores), rel=1e-6, abs=1e-7)
+    zero = torch.tensor([0.0, 1.0]).log()
+    assert float(dirichlet.log_prob(torch.tensor([2.0, 1.0]), zero)) == -math.inf
+    assert float(dirichlet.log_prob(torch.tensor([0.5, 1.0]), zero)) == math.inf
+    alpha = torch.ones(2, requires_grad=True)
+    dirichlet.log_prob(alpha, zero).backward()
+    assert alpha.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("bad", [-1.0, 0.0, float("nan"), float("inf")])
+def test_parameters_are_positive_and_finite(bad):
+    alpha, good = torch.tensor([1.0, bad]), torch.ones(2)
+    calls = [
+        dirichlet.log_normaliser, dirichlet.mean, dirichlet.covariance, dirichlet.entropy,
+        lambda a: dirichlet.log_prob(a, good.log()), lambda a: dirichlet.kl_divergence(a, good),
+        lambda a: dirichlet.kl_divergence(good, a), lambda a: dirichlet.kl_from_symmetric(a, 0.5), DirichletBelief,
+        lambda a: fuse(a[None, None], torch.ones(1, 1, 2), torch.ones(1, 1, 1)),
+    ]  # fmt: skip
+    for call in calls:
+        with pytest.raises(InputError, match="expected positive, finite"):
+            call(alpha)
+
+
+@pytest.mark.parametrize("weight", [math.nan, 2.0, -0.5, math.inf])
+def test_weights_of_cells_lie_between_zero_and_one(weight):
+    with pytest.raises(InputError, match="footprint: expected weights from 0 to 1"):
+        fuse(torch.ones(1, 2, 2), torch.ones(1, 1, 2), torch.tensor([[[1.0, weight]]]))

@@ -199,3 +199,12 @@ def test_fixed_point_equals_the_limit_of_minkas_iteration():
 def test_bad_arguments_are_named(call):
     with pytest.raises(InputError, match=r"expected|did you mean"):
         call()
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_fits_without_gradients(method, mode):
+    mean_log = torch.tensor([[-1.0, -2.0, -1.5], [-2.0, -1.2, -1.0]], dtype=torch.float64)
+    expected = mle(mean_log, method=method)
+    with mode():
+        torch.testing.assert_close(mle(mean_log.clone(), method=method), expected)

@@ -18,11 +18,13 @@ from semfov import (
     as_image,
     foveate,
 )
+from semfov.data import read_image
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector
 from semfov.errors import SemfovError
+from semfov.gaze.saliency import VOCUS2, IttiKoch
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -127,7 +129,7 @@ def test_images_of_any_type_are_accepted(kind, folder, agent, zooming):
         for look in (agent.search(make(folder), "cup", seed=3), agent.explore(make(folder), shifts=2, seed=3)):
             assert look.grid.size == (44, 30)
         views = agent.eye.open(make(folder)), agent.eye.open(own[None])
-        torch.testing.assert_close(views[0].state.bands.base, views[1].state.bands.base, atol=1e-6, rtol=0)
+        torch.testing.assert_close(views[0].state[0].base, views[1].state[0].base, atol=1e-6, rtol=0)
         view = foveate(make(folder), (20, 12), sigma=8.0)
         wanted = foveate(expected[None], torch.tensor([20.0, 12.0]), sigma=8.0)[0]
         torch.testing.assert_close(view.reshape(wanted.shape), wanted, atol=1e-6, rtol=0)
@@ -346,3 +348,12 @@ def test_pictures_in_the_order_of_opencv_have_the_same_colours(kind):
     assert torch.equal(open_large(given, color="bgr").read((3, 1, 9, 12)), expected[:, 1:12, 3:9])
     with pytest.raises(SemfovError, match="bgr"):
         as_image(given, color="brg")
+
+
+@pytest.mark.parametrize("model", [VOCUS2, IttiKoch])
+def test_saliency_takes_pictures_of_any_type(tmp_path, model):
+    picture = Image.fromarray(np.random.default_rng(0).integers(256, size=(48, 64, 3), dtype=np.uint8))
+    picture.save(tmp_path / "a.png")
+    expected = model()(read_image(tmp_path / "a.png")[None])
+    for source in (tmp_path / "a.png", str(tmp_path / "a.png"), picture, np.asarray(picture)):
+        assert torch.equal(model()(source), expected)

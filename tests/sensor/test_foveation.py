@@ -6,7 +6,7 @@ import torch
 from semfov import Foveation, foveate
 from semfov.errors import InputError
 from semfov.sensor import laplacian_pyramid
-from tests.small import close, draw
+from tests.small import close, draw, rand
 
 CONVENTIONS = ("kornia", "opencv")
 
@@ -258,3 +258,31 @@ def test_bad_input(arguments, message):
     arguments = {"image": IMAGE, "gaze": GAZE, "sigma": 3.0} | arguments
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         foveate(**arguments)
+
+
+@pytest.mark.parametrize("name", ["sigma", "growth"])
+@pytest.mark.parametrize("kind", ["parameter", "result"])
+def test_settings_of_another_module_stay_in_the_graph(name, kind):
+    """The gradient is that of the function, at pictures and at canvases that are scaled."""
+    value = torch.nn.Parameter(torch.tensor(6.0 if name == "sigma" else 1.5))
+    given = {name: value if kind == "parameter" else 2 * value / 2}
+    sensor = Foveation(**{"sigma": 6.0, **given})
+    image, gaze = rand(1, 3, 20, 30), torch.tensor([9.0, 5.0])
+    (slope,) = torch.autograd.grad(sensor(image, gaze).square().sum(), value, retain_graph=True)
+    twin = torch.tensor(float(value.detach()), requires_grad=True)
+    expected = foveate(image, gaze, **{"sigma": 6.0, "growth": 2.0, name: twin}).square().sum()
+    torch.testing.assert_close(slope, torch.autograd.grad(expected, twin)[0])
+    opened = sensor.open(image, torch.full((2,), 1.7))
+    (scaled,) = torch.autograd.grad(sensor.look(opened, gaze[None]).square().sum(), value)
+    assert float(scaled) != 0
+    assert (kind == "parameter") == any(each is value for each in sensor.parameters())
+    assert sensor.settings()[name] == float(value.detach())
+    assert f"{name}={float(value.detach()):g}" in repr(sensor)
+
+
+def test_a_plain_tensor_is_a_number():
+    assert float(Foveation(torch.tensor(6.0)).sigma.detach()) == pytest.approx(6.0)
+    with pytest.raises(InputError, match=r"sigma: expected a number, got shape \(2,\)"):
+        Foveation(torch.tensor([6.0, 7.0]))
+    with pytest.raises(InputError, match="learnable: expected False"):
+        Foveation(torch.nn.Parameter(torch.tensor(6.0)), learnable=True)

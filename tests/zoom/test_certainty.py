@@ -14,7 +14,7 @@ from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects, unlike
 from semfov.errors import InputError
-from semfov.fit.windows_certainty import _fit_certainty, _fit_unseen
+from semfov.fit.windows_certainty import _fit_unseen, fit_certainty
 from semfov.io.storage import read, write_file
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
@@ -187,7 +187,7 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
     generator = torch.Generator().manual_seed(0)
     facts = torch.randn(500, len(FACTS), generator=generator)
     right = torch.rand(500, generator=generator) < facts[:, 0].sigmoid()
-    fitted = _fit_certainty(facts, right)
+    fitted = fit_certainty(facts, right)
     parameters = torch.tensor([fitted.offset, *fitted.weights], dtype=torch.float64, requires_grad=True)
     inputs = torch.cat([torch.ones(500, 1), facts], -1).double()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(inputs @ parameters, right.double(), reduction="sum")
@@ -195,7 +195,7 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
     loss = loss + 0.5 * parameters[1:].square().sum() - 0.5 * (empty * (1 - empty)).log()
     (gradient,) = torch.autograd.grad(loss, parameters)
     assert gradient.abs().max() < 1e-3
-    everywhere = _fit_certainty(facts, torch.ones(500, dtype=torch.bool))
+    everywhere = fit_certainty(facts, torch.ones(500, dtype=torch.bool))
     assert math.isfinite(everywhere.offset)
 
 

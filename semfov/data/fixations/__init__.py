@@ -4,6 +4,7 @@ Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfo
 screen, in pixels of a picture, or in cells. `Letterbox` and `Fixations.resized` convert between these.
 """
 
+from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import (
     coco_name,
     read_cocosearch,
@@ -24,6 +25,7 @@ __all__ = [
     "coco_name",
     "from_pysaliency",
     "read_cocosearch",
+    "read_eyelink",
     "read_osie",
     "read_ruarte",
     "read_table",

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox, by_picture, warn_outside
+from semfov.data.fixations.record import Fixations, ObjectBox, by_picture, warn_of_frames
 from semfov.errors import DataError, InputError, check
 from semfov.io.files import check_regular, write_text
 from semfov.io.schema import Anything, Array, Json, Maybe, Number, Object, Text
@@ -99,7 +99,7 @@ def read_cocosearch(
             scanpaths.append(record)
         elif record.picture in sizes:
             scanpaths.append(record.in_picture(sizes[record.picture]))
-    return warn_outside(path, scanpaths)
+    return warn_of_frames(path, scanpaths)
 
 
 def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
@@ -165,7 +165,7 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
         for number, person in enumerate(people):
             who = {"picture": picture, "subject": str(number + 1), "size": size}
             scanpaths.append(_record(path, f"{picture}[{number}]", person, ("x", "y", "duration_ms"), **who))
-    return warn_outside(path, scanpaths)
+    return warn_of_frames(path, scanpaths)
 
 
 def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
@@ -258,7 +258,7 @@ def read_ruarte(
             scanpaths.append(record)
         elif name in sizes:
             scanpaths.append(record.in_picture(sizes[name]))
-    return warn_outside(path, scanpaths)
+    return warn_of_frames(path, scanpaths)
 
 
 def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:

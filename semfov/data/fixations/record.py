@@ -101,7 +101,7 @@ def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
 
     The centre of the first cell has coordinate 0 in cells. With cells of 50 pixels it is at 24.5 in pixels:
 
-    >>> resized_points(np.array([[0.0, 1.0]]), (32, 24), (1600, 1200))
+    >>> _resized_points(np.array([[0.0, 1.0]]), (32, 24), (1600, 1200))
     array([[24.5, 74.5]])
 
     Shapes: points `(n, 2)`, size `(width, height)`, new `(width, height)` → `(n, 2)`.
@@ -163,6 +163,12 @@ class Fixations:
         check(min(self.size) > 0, "size", "a width and a height above 0", self.size)
         if self.durations is not None:
             check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
+            lasting = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())
+            check(lasting, "durations", "milliseconds, 0 or more", self.durations.tolist()[:5])
+        if self.box is not None:
+            x1, y1, x2, y2 = self.box
+            ordered = bool(np.isfinite(self.box).all()) and x1 <= x2 and y1 <= y2
+            check(ordered, "box", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", self.box)
 
     def __len__(self) -> int:
         """Number of fixations, the first included."""
@@ -211,7 +217,45 @@ class Fixations:
         return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
 
 
-def warn_outside(source: str | PathLike[str], fixations: list[Fixations]) -> list[Fixations]:
+def warn_of_frames(
+    source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
+) -> list[Fixations]:
+    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records.
+
+    `units` says that they were read as pixels, in which case they may be fractions.
+    """
+    total = sum(map(len, fixations))
+    if total < 3:
+        return warn_outside(source, fixations, stacklevel=stacklevel + 1)
+    points = np.concatenate([each.points for each in fixations])
+    sides = np.concatenate([np.tile(each.size, (len(each), 1)) for each in fixations])
+    inside = ((points >= -0.5) & (points < sides - 0.5)).all(1).mean()
+    swapped = ((points[:, ::-1] >= -0.5) & (points[:, ::-1] < sides - 0.5)).all(1).mean()
+    middle = (np.abs(points) <= sides / 2).all(1).mean()
+    negative = (points < -0.5).mean(0)
+    looks = None
+    fractional = bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
+    if units and fractional and sides.min() > 8:
+        looks = "fractions of the sides (units='fractions')"
+    elif negative.min() >= 0.2 and middle > 0.95:
+        looks = "pixels from the centre (origin='centre', or 'centre, y up')"
+    elif inside < 0.9 and swapped > max(0.98, inside + 0.1):
+        looks = "y before x (swap the two columns)"
+    elif total >= 20 and bool((points.max(0) < 0.5 * sides.min(0)).all()):
+        corner = " × ".join(f"{side:g}" for side in np.ceil(points.max(0) + 1))
+        looks = f"fixations of a frame of {corner} or little more (give its size)"
+    if looks is None:
+        return warn_outside(source, fixations, stacklevel=stacklevel + 1)
+    first = fixations[0]
+    warnings.warn(
+        f"{source}: {total} fixations were read as pixels of frames such as {first.size[0]} × {first.size[1]}, of "
+        f"{first.subject} in {first.picture}, but look like {looks}",
+        stacklevel=stacklevel,
+    )
+    return fixations
+
+
+def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, stacklevel: int = 3) -> list[Fixations]:
     """Warn of fixations that lie farther than `_FAR` outside their frame, with their share; returns the records."""
     beyond = [np.maximum(-each.points, each.points - each.size).max(1) > _FAR * max(each.size) for each in fixations]
     count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
@@ -220,7 +264,7 @@ def warn_outside(source: str | PathLike[str], fixations: list[Fixations]) -> lis
         warnings.warn(
             f"{source}: {count} of {total} fixations ({count / total:.0%}) lie far outside their frame, such as those "
             f"of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check its size and the unit",
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
     return fixations
 

@@ -1,42 +1,74 @@
-"""Fixations as a plain table (CSV) with a line for each fixation, which any program can write."""
+"""Fixations as a plain table with a line for each fixation, which any program can write."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox, warn_outside
-from semfov.errors import DataError, InputError
+from semfov.data.fixations.record import Fixations, ObjectBox, warn_of_frames
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import check_regular, write_text
 
-_COLUMNS = ("picture", "subject", "x", "y", "width", "height")
-"""Columns that a table must have."""
-_MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found")
+Units = Literal["pixels", "fractions"]
+"""Unit of the coordinates of a table: pixels, whose centres are at integers, or fractions of the sides of the frame."""
+
+Origin = Literal["top left", "bottom left", "centre", "centre, y up"]
+"""Where the coordinates of a table are 0. y points down from the top left and from the centre, else up."""
+
+_COLUMNS = ("picture", "subject", "x", "y")
+_SIZE = ("width", "height")
+_MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
+_MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
+_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
-def read_table(path: str | PathLike[str]) -> list[Fixations]:
+_Line = tuple[str, Mapping[str, str]]
+"""The place of a line in words, and its fields by our names of the columns."""
+
+
+def read_table(
+    source: str | PathLike[str] | Any,
+    *,
+    columns: Mapping[str, str] | None = None,
+    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+    units: Units = "pixels",
+    origin: Origin = "top left",
+) -> list[Fixations]:
     r"""Read fixations from a table.
 
     The first line holds the names of the columns: `picture`, `subject`, `x`, `y`, `width` and `height`, and perhaps
-    `target`, `duration`, `x1`, `y1`, `x2`, `y2` and `found`, whose fields may be empty. The lines of one scanpath
-    follow each other in order, and a new scanpath begins where picture, subject or target change. `x` and `y` are in
+    `target`, `duration`, `x1`, `y1`, `x2`, `y2`, `found` and `trial`, whose fields may be empty. `x` and `y` are in
     pixels of a frame of `width` × `height`, pixel centres at integers. `duration` is in milliseconds. `x1`, `y1`, `x2`
-    and `y2` are the target's box. `found` is `true` or `false`. pandas writes such a table by
-    `frame.to_csv(path, index=False)`.
+    and `y2` are the target's box, in the same unit and from the same origin, its edges. `found` is `true` or `false`.
+    pandas writes such a table by `frame.to_csv(path, index=False)`.
+
+    A scanpath has the fixations of one picture, subject, target and `trial`, in the order of the lines. `trial` tells
+    two viewings of a picture by one person apart, and with it the lines of scanpaths may alternate. Without it the
+    lines of a scanpath must follow each other.
+
+    Fields are separated by commas, semicolons or tabs, and numbers may have a decimal comma in the last two, as
+    spreadsheets write them.
 
     Args:
-        path: the file.
+        source: the file, or a `pandas.DataFrame`.
+        columns: names of the columns in the source by the names above, such as `{"x": "FPOGX"}`.
+        size: `(width, height)` of the frame, or of each picture by its name, for a table without these columns.
+        units: `pixels`, or `fractions` of the sides of the frame.
+        origin: `top left`, `bottom left`, `centre`, or `centre, y up`, as in PsychoPy.
 
     Returns:
-        One record for each scanpath.
+        One record for each scanpath, in the order in which they begin.
 
     Raises:
+        InputError: an argument is unknown.
         DataError: the content does not have this form; the message names the file, the line and the column.
 
     >>> import tempfile
@@ -47,24 +79,85 @@ def read_table(path: str | PathLike[str]) -> list[Fixations]:
     ...     read_table(path)[0].points.tolist()
     [[40.0, 30.0], [52.5, 31.0]]
     """
-    path = Path(path)
+    lookup(units, get_args(Units), "unit")
+    lookup(origin, get_args(Origin), "origin")
+    named = dict(columns or {})
+    for name in named:
+        lookup(name, (*_COLUMNS, *_SIZE, *_MORE), "column")
+    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
+    where = "the table" if frame else str(source)
+    header, rows = _of_frame(source) if frame else _of_file(Path(source))
+    needed = (*_COLUMNS, *(() if size is not None else _SIZE))
+    missing = [named.get(name, name) for name in needed if named.get(name, name) not in header]
+    if missing:
+        sized = " or give size=" if {*missing} & {*_SIZE} else ""
+        raise DataError(
+            f"{where}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
+            f"{', '.join(map(repr, header))[:300]}; name them by columns={{…}}{sized}"
+        )
+    lines = [(place, {name: row.get(named.get(name, name), "") for name in (*needed, *_MORE)}) for place, row in rows]
+    records = [_record(where, group, size, units, origin) for group in _scanpaths(where, lines)]
+    return warn_of_frames(where, records, units=units == "pixels")
+
+
+def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
+    """Names of the columns of a `pandas.DataFrame`, and its rows as text; missing values are empty."""
+    header = [str(name) for name in frame.columns]
+    rows = []
+    for number, row in enumerate(frame.itertuples(index=False, name=None)):
+        texts = ["" if str(value) in _MISSING else str(value) for value in row]
+        rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
+    return header, rows
+
+
+def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
+    """Names of the columns of a file, and its lines; decimal commas become points."""
     check_regular(path)
     try:
-        lines = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        content = path.read_bytes()
+        encoding = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "utf-8")
+        text = content.decode(encoding)
+        first = text.partition("\n")[0]
+        separator = max(",;\t", key=first.count)
+        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        lines = [(f"line {reader.line_num}", line) for line in reader]
+    except (OSError, UnicodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
-    missing = [name for name in _COLUMNS if lines and name not in lines[0]]
-    if missing:
-        raise DataError(f"{path}: expected the columns {', '.join(_COLUMNS)}, got none named {', '.join(missing)}")
-    groups: list[list[tuple[int, Mapping[str, str]]]] = []
+    header = [(name or "").strip() for name in reader.fieldnames or ()]
+    rows = []
+    for place, line in lines:
+        if None in line:
+            raise DataError(
+                f"{path}: {place}: expected {len(header)} fields, got more; quote fields with {separator!r}"
+            )
+        values = [(value or "").strip() for value in line.values()]
+        if separator != ",":
+            values = [value.replace(",", ".") if _is_decimal(value) else value for value in values]
+        rows.append((place, dict(zip(header, values, strict=True))))
+    return header, rows
+
+
+def _is_decimal(text: str) -> bool:
+    """Whether this is a number with a decimal comma."""
+    whole, comma, rest = text.lstrip("+-").partition(",")
+    return bool(comma) and (whole + rest.replace("e", "").replace("E", "").replace("-", "")).isdecimal()
+
+
+def _scanpaths(where: str, lines: Sequence[_Line]) -> list[list[_Line]]:
+    """The lines of each scanpath."""
+    groups: dict[tuple[str, ...], list[_Line]] = {}
     previous = None
-    for number, line in enumerate(lines, start=2):
-        who = line["picture"], line["subject"], line.get("target")
-        if who != previous:
-            groups.append([])
-        groups[-1].append((number, line))
+    for place, line in lines:
+        who = tuple(line[name] for name in ("picture", "subject", "target", "trial"))
+        if who in groups and who != previous and not line["trial"]:
+            raise DataError(
+                f"{where}: {place}: expected the lines of a scanpath to follow each other, got those of "
+                f"{line['subject']!r} in {line['picture']!r} again; sort them, or add a column `trial` that tells "
+                "viewings apart"
+            )
+        groups.setdefault(who, []).append((place, line))
         previous = who
-    return warn_outside(path, [_record(path, group) for group in groups])
+    return list(groups.values())
 
 
 def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> None:
@@ -79,61 +172,120 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     ...     path = Path(folder, "fixations.csv")
     ...     write_table(path, [Fixations("a.jpg", "1", np.array([[40.0, 30.0]]), (80, 60), target="cup")])
     ...     print(path.read_text().splitlines()[1])
-    a.jpg,1,40.0,30.0,80,60,cup,,,,,,
+    a.jpg,1,40.0,30.0,80,60,cup,,,,,,,1
     """
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow([*_COLUMNS, *_MORE])
+    rows.writerow([*_COLUMNS, *_SIZE, *_MORE])
+    viewings: dict[tuple[str, str, str | None], int] = {}
     for each in fixations:
         times = [""] * len(each) if each.durations is None else each.durations.tolist()
         box = [""] * 4 if each.box is None else each.box
         found = "" if each.found is None else str(each.found).lower()
+        who = each.picture, each.subject, each.target
+        viewings[who] = trial = viewings.get(who, 0) + 1
         for (x, y), time in zip(each.points.tolist(), times, strict=True):
-            rows.writerow([each.picture, each.subject, x, y, *each.size, each.target or "", time, *box, found])
+            rows.writerow([each.picture, each.subject, x, y, *each.size, each.target or "", time, *box, found, trial])
     write_text(Path(path), text.getvalue())
 
 
-def _record(path: Path, group: list[tuple[int, Mapping[str, str]]]) -> Fixations:
-    first, line = group[0]
-    points = np.array([[_number(path, at, row, name) for name in ("x", "y")] for at, row in group])
-    times = [_maybe(path, at, row, "duration") for at, row in group]
-    edges = [_maybe(path, first, line, name) for name in ("x1", "y1", "x2", "y2")]
+def _record(
+    where: str,
+    group: Sequence[_Line],
+    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None,
+    units: Units,
+    origin: Origin,
+) -> Fixations:
+    place, line = group[0]
+    for name in (*(() if size is not None else _SIZE), "x1", "y1", "x2", "y2", "found"):
+        other = next((each for each in group if each[1][name] != line[name]), None)
+        if other is not None:
+            expected = f"{line[name]!r}, as in {place}"
+            raise DataError(f"{where}: {other[0]}, {name}: expected {expected}, got {other[1][name]!r}")
+    frame = _frame(where, place, line, size)
+    points = np.array([[_number(where, at, row, name) for name in ("x", "y")] for at, row in group])
+    times = [_maybe(where, at, row, "duration") for at, row in group]
+    if None in times and any(time is not None for time in times):
+        at = group[times.index(None)][0]
+        raise DataError(f"{where}: {at}, duration: expected a number, as in other lines of the scanpath, got nothing")
+    edges = [_maybe(where, place, line, name) for name in ("x1", "y1", "x2", "y2")]
+    if None in edges and any(edge is not None for edge in edges):
+        raise DataError(f"{where}: {place}: expected all of x1, y1, x2 and y2, or none, got some")
     box: ObjectBox | None = None
-    if all(edge is not None for edge in edges):
-        x1, y1, x2, y2 = (float(edge) for edge in edges if edge is not None)
+    if None not in edges:
+        corners = _placed(np.array(edges, dtype=np.float64).reshape(2, 2), frame, units, origin, edges=True)
+        if origin in ("bottom left", "centre, y up"):
+            corners[:, 1] = corners[::-1, 1]
+        x1, y1, x2, y2 = corners.flatten().tolist()
         box = x1, y1, x2, y2
-    words = {"true": True, "false": False, "": None}
-    found = (line.get("found") or "").lower()
+    words = {"true": True, "false": False, "1": True, "0": False, "": None}
+    found = line["found"].lower()
     if found not in words:
-        raise DataError(f"{path}: line {first}, found: expected true, false or nothing, got {found!r}")
-    timed = None not in times
+        raise DataError(f"{where}: {place}, found: expected true, false or nothing, got {found!r}")
     try:
         return Fixations(
             picture=line["picture"],
             subject=line["subject"],
-            points=points,
-            size=(int(_number(path, first, line, "width")), int(_number(path, first, line, "height"))),
-            durations=np.array(times, dtype=np.float64) if timed else None,
-            target=line.get("target") or None,
+            points=_placed(points, frame, units, origin),
+            size=frame,
+            durations=None if None in times else np.array(times, dtype=np.float64),
+            target=line["target"] or None,
             box=box,
             found=words[found],
         )
     except InputError as error:
-        raise DataError(f"{path}: line {first}, {error}") from None
+        raise DataError(f"{where}: {place}, {error}") from None
 
 
-def _number(path: Path, at: int, line: Mapping[str, str], name: str) -> float:
-    value = _maybe(path, at, line, name)
+def _frame(
+    where: str, place: str, line: Mapping[str, str], size: tuple[int, int] | Mapping[str, tuple[int, int]] | None
+) -> tuple[int, int]:
+    """Size of the frame of a scanpath."""
+    if size is None:
+        sides = [_number(where, place, line, name) for name in _SIZE]
+    elif isinstance(size, Mapping):
+        check(line["picture"] in size, "size", f"a size of {line['picture']!r}", "none")
+        sides = [*size[line["picture"]]]
+    else:
+        sides = [*size]
+    whole = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
+    if not whole:
+        raise DataError(f"{where}: {place}, size: expected a width and a height in whole pixels, got {sides}")
+    return int(sides[0]), int(sides[1])
+
+
+def _placed(points: Any, frame: tuple[int, int], units: Units, origin: Origin, *, edges: bool = False) -> Any:
+    """Points, or edges of pixels, in pixels from the top left, given in a unit from an origin."""
+    if units == "pixels" and origin == "top left":
+        return points
+    sides = np.array(frame, dtype=np.float64)
+    # Between here and the end 0 is an edge. Pixels that are counted from a corner have their centres at integers.
+    counted = units == "pixels" and origin == "bottom left" and not edges
+    places = (points + 0.5 if counted else points) * (sides if units == "fractions" else 1.0)
+    if origin in ("bottom left", "centre, y up"):
+        places[:, 1] *= -1
+    if origin == "bottom left":
+        places[:, 1] += sides[1]
+    elif origin != "top left":
+        places += sides / 2
+    return places if edges else places - 0.5
+
+
+def _number(where: str, at: str, line: Mapping[str, str], name: str) -> float:
+    value = _maybe(where, at, line, name)
     if value is None:
-        raise DataError(f"{path}: line {at}, {name}: expected a number, got nothing")
+        raise DataError(f"{where}: {at}, {name}: expected a number, got nothing")
     return value
 
 
-def _maybe(path: Path, at: int, line: Mapping[str, str], name: str) -> float | None:
+def _maybe(where: str, at: str, line: Mapping[str, str], name: str) -> float | None:
     text = line.get(name)
     if not text:
         return None
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise DataError(f"{path}: line {at}, {name}: expected a number, got {text[:40]!r}") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataError(f"{where}: {at}, {name}: expected a number, got {text[:40]!r}")
+    return value

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import gaussian_blur
 from semfov.gaze.saliency.conspicuity import Fusion, combine_maps, rescale
@@ -50,7 +51,7 @@ def _twin_pyramids(
     Raises:
         InputError: the channels are empty or of another shape, or a setting is out of range.
 
-    >>> [len(layer) for layer in twin_pyramids(torch.rand(1, 3, 9, 20))]
+    >>> [len(layer) for layer in _twin_pyramids(torch.rand(1, 3, 9, 20))]
     [2, 2, 2, 2]
     """
     check_shape(channels, "channels", None, None, None, None)
@@ -78,7 +79,7 @@ def _twin_pyramids(
 def _on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
     """Contrasts of bright on dark and of dark on bright.
 
-    >>> on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
+    >>> _on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
     (tensor([0., 2.]), tensor([2., 0.]))
     """
     return F.relu(centre - surround), F.relu(surround - centre)
@@ -182,17 +183,17 @@ class VOCUS2(nn.Module):
         self.color_space: _ColorSpace = color_space
         self.normalise = normalise
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, image: ImageLike) -> Tensor:
         """Compute the saliency of images.
 
         Args:
-            image: `(B, 3, H, W)`, RGB in [0, 1].
+            image: `(B, 3, H, W)`, RGB in [0, 1], or one picture of any common type (`semfov.as_image`).
 
         Returns:
             `(B, H, W)`.
         """
         return vocus2_saliency(
-            image,
+            as_batch(image),
             centre_sigma=self.centre_sigma,
             surround_sigma=self.surround_sigma,
             layers=self.layers,

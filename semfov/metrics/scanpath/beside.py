@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from os import PathLike
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations, FixationValues, warn_outside
+from semfov.data.fixations.table import read_table
 from semfov.errors import check
 from semfov.metrics.scanpath.conditional import auc, nss
 from semfov.metrics.scanpath.multimatch import multimatch
@@ -18,6 +21,7 @@ from semfov.paths import GazeRecord
 _CELLS = 8
 _BLUR = 0.03
 _LONGEST = 64
+_STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 
 _Measure = Callable[[FixationValues, Sequence[FixationValues]], float]
 
@@ -52,7 +56,11 @@ class ScanpathComparison(dict[str, BesidePeople]):
         return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
 
 
-def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixations]) -> ScanpathComparison:
+People = Fixations | Sequence[Fixations] | str | PathLike[str]
+"""Fixations of one person or several, or a table of them (`semfov.data.fixations.read_table`)."""
+
+
+def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> ScanpathComparison:
     """Compare a scanpath with those of people in the same picture, and the people with each other.
 
     - `MultiMatch shape`, `direction`, `length`, `position` (`multimatch`): 1 for equal scanpaths; NaN below three
@@ -66,23 +74,42 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: Sequence[Fixation
 
     Args:
         scanpath: a record of an agent, or fixations.
-        people: fixations of people (`semfov.data.fixations`) in the same picture, in any size of it.
+        people: fixations of people (`semfov.data.fixations`) in the same picture, in any size of it, or the path of a
+            table, of which those in the picture are taken.
 
     Returns:
         The measures by name.
 
     Raises:
-        InputError: there are no people, their records are of several pictures, or rapidfuzz is not installed.
+        InputError: there are no people, their records are of several pictures, of another picture or target, or of a
+            frame with other proportions, or rapidfuzz is not installed.
+        DataError: the table cannot be read.
 
     >>> path = Fixations("a.jpg", "1", np.array([[10.0, 10], [60, 10], [60, 40]]), (80, 60))
     >>> compare_scanpath(path, [path])["sequence score"].scanpath
     1.0
     """
+    own = scanpath.picture if isinstance(scanpath, Fixations) else scanpath.source
+    name = None if own is None else Path(own).stem
+    if isinstance(people, str | PathLike):
+        table = read_table(people)
+        people = [each for each in table if name is None or Path(each.picture).stem == name]
+        check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
+    people = [people] if isinstance(people, Fixations) else [*people]
     check(len(people) > 0, "people", "fixations of at least one person", "none")
     pictures = sorted({each.picture for each in people})
     check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-    size = people[0].size
+    same = name is None or Path(pictures[0]).stem == name
+    check(same, "people", f"fixations in {name!r}, as those of the scanpath", f"in {pictures[0]!r}")
     ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
+    targets = sorted({each.target for each in (ours, *people) if each.target is not None})
+    check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
+    size = people[0].size
+    for each in (ours, *people):
+        stretch = (each.size[0] * size[1]) / (each.size[1] * size[0])
+        got = f"{each.size[0]} × {each.size[1]} of {each.subject!r}"
+        expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
+        check(abs(stretch - 1) <= _STRETCH, "people", expected, got)
     records = [each.resized(size) for each in (ours, *people)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]

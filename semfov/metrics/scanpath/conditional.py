@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semfov.errors import check
+from semfov.errors import check, check_number
 
 _Array = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     array([1.73205081])
     """
     values, at = looked_up(maps, x, y)
+    check(bool(np.isfinite(values).all()), "maps", "finite numbers", "infinity; give densities, not their logarithms")
     flat = values.reshape(*values.shape[:-2], -1)
     # By rounding the mean of equal values may differ from them, and their deviation from 0.
     even = (np.ptp(flat, axis=-1) == 0)[..., None]
@@ -102,6 +103,7 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     >>> log_density([[1.0, 3.0]]).round(3)
     array([[-1.386, -0.288]])
     """
+    check_number(floor, "floor", 0, 1)
     values = np.asarray(maps, dtype=np.float64)
     total = values.sum((-1, -2), keepdims=True)
     usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
@@ -154,6 +156,8 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     >>> information_gain(log_density([[1.0, 3.0]]), log_density([[1.0, 1.0]]), [1], [0]).round(3)
     array([0.585])
     """
+    ours, theirs = (np.shape(each)[-2:] for each in (density, baseline))
+    check(ours == theirs, "baseline", f"densities over {ours} pixels, as `density`", theirs)
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
 
@@ -171,6 +175,8 @@ def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Arr
     leading = values.shape[:-2]
     fits = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
     check(fits, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))
+    missing = int(np.isnan(values).sum())
+    check(not missing, "maps", "numbers", f"NaN in {missing} of {values.size} pixels; replace them (numpy.nan_to_num)")
     height, width = values.shape[-2:]
     outside = ~((column >= 0) & (column < width) & (row >= 0) & (row < height))
     got = f"{int(outside.sum())} of {outside.size} outside it; remove them, or scale them to pixels of the map"

@@ -58,7 +58,8 @@ def multimatch(
     - position :math:`1 - \mathrm{med} \|p - q\| / D`, with the points p and q where the saccades start
     - duration :math:`1 - \mathrm{med} |s - t| / \max(s, t)`, with the durations s and t of the fixations there
 
-    The result equals that of `multimatch_gaze.docomparison` without grouping.
+    The result equals that of `multimatch_gaze.docomparison` without grouping where one path is the cheapest. Of equally
+    cheap paths, as between fixations at the centres of cells, the reference may take another one.
 
     Args:
         ours: `(n, 2)`, fixations of one scanpath.
@@ -79,6 +80,8 @@ def multimatch(
     a, b = (np.asarray(path, dtype=np.float64) for path in (ours, theirs))
     for name, path in (("ours", a), ("theirs", b)):
         check(path.ndim == 2 and path.shape[1] == 2, name, "fixations of shape (n, 2)", path.shape)
+        check(bool(np.isfinite(path).all()), name, "finite numbers", "others; leave these fixations out")
+    check(all(np.isfinite(side) and side > 0 for side in size), "size", "(width, height), positive numbers", size)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
@@ -92,6 +95,8 @@ def multimatch(
         s, t = (np.asarray(each, dtype=np.float64) for each in durations)
         expected = f"{len(a)} and {len(b)} numbers, one for each fixation"
         check(len(s) == len(a) and len(t) == len(b), "durations", expected, (len(s), len(t)))
+        lasting = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
+        check(lasting, "durations", "finite numbers of 0 or more", "others")
         longer = np.maximum(s[i], t[j])
         duration = 1 - float(np.median(np.abs(s[i] - t[j]) / np.where(longer > 0, longer, 1)))
     return MultiMatch(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
+from semfov.metrics.labels import as_labels, as_numbers
 from semfov.metrics.search import cumulative_performance
 
 _Array = NDArray[np.float64]
@@ -30,7 +31,7 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     1
     """
     x, y = _points(points).T
-    x1, y1, x2, y2 = np.asarray(box)
+    x1, y1, x2, y2 = _corners(box)
     on = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
     return int(on.argmax()) if on.any() else -1
 
@@ -56,9 +57,10 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     >>> mean_performance([1, -1, 0], ["ann", "ann", "bob"], 1)
     array([0.5 , 0.75])
     """
-    check(len(found) == len(groups) > 0, "groups", f"one for each of {len(found)} searches, at least one", len(groups))
-    members: dict[Hashable, list[int]] = {}
-    for each, group in zip(found, groups, strict=True):
+    when, names = as_numbers(found, "found").tolist(), as_labels(groups, "groups")
+    check(len(when) == len(names) > 0, "groups", f"one for each of {len(when)} searches, at least one", len(names))
+    members: dict[Hashable, list[float]] = {}
+    for each, group in zip(when, names, strict=True):
         members.setdefault(group, []).append(each)
     curves = [cumulative_performance(np.array(each), shifts) for each in members.values()]
     return np.asarray(np.mean(curves, axis=0))
@@ -155,7 +157,7 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
     >>> scanpath_ratio([[0, 0], [0, 6], [8, 6]], [7, 5, 9, 7])
     0.7142857142857143
     """
-    path, edges = _points(points), np.asarray(box, dtype=np.float64)
+    path, edges = _points(points), _corners(box)
     last = found_at(path, edges)
     if last < 1:
         return float("nan")
@@ -168,4 +170,12 @@ def _points(points: ArrayLike) -> _Array:
     array = np.asarray(points, dtype=np.float64)
     usable = array.ndim == 2 and array.shape[1] == 2 and len(array) > 0
     check(usable, "points", "an array of shape (n, 2), not empty", array.shape)
+    check(bool(np.isfinite(array).all()), "points", "finite numbers", "others; leave these fixations out")
     return array
+
+
+def _corners(box: ArrayLike) -> _Array:
+    corners = np.asarray(box, dtype=np.float64)
+    check(corners.shape == (4,), "box", "(x1, y1, x2, y2)", f"shape {corners.shape}")
+    check(bool((corners[:2] <= corners[2:]).all()), "box", "x1 <= x2 and y1 <= y2", corners.tolist())
+    return corners

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import InputError, check
+from semfov.metrics.labels import as_labels
 
 _Labels = NDArray[np.int64]
 
@@ -144,8 +145,9 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
 
 
 def _word(labels: Sequence[Hashable], argument: str) -> list[Hashable]:
-    check(len(labels) > 0, argument, "at least one label", "none")
-    return labels.tolist() if isinstance(labels, np.ndarray) else list(labels)
+    word = as_labels(labels, argument)
+    check(len(word) > 0, argument, "at least one label", "none")
+    return word
 
 
 def _rapidfuzz() -> Any:
@@ -175,6 +177,7 @@ def merge_close(points: ArrayLike, size: tuple[float, float]) -> NDArray[np.floa
            [9., 9.]])
     """
     path = list(np.asarray(points, dtype=np.float64))
+    check(all(np.isfinite(point).all() for point in path), "points", "finite numbers", "others")
     half = np.asarray(size) / 2
     index = 0
     while index < len(path) - 1:

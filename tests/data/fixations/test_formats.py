@@ -78,6 +78,7 @@ def test_written_free_viewing_records_are_read_back(tmp_path):
         write_osie(tmp_path / "file", [records[0], records[0].resized((8, 6))])
 
 
+@pytest.mark.filterwarnings("ignore:.*look like")
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8))
 def test_any_points_are_read_back_from_a_table(tmp_path_factory, points):
     path = tmp_path_factory.mktemp("table") / "t.csv"

@@ -1,11 +1,13 @@
 """A scanpath beside people: each measure is the mean of its function over pairs, and orders scanpaths as expected."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from semfov import Grid
-from semfov.data.fixations import Fixations
+from semfov.data.fixations import Fixations, Letterbox, write_table
 from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, compare_scanpath, edit_distance, multimatch, sequence_score
 from tests import small
@@ -71,3 +73,33 @@ def test_a_record_is_compared_by_itself_and_printed_as_a_table():
     assert table == compare_scanpath(scanpath.as_fixations("a.jpg"), others)
     assert str(table).splitlines()[0].split() == ["measure", "scanpath", "people"]
     assert len(str(table).splitlines()) == 1 + len(table)
+
+
+def test_people_are_given_as_one_record_or_as_a_table(tmp_path):
+    """Of a table those in the picture are taken."""
+    mine, *others = people(3)
+    write_table(tmp_path / "t.csv", [*others, Fixations("b.jpg", "1", mine.points, SIZE)])
+    assert compare_scanpath(mine, tmp_path / "t.csv") == compare_scanpath(mine, others)
+    one = compare_scanpath(mine, others[0])
+    assert one["sequence score"].scanpath == compare_scanpath(mine, others[:1])["sequence score"].scanpath
+    with pytest.raises(InputError, match=r"people: expected fixations in 'c', got others, such as those in 'a\.jpg'"):
+        compare_scanpath(replace(mine, picture="c.jpg"), tmp_path / "t.csv")
+
+
+def test_what_cannot_be_compared_is_refused():
+    mine, *others = people(3)
+    for changes, said in (
+        ({"picture": "b.jpg"}, "people: expected fixations in 'b', as those of the scanpath, got in 'a.jpg'"),
+        ({"target": "cup"}, "people: expected searches for one target, got for 'cup', 'fork'"),
+        ({"size": (1680, 1050)}, "people: expected frames with the proportions of 800 × 600"),
+    ):
+        theirs = [replace(each, target="fork") for each in others] if "target" in changes else others
+        with pytest.raises(InputError, match=said):
+            compare_scanpath(replace(mine, **changes), theirs)
+        with pytest.raises(InputError, match="people: expected"):
+            compare_scanpath(mine, [replace(others[0], **changes), replace(others[1], target="fork")])
+    placed = replace(mine, points=Letterbox((1680, 1050), SIZE).to_screen(mine.points), size=(1680, 1050))
+    back = compare_scanpath(placed.in_picture(SIZE), [mine, *others])
+    assert back["sequence score"].scanpath == compare_scanpath(mine, [mine, *others])["sequence score"].scanpath
+    rounded = compare_scanpath(mine.resized((641, 480)), others)
+    assert rounded["AUC"].scanpath == pytest.approx(compare_scanpath(mine, others)["AUC"].scanpath, abs=0.01)

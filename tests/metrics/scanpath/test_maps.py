@@ -278,3 +278,41 @@ def test_the_expectation_of_auc_borji_is_the_mean_auc():
     # The standard deviation of a draw is below .08, that of the mean of 400 below .004.
     assert auc_borji(saliency, x, y, draws=400) == pytest.approx(mean, abs=0.016)
     assert auc_borji(saliency, x, y, seed=1) == auc_borji(saliency, x, y, seed=1)
+
+
+NAN = float("nan")
+MAP = [[0.1, 0.2], [0.3, 0.4]]
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: auc([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN in 1 of 4 pixels"),
+        (lambda: nss([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
+        (lambda: auc_judd([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
+        (lambda: auc_shuffled([[0.1, NAN], [0.3, 0.4]], [1], [1], [0], [0]), "maps: expected numbers, got NaN"),
+        (lambda: log_density([[0.1, NAN]]), "maps: expected finite numbers"),
+        (lambda: nss(log_density([[0.0, 0.2], [0.3, 0.5]]), [1], [1]), "maps: expected finite numbers, got infinity"),
+        (lambda: auc(MAP, [NAN], [1]), "x, y: expected points inside"),
+        (lambda: log_density(MAP, floor=1.5), "floor: expected a number from 0 to 1, got 1.5"),
+        (lambda: log_density(MAP, floor=-0.1), "floor: expected a number from 0 to 1"),
+        (lambda: log_density(MAP, floor=NAN), "floor: expected a number from 0 to 1"),
+        (
+            lambda: information_gain(log_density(np.ones((4, 4))), log_density(np.ones((40, 40))), [1], [1]),
+            r"baseline: expected densities over \(4, 4\) pixels, as `density`, got \(40, 40\)",
+        ),
+    ],
+)  # fmt: skip
+def test_figures_are_not_made_better_by_what_is_no_map(call, named):
+    with pytest.raises(InputError, match=named):
+        call()
+
+
+def test_maps_of_any_type_have_the_same_figures():
+    """Halves, whole numbers and tensors; the baseline may be one for all maps."""
+    for kind in (np.float16, np.uint8, np.int64, np.float32):
+        maps = np.array([[1, 2], [3, 4]]).astype(kind)
+        assert auc(maps, [1], [1]) == auc(torch.tensor(maps), [1], [1]) == 0.875
+        assert information_gain(log_density(maps), log_density(np.ones((2, 2))), [1], [1])[0] == pytest.approx(
+            np.log2(0.4 / 0.25)
+        )

@@ -111,3 +111,18 @@ def test_a_curve_may_be_boolean():
 def test_tfp_auc_sums_seven_fixations_by_default():
     assert tfp_auc([0, 0], ["cup", "fork"]) == 7
     assert tfp_auc([6, 7], ["cup", "fork"]) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: found_at([[5, 5]], [8, 4, 4, 8]), "box: expected x1 <= x2 and y1 <= y2"),
+        (lambda: found_at([[5, 5]], [4, 4, 8]), r"box: expected \(x1, y1, x2, y2\), got shape \(3,\)"),
+        (lambda: found_at([[5, 5]], [4, 4, float("nan"), 8]), "box: expected x1 <= x2 and y1 <= y2"),
+        (lambda: found_at([[float("nan"), 5]], [4, 4, 8, 8]), "points: expected finite numbers"),
+        (lambda: scanpath_ratio([[0, 0], [5, 5]], [8, 8, 4, 4]), "box: expected x1 <= x2 and y1 <= y2"),
+    ],
+)
+def test_boxes_are_corners_in_order(call, named):
+    with pytest.raises(InputError, match=named):
+        call()

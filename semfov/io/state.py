@@ -1,0 +1,52 @@
+"""Settings of modules in their state, so that the state of a module with other settings is refused."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from semfov.errors import InputError
+
+_KEY = "_extra_state"
+
+
+class StatedModule(nn.Module):
+    """Base of modules whose shapes do not tell their settings; their `state_dict` holds the settings as bytes of JSON.
+
+    A state without settings, such as that of an earlier version, is loaded as it is.
+    """
+
+    def _stated(self) -> dict[str, Any]:
+        """The settings that are no parameters, as JSON values."""
+        return {}
+
+    def get_extra_state(self) -> Tensor:
+        """The settings as bytes of JSON."""
+        return torch.frombuffer(bytearray(json.dumps(self._stated()).encode()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the state of a module with other settings."""
+        own, theirs = json.loads(json.dumps(self._stated())), json.loads(bytes(state.tolist()))
+        for name, value in own.items():
+            if theirs.get(name, value) != value:
+                raise InputError(
+                    f"state_dict: expected the state of a {type(self).__name__} with {name} {value!r:.200}, got one "
+                    f"with {theirs[name]!r:.200}; make the module with these settings"
+                )
+
+    def _load_from_state_dict(
+        self, state_dict: Any, prefix: str, local_metadata: Any, strict: Any, missing_keys: Any, *others: Any
+    ) -> None:
+        """Load after a look at the settings, which may be missing."""
+        if prefix + _KEY in state_dict:
+            self.set_extra_state(state_dict[prefix + _KEY])
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing_keys, *others)
+        if prefix + _KEY in missing_keys:
+            missing_keys.remove(prefix + _KEY)
+
+
+def without_settings(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The parameters and buffers of a `state_dict`."""
+    return {name: tensor for name, tensor in state.items() if name.rpartition(".")[2] != _KEY}

@@ -1,0 +1,165 @@
+"""Tables of other programs: encodings, separators, names, units and origins, and what is refused or warned of."""
+
+import numpy as np
+import pandas
+import pytest
+
+from semfov.data.fixations import Fixations, read_cocosearch, read_table, write_table
+from semfov.errors import DataError, InputError
+
+HEADER = "picture,subject,x,y,width,height"
+LINES = ("a.jpg,1,399.5,299.5,800,600", "a.jpg,1,212.25,140,800,600", "b.jpg,1,12,14,800,600")
+TABLE = "\n".join([HEADER, *LINES]) + "\n"
+POINTS = [[[399.5, 299.5], [212.25, 140]], [[12, 14]]]
+
+
+def points_of(records):
+    return [each.points.tolist() for each in records]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_tables_of_spreadsheets(tmp_path, encoding, separator, end):
+    """With a byte order mark, semicolons or tabs, and decimal commas where these do not separate."""
+    text = TABLE.replace(",", separator).replace("\n", end)
+    (tmp_path / "t.csv").write_bytes(text.encode(encoding))
+    assert points_of(read_table(tmp_path / "t.csv")) == POINTS
+    if separator != ",":
+        (tmp_path / "t.csv").write_bytes(text.replace(".5", ",5").replace(".25", ",25").encode(encoding))
+        records = read_table(tmp_path / "t.csv")
+        assert points_of(records) == POINTS
+        assert records[0].picture == "a.jpg"
+
+
+def test_a_frame_other_names_and_a_size(tmp_path):
+    frame = pandas.DataFrame({"image": ["a", "a"], "who": [1, 1], "X": [1.5, 2], "Y": [3, 4.5], "t": [None, None]})
+    names = {"picture": "image", "subject": "who", "x": "X", "y": "Y", "duration": "t"}
+    for size in ((80, 60), {"a": (80, 60)}):
+        (record,) = read_table(frame, columns=names, size=size)
+        assert (record.points.tolist(), record.size, record.subject) == ([[1.5, 3], [2, 4.5]], (80, 60), "1")
+        assert record.durations is None
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert points_of(read_table(tmp_path / "t.csv", columns=names, size=(80, 60))) == [[[1.5, 3], [2, 4.5]]]
+    with pytest.raises(DataError, match=r"none named picture, subject, x, y among 'image', 'who', 'X', 'Y', 't'; name"):
+        read_table(frame, size=(80, 60))
+    with pytest.raises(DataError, match="row 1, y: expected a number, got nothing"):
+        read_table(frame.assign(Y=[1.0, np.nan]), columns=names, size=(80, 60))
+    with pytest.raises(InputError, match="size: expected a size of 'a'"):
+        read_table(frame, columns=names, size={"b": (8, 6)})
+    with pytest.raises(InputError, match="unknown column 'Y'"):
+        read_table(frame, columns={"Y": "y"})
+
+
+def test_viewings_are_told_apart_by_their_trial(tmp_path):
+    """Also where lines alternate; without a trial the lines of a scanpath follow each other."""
+    path = tmp_path / "t.csv"
+    rows = [("a,1,1,1,8,6,", 1), ("a,1,2,2,8,6,", 2), ("a,1,3,3,8,6,", 1), ("b,1,4,4,8,6,", 1)]
+    path.write_text("\n".join([HEADER + ",trial", *(f"{row}{trial}" for row, trial in rows)]))
+    assert points_of(read_table(path)) == [[[1, 1], [3, 3]], [[2, 2]], [[4, 4]]]
+    again = Fixations("a", "1", np.ones((2, 2)), (8, 6)), Fixations("a", "1", np.zeros((1, 2)), (8, 6))
+    write_table(path, again)
+    assert points_of(read_table(path)) == [[[1, 1], [1, 1]], [[0, 0]]]
+    path.write_text("\n".join([HEADER, "a,1,1,1,8,6", "a,2,1,1,8,6", "a,1,3,3,8,6"]))
+    with pytest.raises(DataError, match=r"line 4: expected the lines of a scanpath to follow each other.* `trial`"):
+        read_table(path)
+
+
+CORNERS = [[0.0, 0.0], [79.0, 0.0], [0.0, 59.0], [20.0, 10.0]]
+
+
+@pytest.mark.parametrize(
+    ("units", "origin", "given"),
+    [
+        ("pixels", "top left", CORNERS),
+        ("pixels", "bottom left", [[0, 59], [79, 59], [0, 0], [20, 49]]),
+        ("pixels", "centre", [[-39.5, -29.5], [39.5, -29.5], [-39.5, 29.5], [-19.5, -19.5]]),
+        ("pixels", "centre, y up", [[-39.5, 29.5], [39.5, 29.5], [-39.5, -29.5], [-19.5, 19.5]]),
+        ("fractions", "top left", np.array([[0.5, 0.5], [79.5, 0.5], [0.5, 59.5], [20.5, 10.5]]) / (80, 60)),
+        ("fractions", "bottom left", np.array([[0.5, 59.5], [79.5, 59.5], [0.5, 0.5], [20.5, 49.5]]) / (80, 60)),
+    ],
+)  # fmt: skip
+def test_units_and_origins(units, origin, given):
+    """The corner pixels of a frame of 80 × 60, and the box of its first ten columns and five rows."""
+    box = {
+        "top left": (0, 0, 10, 5), "bottom left": (0, 55, 10, 60), "centre": (-40, -30, -30, -25),
+        "centre, y up": (-40, 25, -30, 30),
+    }[origin]  # fmt: skip
+    scale = (80, 60, 80, 60) if units == "fractions" else (1, 1, 1, 1)
+    frame = pandas.DataFrame(given, columns=["x", "y"]).assign(picture="a", subject="1")
+    frame = frame.assign(**{name: n / s for name, n, s in zip(("x1", "y1", "x2", "y2"), box, scale, strict=True)})
+    (record,) = read_table(frame, size=(80, 60), units=units, origin=origin)
+    np.testing.assert_allclose(record.points, CORNERS, atol=1e-9)
+    np.testing.assert_allclose(record.box, (0, 0, 10, 5), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"width": "nan"}, "line 2, width: expected a number, got 'nan'"),
+        ({"width": "inf"}, "line 2, width: expected a number, got 'inf'"),
+        ({"width": "800.5"}, "line 2, size: expected a width and a height in whole pixels"),
+        ({"width": "-800"}, "line 2, size: expected a width"),
+        ({"x": "inf"}, "line 2, x: expected a number, got 'inf'"),
+        ({"duration": "-5"}, "line 2, durations: expected milliseconds, 0 or more"),
+        ({"duration": "nan"}, "line 2, duration: expected a number, got 'nan'"),
+        ({"duration": ""}, "line 2, duration: expected a number, as in other lines"),
+        ({"x1": "50"}, r"line 2, box: expected \(x1, y1, x2, y2\) with x1 <= x2"),
+        ({"x1": ""}, "line 2: expected all of x1, y1, x2 and y2, or none"),
+        ({"x1": "1", "second": "2"}, "line 3, x1: expected '1', as in line 2, got '2'"),
+        ({"found": "maybe"}, "line 2, found: expected true, false or nothing"),
+    ],
+)
+def test_what_is_not_a_fixation_is_named(tmp_path, change, said):
+    fields = {"picture": "a", "subject": "1", "x": "4", "y": "5", "width": "800", "height": "600"}
+    fields |= {"duration": "100", "x1": "10", "y1": "10", "x2": "20", "y2": "20", "found": "true"}
+    second = change.pop("second", None)
+    first = {**fields, **change}
+    other = {**first, "duration": "100", "x": "6"} | ({} if second is None else {"x1": second})
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(",".join(each) for each in (fields, first.values(), other.values())))
+    with pytest.raises(DataError, match=said):
+        read_table(path)
+
+
+def test_a_line_of_more_fields_is_named(tmp_path):
+    (tmp_path / "t.csv").write_text(f"{HEADER}\na,1,399,5,299,5,800,600\n")
+    with pytest.raises(DataError, match="line 2: expected 6 fields, got more"):
+        read_table(tmp_path / "t.csv")
+
+
+def look(points, size=(1680, 1050)):
+    frame = pandas.DataFrame(points, columns=["x", "y"]).assign(picture="a", subject="1")
+    return read_table(frame, size=size)
+
+
+DRAW = np.random.default_rng(0).random((40, 2))
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (DRAW, r"look like fractions of the sides \(units='fractions'\)"),
+        ((DRAW - 0.5) * (1600, 1000), r"look like pixels from the centre \(origin='centre'"),
+        ((DRAW * (1680, 1050))[:, ::-1], r"look like y before x"),
+        (DRAW * (512, 320), r"look like fixations of a frame of 5\d\d × 3\d\d or little more"),
+    ],
+    ids=["fractions", "centred", "swapped", "smaller frame"],
+)
+def test_coordinates_of_another_frame_are_warned_of(points, said):
+    with pytest.warns(UserWarning, match=said):
+        look(points)
+
+
+@pytest.mark.parametrize("noise", [0, 30])
+def test_fixations_of_their_frame_are_read_without_a_word(noise):
+    look(DRAW * (1680, 1050) + noise * (DRAW[::-1] - 0.5))
+    look(0.2 + 0.3 * DRAW[:3] * (1680, 1050))
+
+
+def test_other_readers_warn_too(tmp_path):
+    x, y = (DRAW * (512, 320)).T.tolist()
+    (tmp_path / "s.json").write_text(f'[{{"name": "a.jpg", "X": {x}, "Y": {y}}}]')
+    with pytest.warns(UserWarning, match="look like fixations of a frame"):
+        read_cocosearch(tmp_path / "s.json")
+    assert len(read_cocosearch(tmp_path / "s.json", screen=(512, 320))) == 1

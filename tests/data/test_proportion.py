@@ -1,0 +1,175 @@
+"""Files take memory in proportion to their size, and one file has one answer, whoever reads it."""
+
+import io
+import sys
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov import as_image
+from semfov.data.images import read_image
+from semfov.data.large import open_large, picture_size
+from semfov.errors import DataError
+from tests.data.test_large import pixels
+
+
+def whole(picture):
+    return picture.read((0, 0, *picture.size)).numpy()
+
+
+def fovea(path):
+    return (read_image(path) * 255).round().to(torch.uint8).numpy()
+
+
+def claims(path, width, height, bytes_of=b""):
+    """A JPEG of a small picture whose header claims another size."""
+    Image.fromarray(pixels(8, 8)).save(buffer := io.BytesIO(), "JPEG")
+    content = bytearray(buffer.getvalue())
+    frame = content.index(b"\xff\xc0")
+    content[frame + 5 : frame + 9] = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    path.write_bytes(bytes(content) + bytes_of)
+    return path
+
+
+def test_a_jpeg_that_claims_more_than_its_file_may_hold(tmp_path):
+    """All readers refuse it, before anything is decoded."""
+    path = claims(tmp_path / "a.jpg", 9000, 9000)
+    tracemalloc.start()
+    for read in (read_image, as_image, lambda path: open_large(path).size):
+        with pytest.raises(DataError, match=r"expected a file in proportion, got 81,000,000 pixels in [\d,]+ bytes"):
+            read(path)
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+    with pytest.raises(
+        DataError, match=r"at most 178,956,970 pixels of a file.*, got more; convert it to a tiled TIFF"
+    ):
+        open_large(claims(tmp_path / "b.jpg", 20_000, 20_000))
+
+
+def test_blank_pictures_are_in_proportion(tmp_path):
+    Image.new("L", (6000, 4000), 255).save(tmp_path / "a.png", optimize=True)
+    assert open_large(tmp_path / "a.png").size == (6000, 4000)
+    assert read_image(tmp_path / "a.png").shape == (3, 4000, 6000)
+
+
+@pytest.mark.parametrize("kind", ["inflates", "is stored"])
+def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
+    """A sound TIFF of 64 × 64 pixels, whose only tile is replaced by one of a hundred million zeros."""
+    tifffile = pytest.importorskip("tifffile")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, pixels(64, 64), tile=(64, 64), compression="zlib", photometric="rgb")
+    bomb = zlib.compress(bytes(60_000_000), 9 if kind == "inflates" else 1)
+    bomb = bomb if kind == "inflates" else bomb + bytes(300_000)
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        tags = file.pages[0].tags
+        places = {name: (tags[name].valueoffset, tags[name].dtype) for name in ("TileOffsets", "TileByteCounts")}
+    for (at, dtype), value in zip(places.values(), (len(content), len(bomb)), strict=True):
+        size = {3: 2, 4: 4, 16: 8}[int(dtype)]
+        content[at : at + size] = value.to_bytes(size, "little") if size > 2 or value < 2**16 else b"\xff\xff"
+    path.write_bytes(bytes(content) + bomb)
+    monkeypatch.setattr("semfov.data.large._INFLATED", 100)
+    tracemalloc.start()
+    with pytest.raises(DataError, match=r"expected tiles of 12,288 bytes, got one that"):
+        open_large(path).read((0, 0, 1, 1))
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+
+
+def test_a_tile_that_claims_more_than_is_stored(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((64, 64), np.uint8), tile=(64, 64), compression="zlib")
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        for name in ("TileWidth", "TileLength", "ImageWidth", "ImageLength"):
+            tag = file.pages[0].tags[name]
+            size = {3: 2, 4: 4}[int(tag.dtype)]
+            content[tag.valueoffset : tag.valueoffset + size] = (32_768).to_bytes(size, "little")
+    path.write_bytes(bytes(content))
+    with pytest.raises(DataError, match="in proportion"):
+        open_large(path).read((0, 0, 1, 1))
+
+
+@pytest.mark.parametrize("size", [(3, 40), (40, 3), (3, 3), (1, 5), (4, 1)])
+@pytest.mark.parametrize("kind", ["png", "tif", "bmp"])
+def test_narrow_pictures_of_files_are_not_ambiguous(tmp_path, size, kind):
+    array = pixels(size[1], size[0])
+    Image.fromarray(array).save(tmp_path / f"a.{kind}")
+    for source in (tmp_path / f"a.{kind}", Image.fromarray(array)):
+        assert np.array_equal((as_image(source) * 255).round().byte().permute(1, 2, 0).numpy(), array)
+        assert open_large(source).size == picture_size(source) == size
+
+
+def saved(path, mode="RGB", **options):
+    picture = Image.fromarray(pixels(120, 90)).resize((90, 120)).convert(mode)
+    picture.save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "CMYK", "YCbCr", "P", "1", "I;16"])
+@pytest.mark.parametrize("kind", ["tif", "png"])
+def test_one_file_has_one_answer(tmp_path, mode, kind, monkeypatch):
+    """By windows as by the fovea."""
+    if kind == "png" and mode in ("CMYK", "YCbCr"):
+        pytest.skip("PNG has no such colours")
+    path = tmp_path / f"a.{kind}"
+    if mode in ("RGBA", "LA"):
+        picture = Image.fromarray(np.dstack([pixels(120, 90), pixels(120, 90, 1)[..., :1]]), "RGBA").convert(mode)
+        picture.save(path)
+    elif mode == "I;16":
+        Image.fromarray(pixels(120, 90)[..., 0].astype(np.uint16) * 250).save(path)
+    else:
+        saved(path, mode)
+    difference = np.abs(whole(open_large(path)).astype(int) - fovea(path).astype(int))
+    assert difference.max() <= 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("photometric", ["rgb", "minisblack", "miniswhite"])
+def test_turned_tiffs_have_one_answer(tmp_path, orientation, photometric):
+    tifffile = pytest.importorskip("tifffile")
+    array = pixels(120, 90) if photometric == "rgb" else pixels(120, 90)[..., 0]
+    tags = [(274, "H", 1, orientation, True)]
+    tifffile.imwrite(tmp_path / "a.tif", array, photometric=photometric, extratags=tags, rowsperstrip=16)
+    picture = open_large(tmp_path / "a.tif")
+    assert picture.size == ((90, 120) if orientation < 5 else (120, 90))
+    assert np.array_equal(whole(picture), fovea(tmp_path / "a.tif"))
+
+
+@pytest.mark.parametrize("extra", ["unassalpha", "assocalpha", "unspecified"])
+def test_alpha_of_tiffs_read_by_windows(tmp_path, extra):
+    """Blended with white, unless the fourth channel is no alpha."""
+    tifffile = pytest.importorskip("tifffile")
+    array = np.dstack([pixels(120, 90), pixels(120, 90, 1)[..., :1]])
+    if extra == "assocalpha":
+        array[..., :3] = array[..., :3].astype(int) * array[..., 3:] // 255
+    tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb", extrasamples=[extra], tile=(64, 64))
+    share = array[..., 3:] / 255
+    exact = {
+        "unassalpha": array[..., :3] * share + 255 * (1 - share),
+        "assocalpha": array[..., :3] + 255 * (1 - share),
+        "unspecified": array[..., :3],
+    }[extra]
+    window = whole(open_large(tmp_path / "a.tif")).transpose(1, 2, 0)
+    assert np.abs(window.astype(float) - exact).max() <= 1
+
+
+def test_large_pictures_with_alpha_are_read_where_those_without_are(tmp_path, monkeypatch):
+    """The limit of float pictures is not that of pictures that are read by windows."""
+    monkeypatch.setattr("semfov.data.images.MAX_PIXELS", 5000)
+    for mode in ("RGB", "RGBA", "P", "L"):
+        path = saved(tmp_path / f"{mode}.png", mode)
+        assert open_large(path).read((0, 0, 5, 5)).shape == (3, 5, 5)
+        with pytest.raises(DataError, match=r"expected 1 to 5,000 pixels.*look at it by windows"):
+            read_image(path)
+
+
+def test_jpeg_2000_is_read_without_rasterio(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    saved(tmp_path / "a.jp2")
+    assert np.array_equal(whole(open_large(tmp_path / "a.jp2")), fovea(tmp_path / "a.jp2"))

@@ -1,0 +1,80 @@
+"""The state of a module with other settings is refused; states without settings are loaded as they are."""
+
+import io
+
+import pytest
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from semfov import ActivePerception, Eye, Foveation
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.errors import InputError
+from semfov.io.state import without_settings
+from semfov.observation.foveal import FovealObservationModel
+from semfov.sensor import Glimpse, LogPolar, MultiScaleFovea, Perspective
+from tests.small import Blobs, Coloured, agent
+
+PAIRS = {
+    "class names": (lambda names: FovealObservationModel.identity(names, edges=[0.2]), ["cup", "cat"], ["cat", "cup"]),
+    "edges of levels": (lambda edge: FovealObservationModel.identity(["cup"], edges=[0.2], epsilon=edge), 1e-3, 1e-6),
+    "growth": (lambda growth: Foveation(20.0, growth=growth), 1.0, 2.0),
+    "levels": (lambda levels: Foveation(20.0, levels), 3, 5),
+    "convention": (lambda convention: Foveation(20.0, convention=convention), "kornia", "opencv"),
+    "fovea": (LogPolar, 10.0, 20.0),
+    "side": (MultiScaleFovea, 32, 64),
+    "size of glimpses": (Glimpse, (32, 32), (32, 48)),
+    "size of views": (Perspective, (40, 30), (30, 40)),
+    "reference": (lambda reference: Eye(Foveation(9.0), Blobs(), reference=reference), 640.0, 64.0),
+    "classes of a detector": (lambda names: Coloured(names), ("red", "blue"), ("blue", "red")),
+    "a part of an agent": (lambda names: agent(Coloured(names)), ("red", "blue"), ("blue", "red")),
+}
+
+
+@pytest.mark.parametrize("kind", PAIRS)
+@pytest.mark.parametrize("file", ["memory", "torch", "safetensors"])
+def test_the_state_of_other_settings_is_refused(kind, file):
+    make, one, other = PAIRS[kind]
+    state = make(one).state_dict()
+    if file == "torch":
+        torch.save(state, stream := io.BytesIO())
+        stream.seek(0)
+        state = torch.load(stream, weights_only=True)
+    elif file == "safetensors":
+        state = load_tensors(save_tensors(without_shared(state)))
+    if file != "safetensors" or len(state) == len(make(one).state_dict()):
+        make(one).load_state_dict(state)
+    with pytest.raises(InputError, match=r"state_dict: expected the state of a .* with "):
+        make(other).load_state_dict(state, strict=False)
+
+
+def without_shared(state):
+    """Without tensors that are there under another name, which safetensors refuses."""
+    seen = {}
+    return {name: value for name, value in state.items() if seen.setdefault(value.data_ptr(), name) == name}
+
+
+@pytest.mark.parametrize("kind", PAIRS)
+def test_a_state_without_settings_is_loaded(kind):
+    """As of an earlier version, and as files of models hold it."""
+    make, one, other = PAIRS[kind]
+    make(other).load_state_dict(without_settings(make(one).state_dict()))
+
+
+def test_learned_settings_are_no_obstacle():
+    """A width that is a parameter is loaded, and so are values that a fit changes."""
+    source, target = Foveation(10.0, learnable=True), Foveation(30.0, learnable=True)
+    target.load_state_dict(source.state_dict())
+    assert float(target.sigma.detach()) == pytest.approx(10.0)
+    assert all(isinstance(value, torch.Tensor) for value in source.state_dict().values())
+
+
+def test_files_and_digests_hold_tensors_alone(tmp_path):
+    for kind, name in ((TargetEvidence, "yolov3-tiny-growth-2"), (MapEvidence, "yolov3-tiny-growth-2")):
+        files = sorted(kind.shipped.glob("*.safetensors"))
+        model = kind.from_pretrained(files[0])
+        model.save(tmp_path / f"{name}.safetensors")
+        again = kind.from_pretrained(tmp_path / f"{name}.safetensors")
+        assert again.digest() == model.digest()
+        assert not [key for key in load_tensors((tmp_path / f"{name}.safetensors").read_bytes()) if "extra" in key]
+    assert ActivePerception
