@@ -503,23 +503,6 @@ class ActivePerception(nn.Module):
             self.eye.detector, open_picture(picture, color).image(self.eye.sensor.like)[0], source=source
         )
 
-    def gaze(self, picture: PictureLike, *, color: Color = "rgb") -> GazePrediction:
-        """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
-
-        Args:
-            picture: a photograph, as for `search`.
-            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
-
-        Returns:
-            The density of fixations, from which scanpaths are drawn.
-
-        Raises:
-            InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
-            DataError: the file of the picture cannot be read.
-        """
-        source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(self.eye.detector, self._photograph(picture, color)[0], source=source)
-
     def live(
         self,
         target: _Targets = None,
