@@ -151,7 +151,7 @@ KNOWN = {
     "docs/decisions/closer_looks.md": {
         f"shows {PART} of the longer side": "code",
         "there and at none of the places looked at before is 0.1": "in the file of the model",
-        "this takes 1.99 passes, and looks at every place from a probability of 0.1 on 2.21, with": "tried on the fit set",
+        "1.99 passes, and looks at every place from a probability of 0.1 on 2.21": "tried on the fit set",
         "curve (0.966)": "tried on the fit set, without a command",
         "958 searches of 116 photographs": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",

@@ -102,7 +102,9 @@ class DecideConfig(RunConfig):
     def complete(self, folder: ModelFolder) -> Self:
         """The settings with the folder's models that its agent uses, where none are given explicitly."""
         own = {name: folder.file(name) for name in ("windows", "verification") if folder.used(name)}
-        missing = {name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None}
+        missing: dict[str, Any] = {
+            name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None
+        }
         return replace(self, **missing)
 
 

@@ -279,7 +279,14 @@ class GlimpseEvidence(Pretrained):
         return tapered(self.border, span)
 
     def certainty_in(self, lattice: Lattice) -> Certainty | None:
-        """Probability that an object of a picture is there: of a photograph, or of a larger picture."""
+        """Choose the certainty of a picture.
+
+        Args:
+            lattice: lattice of the picture.
+
+        Returns:
+            The probability that an object is there, in a photograph or in a larger picture; None where none was fitted.
+        """
         return self.photograph.certainty if self.photograph and lattice.levels == 1 else self.certainty
 
     def check_compatible(self, settings: Mapping[str, Any]) -> None:

@@ -171,7 +171,7 @@ def test_invalid_values_in_records_are_refused_and_valid_ones_are_loaded(name, t
             continue
         del record[key]
         missing = loaded_or_none(name, tmp_path, tensors, record)
-        assert missing is None or key in ("thresholds", "verification", "certainty")
+        assert missing is None or key in ("thresholds", "verification", "certainty", "photograph")
         for junk in JUNK:
             tensors, record = parts(MODELS[name]())
             loaded = loaded_or_none(name, tmp_path, tensors, {**record, key: junk})
