@@ -63,7 +63,8 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
 def values_known(*tensors: Tensor) -> bool:
     """Tell whether the values of tensors can be read.
 
-    They cannot while a graph is traced or under a transform of `torch.func`. Checks of values are left out there.
+    They cannot while a graph is traced, under a transform of `torch.func`, or on the device `meta`. Checks of values
+    are left out there.
 
     Args:
         tensors: tensors of any shape.
@@ -76,7 +77,7 @@ def values_known(*tensors: Tensor) -> bool:
     >>> torch.func.vmap(lambda row: torch.tensor(values_known(row)))(torch.ones(2, 3))
     tensor([False, False])
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or any(tensor.is_meta for tensor in tensors):
         return False
     try:
         for tensor in tensors:
