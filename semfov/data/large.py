@@ -5,7 +5,7 @@ import warnings
 import weakref
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from os import PathLike
@@ -58,7 +58,11 @@ _SEEN = 64  # side of the windows in which the range of a picture of 16 bits is 
 _JPEG = 7
 _WIDTH, _HEIGHT, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES = 256, 257, 259, 262, 274, 277
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
-_INFLATERS = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+_INFLATERS: dict[int, Callable[[], Any]] = {
+    8: zlib.decompressobj,
+    32946: zlib.decompressobj,
+    34925: lzma.LZMADecompressor,
+}
 """Decoders of compressions whose data may inflate a thousandfold, by their numbers in a TIFF."""
 
 
