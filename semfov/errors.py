@@ -16,7 +16,7 @@ Name = TypeVar("Name", bound=str)
 
 
 def printable(text: str) -> str:
-    """Escape control characters, and bytes of names that are not UTF-8; lines stay.
+    r"""Escape control characters, and bytes of names that are not UTF-8; lines stay.
 
     Args:
         text: a text, such as the name of a file.
