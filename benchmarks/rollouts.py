@@ -7,17 +7,17 @@ import torch
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
 from semfov.runs.candidates import Candidate
-from semfov.runs.search_protocol import Episode, looks_of, run_episodes
+from semfov.runs.search_protocol import Trial, looks_of, run_episodes
 from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30
 
 
-def episode(number: int) -> Episode:
+def episode(number: int) -> Trial:
     """The search of this number; successive searches have different targets and starts."""
     target = 1 + number % CLASSES
     start = 1 + number % 99
-    return Episode(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
+    return Trial(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
 
 
 def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:

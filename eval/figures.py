@@ -36,7 +36,7 @@ from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor
-from semfov.viz import plot_belief_bars, plot_foveated_strip, plot_saliency
+from semfov.viz import plot_belief_bars, plot_foveated_strip
 from semfov.viz.drawing import (
     Tag,
     choose_fixations,
@@ -46,10 +46,11 @@ from semfov.viz.drawing import (
     draw_cross,
     draw_image,
     draw_look,
+    draw_scale,
     draw_tags,
 )
-from semfov.viz.path import GazePath, path_of
-from semfov.viz.style import FOUND, GAZE, OTHER, lay_out, make_figure, save_figure, styled
+from semfov.viz.path import GazePath, LookPath
+from semfov.viz.style import FOUND, GAZE, OTHER, PROBABILITY, lay_out, make_figure, save_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,12 +60,12 @@ MOST = 12
 """Largest number of detections in a picture."""
 LOOKS = 4
 """Looks before the map of saliency is drawn, and fixations of the example of a search, as in the paper."""
-SAME_OBJECT = 0.5
+_SAME_OBJECT = 0.5
 """Intersection over union from which on two detections are of one object."""
 
 
 @dataclass(frozen=True)
-class FiguresConfig(Settings):
+class _FiguresConfig(Settings):
     """What the figures show.
 
     Args:
@@ -92,10 +93,7 @@ class FiguresConfig(Settings):
 class Example:
     """A photograph, and a search in it.
 
-    Attributes:
-        eye: the paper's wide fovea, and the detector.
-        image: `(3, H, W)`.
-        scanpath: the search.
+    Shapes: image `(3, H, W)`.
     """
 
     eye: Eye
@@ -129,11 +127,11 @@ class Example:
         return make_figure(rows, columns, width * columns, height * rows, layout="compressed")
 
 
-def figures(config: FiguresConfig) -> None:
+def figures(config: _FiguresConfig) -> None:
     """Draw all figures and print their files."""
     with torch.inference_mode():
-        example = search_example(config)
-        for name, draw in FIGURES.items():
+        example = _search_example(config)
+        for name, draw in _FIGURES.items():
             print(f"{name}: ", end="")
             figure = draw(example)
             print(
@@ -143,7 +141,7 @@ def figures(config: FiguresConfig) -> None:
             )
 
 
-def search_example(config: FiguresConfig) -> Example:
+def _search_example(config: _FiguresConfig) -> Example:
     """Search the photograph as published: calibrated scores, and predictive search."""
     sensor = SensorConfig(name="published")
     eye = make_eye(config.detector, sensor)
@@ -193,7 +191,7 @@ def detection_example(example: Example) -> Figure:
 
 
 @styled
-def foveal_scene(example: Example) -> Figure:
+def _foveal_scene(example: Example) -> Figure:
     """The foveal image, and the distance from the fovea to the centre of each box, as a share of the longer side."""
     figure, (axes,) = example.pictures(1, 1, 5.4)
     draw_image(axes, example.foveated("published", example.fixation), example.grid)
@@ -227,22 +225,14 @@ def ambiguities(example: Example) -> Figure | None:
     if pair is None:
         return None
     before, cell, after = pair
-    return ambiguity(example, before, after, example.grid.centres[cell])
+    return _ambiguity(example, before, after, example.grid.centres[cell])
 
 
 def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detections, int, Detections] | None:
-    """The pair of detections of one object that differ in class, of which the less confident is most confident.
-
-    Args:
-        sharp: detections in the photograph, a batch of one.
-        looks: detections in foveal images, each a batch of one.
-
-    Returns:
-        The detection in the photograph, the number of the look, and its detection; None if no class changes.
-    """
+    """The pair of detections of one object that differ in class, of which the less confident is most confident."""
     best, pair = 0.0, None
     for number, look in enumerate(looks):
-        same = box_iou(sharp.boxes[0], look.boxes[0]) >= SAME_OBJECT
+        same = box_iou(sharp.boxes[0], look.boxes[0]) >= _SAME_OBJECT
         other = sharp.labels[0][:, None] != look.labels[0][None]
         sure = torch.minimum(sharp.confidence[0][:, None], look.confidence[0][None]) * (same & other)
         if sure.numel() and float(sure.max()) > best:
@@ -253,7 +243,7 @@ def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detection
 
 
 @styled
-def ambiguity(example: Example, before: Detections, after: Detections, fixation: Tensor) -> Figure:
+def _ambiguity(example: Example, before: Detections, after: Detections, fixation: Tensor) -> Figure:
     """A detection in the photograph, beside one in the foveal image of a fixation."""
     figure, axes = example.pictures(1, 2, 4.2)
     draw_image(axes[0], example.image, example.grid)
@@ -304,8 +294,12 @@ def saliency_example(example: Example) -> Figure:
     pixels = torch.cartesian_prod(torch.arange(height), torch.arange(width)).flip(-1).float()
     visited_pixels = visited[0, Grid(grid.columns, grid.rows, (width, height)).cell_of(pixels)].reshape(height, width)
     figure, axes = example.pictures(1, 2, 4.2)
-    plot_saliency(saliency[0].masked_fill(visited_pixels, 0), view[0], title=f"VOCUS2 after {LOOKS} looks", axes=axes)
+    draw_image(axes[0], view[0], Grid(1, 1, (width, height)))
     axes[0].set_title("foveal image")
+    shown = saliency[0].masked_fill(visited_pixels, 0).numpy()
+    drawn = axes[1].imshow(shown, extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
+    axes[1].set(xticks=[], yticks=[], title=f"VOCUS2 after {LOOKS} looks")
+    draw_scale(axes[1], drawn, "")
     lay_out(figure)
     fixations = grid.centres[cells[:LOOKS]]
     for panel, frame in zip(axes, (example.frame, (width, height)), strict=True):
@@ -315,7 +309,7 @@ def saliency_example(example: Example) -> Figure:
 
 
 @styled
-def search_in_steps(example: Example) -> Figure:
+def _search_in_steps(example: Example) -> Figure:
     """Fixations of a search with what is detected at each, above the probability of the target in every cell."""
     from matplotlib.figure import Figure
 
@@ -329,23 +323,23 @@ def search_in_steps(example: Example) -> Figure:
     plot_belief_bars(scanpath, most=count, axes=below)
     lay_out(figure)
     for panel, fixation in zip(above, choose_fixations(scanpath, count), strict=True):
-        path_of(panel, scanpath).show(fixation)
+        LookPath(panel, scanpath).show(fixation)
     return figure
 
 
-FIGURES: dict[str, Callable[[Example], Figure | None]] = {
+_FIGURES: dict[str, Callable[[Example], Figure | None]] = {
     "detection_example": detection_example,
     "foveal_reconstruction": foveal_reconstruction,
-    "map": foveal_scene,
+    "map": _foveal_scene,
     "ambiguities": ambiguities,
     "grid_example": grid_example,
     "saliency_example": saliency_example,
-    "vsexample": search_in_steps,
+    "vsexample": _search_in_steps,
 }
 """The figures by their labels in the source of the paper."""
 
 
-main = command(figures, FiguresConfig, __doc__)
+main = command(figures, _FiguresConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -52,8 +52,8 @@ from semfov.runs.command import command
 from semfov.runs.presets import label
 from semfov.runs.workers import shared_processes
 
-END = "<!-- end -->"
-PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{END}", re.DOTALL)
+_END = "<!-- end -->"
+_PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{_END}", re.DOTALL)
 """A table of a page, between the comment that names it and the one that ends it."""
 
 
@@ -64,16 +64,16 @@ def results(config: ResultsConfig) -> None:
     with shared_processes():
         for name in chosen:
             print(f"\n== {name}")
-            HANDLERS[type(runs[name])](runs[name])
+            _HANDLERS[type(runs[name])](runs[name])
     pages = (config.page, config.tables)
-    texts = [read_page(page) for page in pages]
+    texts = [_read_page(page) for page in pages]
     stale: list[str] = []
     for page, text in zip(pages, texts, strict=True):
-        filled, others = fill_page(text, runs)
+        filled, others = _fill_page(text, runs)
         write_text(page, filled)
         stale += others
     drawn = draw_figures(config.pictures, runs)
-    renewed = [match["name"] for text in texts for match in PLACE.finditer(text) if match["name"] not in stale]
+    renewed = [match["name"] for text in texts for match in _PLACE.finditer(text) if match["name"] not in stale]
     stale += [
         f"{name}.png" for name in (*PAGE_FIGURES, THRESHOLD_FIGURE) if config.pictures / f"{name}.png" not in drawn
     ]
@@ -83,7 +83,7 @@ def results(config: ResultsConfig) -> None:
         print(f"written: {path}")
 
 
-def read_page(path: Path) -> str:
+def _read_page(path: Path) -> str:
     """The text of a page with tables."""
     try:
         return path.read_text(encoding="utf-8")
@@ -92,75 +92,59 @@ def read_page(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class PageTable:
-    """A table of the pages.
-
-    Attributes:
-        made_of: names of the experiments that it is made of.
-        make: gives its lines.
-    """
+class _PageTable:
+    """A table of the pages."""
 
     made_of: tuple[str, ...]
     make: Callable[[Runs], list[str]]
 
 
-def fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
-    """Renew the tables of a page whose experiments have all run.
-
-    Args:
-        text: the page.
-        runs: the experiments.
-
-    Returns:
-        The page, and the names of the tables that were kept.
-
-    Raises:
-        InputError: a comment names no table.
-    """
+def _fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
+    """Renew the tables of a page whose experiments have all run."""
     stale = []
 
     def fill(match: re.Match[str]) -> str:
-        made = page_table(match["name"], runs)
+        made = _page_table(match["name"], runs)
         if missing(made.made_of, runs):
             stale.append(match["name"])
             return match[0]
         source = origin(runs[name].out for name in made.made_of)
-        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), END))
+        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), _END))
 
-    return PLACE.sub(fill, text), stale
+    return _PLACE.sub(fill, text), stale
 
 
-def page_table(line: str, runs: Runs) -> PageTable:
+def _page_table(line: str, runs: Runs) -> _PageTable:
     """The table that a comment names: of several experiments, of a study, or of one experiment."""
     if line in STUDIES:
-        return PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
-    if line in WHOLE:
-        return WHOLE[line]
+        return _PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
+    if line in _WHOLE:
+        return _WHOLE[line]
     name, _, kind = line.partition(" ")
-    lookup(name, [*runs, *STUDIES, *WHOLE], "experiment")
-    make = TABLES[lookup(kind, TABLES, "table")]
-    return PageTable((name,), lambda runs: make(runs[name].out))
+    lookup(name, [*runs, *STUDIES, *_WHOLE], "experiment")
+    make = _TABLES[lookup(kind, _TABLES, "table")]
+    return _PageTable((name,), lambda runs: make(runs[name].out))
 
 
 _SEARCHES, _EXPLORATIONS = (tuple(published(kind).values()) for kind in ("search", "explore"))
 
-WHOLE = {
-    "paper": PageTable(_SEARCHES, beside_paper),
-    "findings": PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
-    "verdicts": PageTable(AT_THRESHOLDS, verdicts),
-    "verdicts-words": PageTable(AT_THRESHOLDS, words_of_verdicts),
-    "thresholds": PageTable(AT_THRESHOLDS, by_threshold),
-    "photographs": PageTable(_SEARCHES[:1], photographs),
-    "readings": PageTable(_SEARCHES[:1], readings),
+_WHOLE = {
+    "paper": _PageTable(_SEARCHES, beside_paper),
+    "findings": _PageTable((*_SEARCHES, *_EXPLORATIONS), findings),
+    "verdicts": _PageTable(AT_THRESHOLDS, verdicts),
+    "verdicts-words": _PageTable(AT_THRESHOLDS, words_of_verdicts),
+    "thresholds": _PageTable(AT_THRESHOLDS, by_threshold),
+    "photographs": _PageTable(_SEARCHES[:1], photographs),
+    "readings": _PageTable(_SEARCHES[:1], readings),
 }
 """Tables of the pages that are not of a single experiment."""
 
-SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
-EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
-BELIEVED = ["belief", "NLL", "ECE", "mean probability", "share that hold it"]
+_SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
+_EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
+_BELIEVED = ["belief", "NLL", "ECE", "mean probability", "share that hold it"]
 """Columns of the tables of runs that the pages show."""
 
-HANDLERS: dict[type, Callable[[Any], None]] = {
+_HANDLERS: dict[type, Callable[[Any], None]] = {
     SearchConfig: partial(search, pictures=False),
     ExploreConfig: partial(explore, pictures=False),
     DecideConfig: search_and_decide,
@@ -169,11 +153,11 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
 }
 """Functions that run an experiment, by the class of its settings."""
 
-TABLES: dict[str, Callable[[Path], list[str]]] = {
-    "search": partial(markdown_table, "summary.md", 0, columns=SEARCHED),
-    "explore": partial(markdown_table, "summary.md", 0, columns=EXPLORED),
-    "explore-objects": partial(markdown_table, "summary.md", 1, columns=EXPLORED),
-    "explore-cells": partial(markdown_table, "summary.md", 2, columns=EXPLORED),
+_TABLES: dict[str, Callable[[Path], list[str]]] = {
+    "search": partial(markdown_table, "summary.md", 0, columns=_SEARCHED),
+    "explore": partial(markdown_table, "summary.md", 0, columns=_EXPLORED),
+    "explore-objects": partial(markdown_table, "summary.md", 1, columns=_EXPLORED),
+    "explore-cells": partial(markdown_table, "summary.md", 2, columns=_EXPLORED),
     "agreement": agreement,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
     "paired-by-hand": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 15, 30)),
@@ -181,8 +165,8 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "decisions": partial(markdown_table, "decisions.md", 1),
     "differences": partial(markdown_table, "decisions.md", 2),
     "landings": partial(markdown_table, "decisions.md", 3),
-    "by-looks": partial(markdown_table, "beliefs.md", 0, columns=BELIEVED),
-    "by-distance": partial(markdown_table, "beliefs.md", 1, columns=BELIEVED),
+    "by-looks": partial(markdown_table, "beliefs.md", 0, columns=_BELIEVED),
+    "by-distance": partial(markdown_table, "beliefs.md", 1, columns=_BELIEVED),
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
     "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),
     "samples-objects": partial(by_samples, shifts=(1, 2, 5, 10, 20), field=OBJECTS),

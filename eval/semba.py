@@ -37,7 +37,7 @@ _SHIFTS = (1, 3, 6)
 
 
 @dataclass(frozen=True)
-class SembaConfig(LookingConfig):
+class _SembaConfig(LookingConfig):
     """Search as SemBA does, with both rules of fusion.
 
     Args:
@@ -57,13 +57,13 @@ class SembaConfig(LookingConfig):
     out: Path = Path("runs/semba")
 
 
-def search_as_semba(config: SembaConfig) -> None:
+def _search_as_semba(config: _SembaConfig) -> None:
     """Search for every target of every photograph with both rules, and write the table."""
     run = Looking(config)
     results: list[Tensor] = []
     scenes: list[int] = []
     for index in track(range(len(run.scenes)), "searching", "scene"):
-        outcomes = search_scene(config, run, index)
+        outcomes = _search_scene(config, run, index)
         results += outcomes
         scenes += [index] * len(outcomes)
     if not results:
@@ -87,18 +87,8 @@ def search_as_semba(config: SembaConfig) -> None:
 
 
 @torch.inference_mode()
-def search_scene(config: SembaConfig, run: Looking, index: int) -> list[Tensor]:
-    """Search one photograph for each of its targets that is not in the middle.
-
-    Args:
-        config: the settings.
-        run: eye, scenes and store.
-        index: index of the photograph.
-
-    Returns:
-        For each search `(rules, figures)`: whether it had fixated the target after 1, 3 and 6 shifts, whether it
-        stopped before all shifts were made, and whether it stopped on the target.
-    """
+def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor]:
+    """Search one photograph for each of its targets that is not in the middle."""
     grid, annotation = run.grid(index), run.scenes.annotation(index)
     middle = grid.cell_of(grid.extent[None] / 2)
     covered = grid.footprint(annotation.boxes)
@@ -144,7 +134,7 @@ def search_scene(config: SembaConfig, run: Looking, index: int) -> list[Tensor]:
     return list(torch.stack(results, 1))
 
 
-main = command(search_as_semba, SembaConfig, __doc__)
+main = command(_search_as_semba, _SembaConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -47,14 +47,8 @@ from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table
 
 
-class SensorChoice(NamedTuple):
-    """A sensor with a size of the detector's input.
-
-    Attributes:
-        sensor: name of the sensor.
-        side: side of the detector's input in pixels.
-        settings: fields of `SensorConfig` that differ from those of its name.
-    """
+class _SensorChoice(NamedTuple):
+    """A sensor with a size of the detector's input."""
 
     sensor: str
     side: int
@@ -62,13 +56,13 @@ class SensorChoice(NamedTuple):
 
 
 CANDIDATES = {
-    "published, 320": SensorChoice("published", 320),
-    "multi-scale, 4 × 160": SensorChoice("multi-scale", 160),
-    "gradual, 320": SensorChoice("gradual", 320),
-    "gradual, 416": SensorChoice("gradual", 416),
-    "log-polar, 320": SensorChoice("log-polar", 320),
-    "sharp, 320": SensorChoice("gradual", 320, {"sigma": 1e4}),
-    "multi-scale, 4 × 160 of 1920 px": SensorChoice("multi-scale", 160, {"reference": 1920.0}),
+    "published, 320": _SensorChoice("published", 320),
+    "multi-scale, 4 × 160": _SensorChoice("multi-scale", 160),
+    "gradual, 320": _SensorChoice("gradual", 320),
+    "gradual, 416": _SensorChoice("gradual", 416),
+    "log-polar, 320": _SensorChoice("log-polar", 320),
+    "sharp, 320": _SensorChoice("gradual", 320, {"sigma": 1e4}),
+    "multi-scale, 4 × 160 of 1920 px": _SensorChoice("multi-scale", 160, {"reference": 1920.0}),
 }
 """What is compared; the last one is for pictures of at least 1920 px, and left out unless it is asked for.
 
@@ -81,7 +75,7 @@ _SCORE, _OVERLAP = 0.1, 0.5
 
 
 @dataclass(frozen=True)
-class SensorsConfig(LookingConfig):
+class _SensorsConfig(LookingConfig):
     """Compare sensors, each with models of its own.
 
     Args:
@@ -117,7 +111,7 @@ class SensorsConfig(LookingConfig):
         return self.out / clean(name)
 
 
-def compare_sensors(config: SensorsConfig) -> None:
+def _compare_sensors(config: _SensorsConfig) -> None:
     """Fit, search and explore with every sensor, and write the table."""
     check(config.protocol.shifts >= _SHIFTS[-1], "protocol.shifts", f"{_SHIFTS[-1]} or more", config.protocol.shifts)
     rows = [_row(config, name) for name in config.candidates]
@@ -130,7 +124,7 @@ def compare_sensors(config: SensorsConfig) -> None:
     print(text)
 
 
-def _row(config: SensorsConfig, name: str) -> list[str]:
+def _row(config: _SensorsConfig, name: str) -> list[str]:
     """The row of a sensor."""
     shared, folder = config.settings(name), config.folder(name)
     belief, searchers, mapping = config.belief, policies(config), "random-raw"
@@ -147,7 +141,7 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
     )
     explore = ExploreRun(ExploreConfig(policies=(mapping,), out=folder / "explore", **common))
     map_curves = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
-    five = five_looks(search, model, config.classes)
+    five = _five_looks(search, model, config.classes)
     pixels, seconds = cost(search.eye, search.scenes[0].image)
     return [
         name,
@@ -159,13 +153,13 @@ def _row(config: SensorsConfig, name: str) -> list[str]:
     ]
 
 
-def policies(config: SensorsConfig) -> tuple[str, ...]:
+def policies(config: _SensorsConfig) -> tuple[str, ...]:
     """The searchers that are compared, the random one first."""
     calibrated = ["non-predictive-calibrated"] * bool(config.fixations)
     return ("random", "non-predictive-raw", *calibrated)
 
 
-def _observation(config: SensorsConfig, name: str) -> Path:
+def _observation(config: _SensorsConfig, name: str) -> Path:
     """File of the observation model of a sensor, which is fitted unless it is there."""
     fitting = FitObservationConfig(
         data=config.fit,
@@ -191,20 +185,13 @@ def _at(curve: Curve, shift: int) -> tuple[float, float]:
     return float(curve.mean[shift]), float(curve.over_images[shift])
 
 
-def five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
+def _five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
     """What is seen in one look from the middle, and in that and four looks around it.
 
     The area tells how well the largest score of a class says whether it is in a photograph. An object is found by a
     detection of its class with a score of 0.1 that overlaps it by half.
 
-    Args:
-        run: the finished looks from every cell.
-        model: observation model that calibrates the scores for the area; None takes raw scores.
-        classes: largest number of present classes of a photograph, and of absent ones.
-
-    Returns:
-        `(4,)`: area under the ROC after one look and after five, recall after one look and after five; the samples are
-        of photographs.
+    Shapes: → `(4,)`.
     """
     scores, there, groups = [], [], []
     objects = torch.zeros(len(run.scenes), 3)
@@ -261,7 +248,7 @@ def cost(eye: Eye, image: Tensor, looks: int = 12) -> tuple[int, float]:
         return len(canvases) * canvases.shape[-2] * canvases.shape[-1], min(seconds)
 
 
-main = command(compare_sensors, SensorsConfig, __doc__)
+main = command(_compare_sensors, _SensorsConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

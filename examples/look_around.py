@@ -8,7 +8,6 @@ import argparse
 import semfov
 from semfov import HeadAgent
 from semfov.head import Panoramas
-from semfov.viz.head import animate_head, plot_head_path
 
 
 def main() -> None:
@@ -39,9 +38,9 @@ def main() -> None:
         x, y, z = path.gaze(number).tolist()
         print(f"{seconds:5.2f} s: head at yaw {yaw:.0f}°, pitch {pitch:.0f}°; gaze along ({x:.2f}, {y:.2f}, {z:.2f})")
     print(path)
-    plot_head_path(path, image).savefig(arguments.out, dpi=88)
+    path.plot(image=image).savefig(arguments.out, dpi=88)
     if arguments.film:
-        animate_head(path, arguments.film, image=image)
+        path.animate(arguments.film, image=image)
 
 
 if __name__ == "__main__":

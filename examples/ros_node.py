@@ -10,7 +10,7 @@ from sensor_msgs.msg import Image
 from vision_msgs.msg import Detection2D, Detection2DArray, ObjectHypothesisWithPose
 
 import semfov
-from semfov.io import ros
+from examples import ros_messages as ros
 
 
 class GazeNode(Node):

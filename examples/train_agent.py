@@ -10,17 +10,21 @@ Run it from a checkout: python -m examples.train_agent
 """
 
 import argparse
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import Tensor, nn
 
-from semfov.envs import GazeVectorEnv, MaskedRandom, PolicyAgent, open_scenery, run_agent
-from semfov.envs.agents import Agent
-from semfov.envs.stable_baselines3 import StableVecEnv
+from semfov.envs import GazeSearch, Scenery, open_scenery
+
+Agent = Callable[[Any, Any], Any]
+"""Chooses a cell from the planes `(C, Y, X)` of the belief and the mask `(X·Y,)` of the free cells."""
 
 
 class CellFeatures(BaseFeaturesExtractor):
@@ -70,22 +74,22 @@ class CellPolicy(MaskableActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **options)
 
 
-class TrainedAgent:
-    """A trained model as an agent that takes the most probable action.
+def belief_only(scenery: Scenery) -> gymnasium.Env[Any, Any]:
+    """An environment whose observation is the belief alone."""
+    env = GazeSearch(scenery, belief=True)
+    return gymnasium.wrappers.TransformObservation(env, lambda each: each["belief"], env.observation_space["belief"])
 
-    Args:
-        model: a model of Stable-Baselines3 that was trained on the belief alone.
-    """
 
-    def __init__(self, model: Any) -> None:
-        self._model = model
-
-    def __call__(self, observations: Any, infos: dict[str, Any]) -> Any:
-        """Choose the next cell of every episode."""
-        masks = infos["action_mask"].astype(bool)
-        # When an episode is over, all of its cells may have been fixated, but the model needs one allowed action.
-        masks |= ~masks.any(-1, keepdims=True)
-        return self._model.predict(observations["belief"], action_masks=masks, deterministic=True)[0]
+def gaze_shifts(env: gymnasium.Env[Any, Any], agent: Agent, episodes: Sequence[Any]) -> list[int]:
+    """The gaze shift that finds the target of each episode, or 0."""
+    found = []
+    for episode in episodes:
+        belief, info = env.reset(options={"episode": episode})
+        terminated = truncated = False
+        while not (terminated or truncated):
+            belief, _, terminated, truncated, info = env.step(agent(belief, info["action_mask"].astype(bool)))
+        found.append(int(terminated) * (info["passes"] - 1))
+    return found
 
 
 def main() -> None:
@@ -107,8 +111,7 @@ def main() -> None:
     training, test = (
         open_scenery("search", **common, seed=seed, starts=starts) for seed, starts in ((0, 100), (1000, 10))
     )
-    together = GazeVectorEnv("search", 32, training, belief=True, detections=False, autoreset_mode="SameStep")
-    envs = StableVecEnv(together, key="belief")
+    envs = DummyVecEnv([lambda: belief_only(training)] * 32)
     envs.seed(0)
     model = MaskablePPO(
         CellPolicy,
@@ -123,15 +126,15 @@ def main() -> None:
     )
     model.learn(arguments.steps)
 
-    judged = GazeVectorEnv("search", 64, test, belief=True, autoreset_mode="Disabled")
-    episodes = [episode for scene in test.scenes for episode in test.episodes(scene)]
+    random = np.random.default_rng(0)
     agents: dict[str, Agent] = {
-        "random": MaskedRandom(0),
-        "hand-made": PolicyAgent(judged),
-        "trained": TrainedAgent(model),
+        "random": lambda belief, free: random.choice(np.flatnonzero(free)),
+        "hand-made": lambda belief, free: belief[0].argmax(),
+        "trained": lambda belief, free: int(model.predict(belief, action_masks=free, deterministic=True)[0]),
     }
+    env, episodes = belief_only(test), [episode for scene in test.scenes for episode in test.episodes(scene)]
     for name, agent in agents.items():
-        shifts = np.array([each.found_at for each in run_agent(judged, agent, episodes)])
+        shifts = np.array(gaze_shifts(env, agent, episodes))
         shares = ", ".join(f"{100 * ((shifts > 0) & (shifts <= n)).mean():.0f} % within {n}" for n in (1, 3, 10))
         print(f"{name}: of {len(shifts)} targets in other scenes, gaze shifts find {shares}")
 

@@ -14,87 +14,9 @@ fits the agent to a detector of your own. Each part is also a function or a diff
 `semfov.fusion`, `semfov.acquisition`, `semfov.rollout`.
 """
 
-import warnings
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
 import semfov.cli.start  # noqa: F401 (before what takes long to import)
-from semfov.agent import ActivePerception
-from semfov.agents import HeadAgent, ZoomAgent
-from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers
-from semfov.data import EmbeddedScenes, as_image, read_image
-from semfov.detection import Detections, Detector, Objects, Selection, merge_boxes
-from semfov.detection.load import load_detector
-from semfov.episode import rollout
-from semfov.errors import DataError, InputError, SemfovError
-from semfov.eye import Eye
-from semfov.gaze import acquisition, policies, saliency
-from semfov.head import Flat, Panorama
-from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
-from semfov.paths import Scanpath
-from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
-from semfov.sensor import Foveation, foveate
-from semfov.version import __version__
-from semfov.zoom import WindowEye
 
-if TYPE_CHECKING:
-    from semfov.data import CocoScenes
-    from semfov.fit.detector import fit_detector
-
-__all__ = [
-    "ActivePerception",
-    "Belief",
-    "CocoScenes",
-    "DataError",
-    "Detections",
-    "Detector",
-    "DirichletBelief",
-    "DirichletStatistics",
-    "EmbeddedScenes",
-    "Eye",
-    "FovealObservationModel",
-    "Flat",
-    "Foveation",
-    "Grid",
-    "HeadAgent",
-    "InputError",
-    "MapEvidence",
-    "Objects",
-    "Panorama",
-    "Scanpath",
-    "Selection",
-    "SemfovError",
-    "TargetEvidence",
-    "ZoomAgent",
-    "WindowEye",
-    "__version__",
-    "acquisition",
-    "as_image",
-    "dirichlet",
-    "fit_detector",
-    "foveate",
-    "fusion",
-    "load_detector",
-    "merge_boxes",
-    "observers",
-    "policies",
-    "read_image",
-    "rollout",
-    "saliency",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name == "CocoScenes":
-        # `semfov.data.coco` is also a program: Python warns if it is imported before it is run.
-        from semfov.data.coco import CocoScenes
-
-        return CocoScenes
-    if name == "fit_detector":
-        # Training needs imports that would make the import of the package slow.
-        from semfov.fit.detector import fit_detector
-
-        return fit_detector
-    if name == "ZoomEye":
-        warnings.warn("semfov.ZoomEye is now semfov.WindowEye", DeprecationWarning, stacklevel=2)
-        return WindowEye
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# Names are imported when they are first asked for (the stub says from where): the help of the command needs none.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,54 +1,41 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
-from typing import Any, Literal, Self, cast, get_args
+from typing import Any, Self, get_args
 
 from torch import Tensor, nn
 
+from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.limits import EpisodeLimits, OnLook, only_for, without_none
-from semfov.agents.windows import ZoomAgent, pays
+from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, open_picture
+from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
-from semfov.data.classes import class_index, class_numbers
-from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.data.classes import class_numbers
+from semfov.data.inputs import Color
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, SemfovError, check, check_number, check_options, check_whole, lookup
+from semfov.errors import InputError, check, check_number, check_options, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
-from semfov.head.camera import PanTiltCamera, is_scene, open_scene
-from semfov.head.world import World
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.paths import GazeRecord
+from semfov.paths import GazePrediction, GazeRecord
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
-
-_KindOfLook = Literal["fovea", "windows", "head"]
-"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
-
-How = Literal["auto", "fovea", "windows", "head"]
-"""Kind of look, or `auto` for the one that suits the picture."""
-
-PictureLike = ImageLike | LargePicture | World | PanTiltCamera
-"""A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
-`semfov.Panorama`, a `semfov.Flat`, or a camera that turns."""
 
 _Targets = str | int | Sequence[str | int] | None
 """A class by name or index, several of them, or None for all classes."""
@@ -57,10 +44,11 @@ _Targets = str | int | Sequence[str | int] | None
 class ActivePerception(nn.Module):
     """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
 
-    The picture decides how the agent looks (`how="auto"`). In a photograph it moves the gaze of a fovea over a grid of
-    cells (`fovea`). In a picture with two octaves or more to zoom in, at least four times as long as the detector's
-    input, it looks at windows and chooses their places and magnifications (`windows`). In a scene, such as a
-    `semfov.Panorama`, it moves eye and head (`head`). `record.how` says which it was.
+    The picture decides how the agent looks (`how="auto"`). At a flat picture of any size it looks at windows, the first
+    of them the whole picture, and chooses their places and magnifications (`windows`). In a scene, such as a
+    `semfov.Panorama`, it moves eye and head (`head`). `how="fovea"` moves the gaze of a fovea over the cells of a
+    photograph, as in the paper; without evidence for photographs, `auto` does so where the picture is less than four
+    times as long as the detector's input. `record.how` says which it was.
 
     Args:
         eye: sensor and detector.
@@ -110,7 +98,6 @@ class ActivePerception(nn.Module):
         sigma: float = 100.0,
         growth: float = 2.0,
         grid: tuple[int, int] = (10, 10),
-        context: bool = False,
         **options: Any,
     ) -> Self:
         """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
@@ -120,8 +107,6 @@ class ActivePerception(nn.Module):
             sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
             growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
-            context: whether search also uses the usual places of the target and its co-occurrence with other classes
-                (`ContextPrior`).
             options: options of `semfov.load_detector`.
 
         Returns:
@@ -131,7 +116,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_arguments, name, sigma, growth, grid, context, **options)
+        return cls._of(recommended_arguments, name, sigma, growth, grid, **options)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -253,13 +238,17 @@ class ActivePerception(nn.Module):
             )
         return HeadAgent(self.eye, search.model, explore.model)
 
-    def kind_of_look(self, picture: PictureLike, how: How = "auto", *, every: bool = False) -> _KindOfLook:
+    def kind_of_look(
+        self, picture: PictureLike, how: How = "auto", *, every: bool = False, foveal: bool = False
+    ) -> KindOfLook:
         """How the agent looks at a picture.
 
         Args:
             picture: as for `search`.
             how: `auto` chooses by the picture; another kind is returned as it is, if it suits the picture.
-            every: whether all objects are wanted, of which the overview of a photograph shows most.
+            every: whether all objects are wanted.
+            foveal: whether something is asked for that only a fovea can do in a photograph: a search for any of several
+                classes, a first cell, gaze shifts, or the protocol of the paper.
 
         Returns:
             `fovea`, `windows` or `head`.
@@ -267,19 +256,11 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        how = lookup(how, get_args(How), "kind of look")
-        if is_scene(picture):
-            check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
-            return "head"
-        if how != "auto":
-            return how
-        if every:
-            return "windows"
-        # What cannot be opened is refused where it is read.
-        with suppress(SemfovError):
-            size = picture_size(cast(ImageLike | LargePicture, picture))
-            return "windows" if pays(size, self.eye.detector.input_size) else "fovea"
-        return "fovea"
+        return self._kind_of(open_picture(picture), how, every=every, foveal=foveal)
+
+    def _kind_of(self, picture: OpenedPicture, how: str, *, every: bool, foveal: bool) -> KindOfLook:
+        photographs = not foveal and self.windows is not None and self.windows.photograph is not None
+        return picture.kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
 
     def search(
         self,
@@ -354,13 +335,16 @@ class ActivePerception(nn.Module):
         """
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        kind = self.kind_of_look(picture, how)
-        only_for(kind, "fovea", "passes", shifts=shifts, boxes=boxes)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        # Class numbers may be those of NumPy or a tensor, which have no length.
+        targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
+        foveal = start is not None or boxes is not None or len(targets) > 1
+        opened, kind, limits = self._begin(
+            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+        )
+        only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
             return self.fovea.search(
-                self._photograph(picture, color),
+                opened.image(self.eye.sensor.like),
                 target,
                 EpisodeLimits(**limits),
                 shifts=shifts,
@@ -371,14 +355,15 @@ class ActivePerception(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
             )
-        index = _one_class(target, self.classes)
+        check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
+              target)  # fmt: skip
+        arguments = without_none(confirm=confirm, give_up=give_up, **limits)
         if kind == "head":
-            arguments = without_none(start=start, confirm=confirm, give_up=give_up, **limits, duration=duration)
             only_for(kind, "fovea", "confirm", closer=closer)
-            return self.head.search(open_scene(picture, color), index, seed=seed, **arguments)
+            arguments |= without_none(start=start, duration=duration)
+            return self.head.search(opened.world, targets[0], seed=seed, **arguments)
         only_for(kind, "fovea", "none", start=start)
-        arguments = without_none(confirm=confirm, give_up=give_up, closer=closer, **limits)
-        return self.zoom.search(_large(picture, color), index, **arguments)
+        return self.zoom.search(opened.large, targets[0], **without_none(closer=closer), **arguments)
 
     def find_all(
         self,
@@ -425,22 +410,18 @@ class ActivePerception(nn.Module):
                 kind of look.
             DataError: the file of the picture cannot be read.
         """
-        kind = self.kind_of_look(picture, how, every=True)
         targets = class_numbers(target, self.classes[1:], "target")
-        only_for(kind, "fovea", "passes", shifts=shifts)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration, every=True)
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
-            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             return _counting(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
+        arguments = without_none(worth=worth, **limits)
         if kind == "head":
-            arguments = without_none(worth=worth, duration=duration, **limits)
-            return _counting(self.head.find_all(open_scene(picture, color), targets, **arguments), least)
+            arguments |= without_none(duration=duration)
+            return _counting(self.head.find_all(opened.world, targets, **arguments), least)
         aim = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(
-            _large(picture, color), aim, batch=batch, **without_none(worth=worth, least=least, **limits)
-        )
+        return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
 
     def explore(
         self,
@@ -488,19 +469,39 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        kind = self.kind_of_look(picture, how)
-        only_for(kind, "fovea", "passes", shifts=shifts)
-        only_for(kind, "head", "seconds", duration=duration)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        foveal = start is not None
+        opened, kind, limits = self._begin(
+            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+        )
         if kind == "fovea":
-            image, bounds = self._photograph(picture, color), EpisodeLimits(**limits)
+            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
             return _counting(record, least)
+        arguments = without_none(worth=worth, **limits)
         if kind == "head":
-            arguments = without_none(start=start, duration=duration, worth=worth, **limits)
-            return _counting(self.head.explore(open_scene(picture, color), seed=seed, **arguments), least)
+            arguments |= without_none(start=start, duration=duration)
+            return _counting(self.head.explore(opened.world, seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
-        return self.zoom.explore(_large(picture, color), **without_none(worth=worth, least=least, **limits))
+        return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
+
+    def gaze(self, picture: PictureLike, *, color: Color = "rgb") -> GazePrediction:
+        """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
+
+        Args:
+            picture: a photograph, as for `search`.
+            color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+
+        Returns:
+            The density of fixations, from which scanpaths are drawn.
+
+        Raises:
+            InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
+            DataError: the file of the picture cannot be read.
+        """
+        source = fspath(picture) if isinstance(picture, str | PathLike) else None
+        return GazePrediction.of(
+            self.eye.detector, open_picture(picture, color).image(self.eye.sensor.like)[0], source=source
+        )
 
     def live(
         self,
@@ -523,7 +524,7 @@ class ActivePerception(nn.Module):
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
             how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
             rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1 for a fovea and 0.03 for
-                windows (`semfov.live.FovealPerception`, `semfov.live.WindowPerception`).
+                windows (`semfov.agents.FoveaEpisode`, `semfov.agents.WindowEpisode`).
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
@@ -558,13 +559,26 @@ class ActivePerception(nn.Module):
             color=color,
         )
 
-    def _photograph(self, picture: PictureLike, color: Color) -> Tensor:
-        """The picture of a fovea, `(1, 3, H, W)`."""
-        like = self.eye.sensor.like
-        if isinstance(picture, LargePicture):
-            pixels = picture.read((0, 0, *picture.size))
-            return as_image(pixels, like=like, argument="picture")[None]
-        return as_image(cast(ImageLike, picture), like=like, argument="picture", color=color)[None]
+    def _begin(
+        self,
+        picture: PictureLike,
+        color: Color,
+        how: How,
+        passes: int | None,
+        seconds: float | None,
+        on_look: OnLook | None,
+        shifts: int | None,
+        duration: float | None,
+        *,
+        every: bool = False,
+        foveal: bool = False,
+    ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
+        """Open the picture, choose the kind of look, and check the limits that suit it."""
+        opened = open_picture(picture, color)
+        kind = self._kind_of(opened, how, every=every, foveal=foveal or shifts is not None)
+        only_for(kind, "fovea", "passes", shifts=shifts)
+        only_for(kind, "head", "seconds", duration=duration)
+        return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}
 
     def _check_parts(self) -> None:
         """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
@@ -582,15 +596,3 @@ def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
         return record
     check_number(least, "least", 0, 1)
     return replace(record, least=least)
-
-
-def _one_class(target: TargetLike, classes: Sequence[str]) -> int:
-    """Number of the only class of a target."""
-    targets = [target] if isinstance(target, str | int) else list(target)
-    check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
-    return class_index(targets[0], classes[1:], "target")
-
-
-def _large(picture: PictureLike, color: Color) -> LargePicture:
-    """The picture of windows."""
-    return open_large(cast(ImageLike | LargePicture, picture), color=color)

@@ -16,7 +16,17 @@ Name = TypeVar("Name", bound=str)
 
 
 def printable(text: str) -> str:
-    """Text in which control characters, and bytes of names that are not UTF-8, are escaped; lines stay."""
+    r"""Escape control characters, and bytes of names that are not UTF-8; lines stay.
+
+    Args:
+        text: a text, such as the name of a file.
+
+    Returns:
+        The text that a terminal may show.
+
+    >>> printable("a" + chr(27) + "[2J.jpg")
+    'a\\x1b[2J.jpg'
+    """
     steering = ("Cc", "Cf", "Cs")  # controls, marks of direction and lone surrogates
     return "".join(
         ascii(each)[1:-1] if unicodedata.category(each) in steering and each not in "\n\t" else each for each in text
@@ -198,8 +208,9 @@ def check_finite(tensor: Tensor, argument: str) -> None:
     Traceback (most recent call last):
     semfov.errors.InputError: gaze: expected finite numbers, got 1 of 2 that are not finite
     """
-    bad = int((~torch.isfinite(tensor)).sum())
-    check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
+    if values_known(tensor):
+        bad = int((~torch.isfinite(tensor)).sum())
+        check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[Name], what: str) -> Name:

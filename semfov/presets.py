@@ -7,10 +7,9 @@ document the parameters.
 from os import PathLike, fspath
 from typing import Any
 
-from semfov.belief.context import ContextPrior
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
@@ -30,7 +29,7 @@ PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.publi
 
 
 def recommended_arguments(
-    name: str, sigma: float, growth: float, grid: tuple[int, int], context: bool, **options: Any
+    name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
 ) -> dict[str, Any]:
     """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
     check_shipped_sensor(sigma, growth)
@@ -40,16 +39,11 @@ def recommended_arguments(
     name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
     evidence = TargetEvidence.from_pretrained(name)
     everything = MapEvidence.from_pretrained(name)
-    observer: Observer = Target(evidence)
-    if context:
-        prior = ContextPrior.from_pretrained()
-        prior.check_compatible(detector.classes)
-        observer = Context(observer, prior)
     mapping = LearnedMap(everything), Closer(sigma / eye.reference)
     verification = Verification.if_shipped(name)
     return {
         "eye": eye,
-        "search": (observer, NonPredictive()),
+        "search": (Target(evidence), NonPredictive()),
         "explore": mapping,
         "verification": verification,
         "windows": GlimpseEvidence.if_shipped(detector.name),

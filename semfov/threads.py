@@ -24,7 +24,7 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
     >>> @one_thread_if_small
     ... def threads(x):
     ...     return torch.get_num_threads()
-    >>> threads(torch.zeros(9)), threads(torch.zeros(MANY_ELEMENTS)) == torch.get_num_threads()
+    >>> threads(torch.zeros(9)), threads(torch.zeros(_MANY_ELEMENTS)) == torch.get_num_threads()
     (1, True)
     """
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, Scanpath
-from semfov.belief import Belief, ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.base import Look
 from semfov.data.scene import Annotation, Scene
@@ -106,11 +106,6 @@ class FixedLook(Semantic):
 
     def weigh(self, detections, fixation, grid, target=None) -> Look:
         return self.look
-
-
-def context(**weights: tuple[float, float]) -> ContextPrior:
-    """A random context prior (which classes occur near each other); its weights are for a map unless given."""
-    return ContextPrior(CLASSES, rand(4, 3, 3), rand(4, 4, 3), [0.2, 0.4], weights=weights or {"map": (0.5, 0.2)})
 
 
 def beliefs() -> Tensor:

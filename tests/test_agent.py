@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, HeadAgent, ZoomAgent
-from semfov.belief import ContextPrior, TargetEvidence
-from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import Semantic, Target
 from semfov.decision import confirms
 from semfov.detection import Detections
 from semfov.episode import STAGES
@@ -159,21 +159,14 @@ def test_an_observer_shared_by_both_tasks_has_one_belief(image):
     torch.testing.assert_close(one.posterior, one.probabilities[..., 2])
 
 
-def toy_context():
-    generator = torch.Generator().manual_seed(0)
-    place, cooccurrence = torch.randn(3, 3, 3, generator=generator), torch.randn(3, 3, 2, generator=generator)
-    return ContextPrior(["red", "green"], place, cooccurrence, [0.2], weights={"evidence": (0.5, 0.25)})
-
-
 def test_learned_models_are_submodules_of_the_agent(image):
     """State, dtype, gradients and copies of the agent include the models of its observers and policies."""
     misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
     evidence, expected = TargetEvidence(4, 4), FovealObservationModel.identity(["red", "green"], [0.3])
-    search = Context(Target(evidence), toy_context()), NonPredictive()
+    search = Target(evidence), NonPredictive()
     agent = ActivePerception(squares_eye(), search, (Semantic(3, misses=misses), KL(expected)), grid=(8, 6))
     learned = {
-        "searching.observer.observer.model": evidence,
-        "searching.observer.prior": search[0].prior,
+        "searching.observer.model": evidence,
         "exploring.observer.misses": misses,
         "exploring.policy.model": expected,
     }
@@ -201,7 +194,7 @@ def test_learned_models_are_submodules_of_the_agent(image):
     again = other.search(image.double(), "green", start=0, shifts=2)
     assert torch.equal(again.posterior, scanpath.posterior)
     with torch.no_grad():
-        next(other.searching.observer.observer.model.parameters()).add_(1)
+        next(other.searching.observer.model.parameters()).add_(1)
     assert torch.equal(agent.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
     # This agent has no learned models; the state of another agent is loaded into this one.
     plain = ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()))
@@ -331,7 +324,7 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
     view = eye.open(picture)
     got = eye.foveated(view, gaze)
     shown, _ = eye.detector.fit(Foveation(60.0, growth=growth)(picture, gaze[None])[0])
-    scaled = foveate(view.state.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
+    scaled = foveate(view.state[0], view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
     error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
     assert error < 0.02
     # With growth 1 both views are the same up to rounding.

@@ -74,7 +74,7 @@ def names_in(built, kind):
 def tracked(folder):
     """Source and data files of the package, without generated files."""
     files = [path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", *DATA}}
+    return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", ".pyi", *DATA}}
 
 
 def test_the_wheel_contains_exactly_the_package_its_data_and_the_licence(built):

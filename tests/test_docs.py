@@ -33,11 +33,6 @@ def test_guides_for_custom_parts_show_the_part_of_the_example(kind):
     assert f"```python\n{part}\n```" in (DOCS / "guides" / f"write_your_own_{kind}.md").read_text(encoding="utf-8")
 
 
-def test_the_guide_for_robots_shows_the_whole_node():
-    node = (DOCS.parent / "examples" / "ros_node.py").read_text(encoding="utf-8")
-    assert f"```py\n{node}```" in (DOCS / "guides" / "robots.md").read_text(encoding="utf-8")
-
-
 def test_every_main_subpackage_has_a_guide():
     rooms = {"sensor", "detection", "observation", "belief", "gaze", "evaluation"}
     assert {guide.stem for guide in GUIDES} >= rooms

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from semfov import FovealObservationModel, Foveation, Grid, InputError
-from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief import TargetEvidence
 from semfov.belief.evidence import Gathered
-from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief.observers import Semantic, Target
 from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye
@@ -49,12 +49,6 @@ def evidence():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return TargetEvidence(6, 5).eval().requires_grad_(False)
-
-
-def context(classes=3):
-    names = [f"class {number}" for number in range(1, classes + 1)]
-    place, cooccurrence = rand(classes + 1, 3, 3), rand(classes + 1, classes + 1, 2)
-    return ContextPrior(names, place, cooccurrence, [0.3], weights={"evidence": (0.5, 0.25), "map": (1.0, 2.0)})
 
 
 def reached(step):
@@ -307,14 +301,14 @@ def live():
     return eye, eye.open(picture)
 
 
-@pytest.mark.parametrize("kind", ["map", "target", "context"])
+@pytest.mark.parametrize("kind", ["map", "target"])
 @pytest.mark.parametrize("target", [1, 3])
 def test_live_and_stored_looks_give_the_same_scanpath(kind, target):
     eye, view = live()
     seen = eye.look(view, GRID.centres)
     assert len(set(seen.count.tolist())) > 1  # The number of detections depends on the fixation.
     mapper = Semantic(4, tempering=0.5)
-    observer = {"map": mapper, "target": Target(evidence()), "context": Context(mapper, context())}[kind]
+    observer = {"map": mapper, "target": Target(evidence())}[kind]
     run = partial(
         rollout, observer=observer, acquisition=TargetPosterior(target), start=START, choice=Greedy(drawn_from(NOISE))
     )
@@ -346,8 +340,6 @@ STRATEGIES = {
     "soft map, non-predictive": lambda: (Semantic(21, tempering=0.25, footprint="soft"), NonPredictive()),
     "closest look, kl": lambda: (Semantic(21, memory="closest"), KL(observed())),
     "target, non-predictive": lambda: (Target(evidence()), NonPredictive()),
-    "context of a map, non-predictive": lambda: (Context(Semantic(21), context(20).float()), NonPredictive()),
-    "context of evidence, non-predictive": lambda: (Context(Target(evidence()), context(20)), NonPredictive()),
     "map, random": lambda: (Semantic(21), Random()),
 }
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov.agents import FoveaEpisode
+from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, nothing_seen
-from semfov.belief.observers import Context, LearnedMap, Semantic, Target
+from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
-from semfov.live import FovealPerception, FrameRate
 from tests.small import Coloured, tensors
 
 SIZE = (160, 120)
@@ -38,12 +38,10 @@ def learned(kind):
 
 
 def observers():
-    context = ContextPrior(["red", "green"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1])
     return {
         "semantic": Semantic(3),
         "closest": Semantic(3, memory="closest"),
         "target": Target(learned(TargetEvidence)),
-        "context": Context(Target(learned(TargetEvidence)), context, (1.0, 1.0)),
         "map": LearnedMap(learned(MapEvidence)),
     }
 
@@ -206,7 +204,7 @@ def test_each_frame_has_a_decision():
     assert gone[-1].outcome != "found"
     assert gone[-1].probability < 0.5
     assert agent_with(Semantic(3)).live("green").step(scene(8)).decision is None
-    assert FovealPerception(agent_with(Deciding(3)).fovea, 2, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+    assert FoveaEpisode(agent_with(Deciding(3)).fovea, 2, rate=0.1, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
 
 
 def test_frames_may_have_any_type_but_must_have_the_same_size():
@@ -248,19 +246,3 @@ def test_frames_of_opencv_give_the_same_moments():
     assert int(moments[0].detections.labels[0, 0]) == 2
     with pytest.raises(InputError, match="order of channels"):
         agent_with(observer).live("green", color="brg")
-
-
-def test_the_rate_leaves_out_the_first_frames():
-    """The first frame took 2.5 s, the next two half a second each, and each of the others a tenth."""
-    ends = [2.5, 3.0, 3.5, *(3.5 + 0.1 * number for number in range(1, 41))]
-    rate, told = FrameRate(3, recent=5, clock=iter(ends).__next__), []
-    for _ in ends:
-        rate.add()
-        told.append(str(rate))
-    assert told[:4] == ["warming up"] * 3 + ["10.0 frames/s"]
-    assert rate.mean == pytest.approx(10)
-    assert rate.summary() == "43 frames, 10.0 per second after the first 3"
-    few = FrameRate(3, clock=iter(ends).__next__)
-    few.add()
-    assert few.summary() == "1 frame, all of them while the detector got ready"
-    assert (few.now, few.mean) == (None, None)

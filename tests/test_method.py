@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.figures import FIGURES
+from eval.figures import _FIGURES
 from eval.page.figures import PAGE_FIGURES
 
 ROOT = Path(__file__).parents[1]
@@ -84,7 +84,7 @@ def test_every_figure_of_the_paper_is_listed_with_its_command_or_the_reason_for_
     rows = rows_of("The paper's figures")
     commands = {label.strip("`"): command for label, _, command in rows}
     assert list(commands) == DRAWN
-    assert [label for label, command in commands.items() if command == "`python -m eval.figures`"] == list(FIGURES)
+    assert [label for label, command in commands.items() if command == "`python -m eval.figures`"] == list(_FIGURES)
     linked = re.findall(r"pictures/(\w+)\.png", "\n".join(shown for _, shown, _ in rows))
     assert linked == list(PAGE_FIGURES)
     assert [command for command in commands.values() if not re.match(r"`python -m |none: ", command)] == []

@@ -10,8 +10,7 @@ import torch
 
 import semfov
 from semfov import FovealObservationModel
-from semfov.belief import ContextPrior, Verification
-from semfov.gaze import ClassTemplates, GazeHabits
+from semfov.belief import Verification
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
@@ -19,8 +18,8 @@ from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE, features
 
 KINDS = (
-    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, ContextPrior, ClassTemplates,
-    GazeHabits, GlimpseEvidence,
+    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, GlimpseEvidence,
+    semfov.saliency.FixationDensity,
 )  # fmt: skip
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -28,7 +27,7 @@ MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
-LARGEST = {FovealObservationModel: 1_100_000, ClassTemplates: 200_000, GazeHabits: 10_000}
+LARGEST = {FovealObservationModel: 1_100_000, semfov.saliency.FixationDensity: 160_000}
 SHIPPED = [(kind, path) for kind in KINDS for path in sorted(kind.shipped.glob("*.safetensors"))]
 
 
@@ -37,7 +36,7 @@ def test_shipped_files_are_small_and_in_their_card_and_name_no_place(kind, path)
     assert path.stat().st_size < LARGEST.get(kind, 100_000)
     assert "/" not in json.dumps(kind.from_pretrained(path.stem).metadata).replace("://", "")
     cards = [folder / "README.md" for folder in (path.parent, path.parent.parent) if (folder / "README.md").exists()]
-    assert any(re.search(rf"`(context/)?{path.stem}(\.safetensors)?`", card.read_text("utf-8")) for card in cards)
+    assert any(re.search(rf"`{path.stem}(\.safetensors)?`", card.read_text("utf-8")) for card in cards)
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
@@ -96,48 +95,6 @@ def test_shipped_models_of_map_evidence(path):
     named = belief.probabilities[0].argmax(-1)
     assert named[grid.cell_of(fixation)[0]] == 7
     assert named[0] == named[99] == 0
-
-
-@pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
-def test_shipped_context_priors(path):
-    prior = ContextPrior.from_pretrained(path.stem)
-    assert set(prior.weights) == {"evidence", "map"}
-    assert all(weight > 0 for pair in prior.weights.values() for weight in pair)
-    index = {name: place for place, name in enumerate(prior.classes, 1)}
-    # Kites are high in images, and ties are close to people.
-    kite = prior.place[index["kite"]]
-    assert kite[:5].mean() > kite[5:].mean()
-    tie = prior.cooccurrence[index["tie"], index["person"]]
-    assert tie[0] > 0 > tie[-1]
-    assert bool((prior.cooccurrence.diagonal() == 0).all())
-
-
-def test_shipped_class_templates():
-    paths = sorted(semfov.gaze.ClassTemplates.shipped.glob("*.safetensors"))
-    assert [path.stem for path in paths] == ["yolov3-tiny"]
-    model = semfov.gaze.ClassTemplates.from_pretrained("yolov3-tiny")
-    assert model.metadata["detector"]["name"] == "yolov3-tiny"
-    assert sum(model.metadata["counts"]) == 13_988
-    assert "13,988 objects" in (paths[0].parent / "README.md").read_text(encoding="utf-8")
-    # The average object of a class matches the template of its own class best.
-    average = (model.templates + model.mean)[:, :, None, None]
-    assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
-
-
-def test_shipped_gaze_habits():
-    paths = sorted(semfov.gaze.GazeHabits.shipped.glob("*.safetensors"))
-    assert [path.stem for path in paths] == ["osie-vocus2"]
-    habits = semfov.gaze.GazeHabits.from_pretrained("osie-vocus2")
-    assert habits.metadata["policy"] == "vocus2-raw"
-    card = (paths[0].parent / "README.md").read_text(encoding="utf-8")
-    assert f"{habits.metadata['held_out_bits']:.3f} ± " in card
-    assert f"{habits.metadata['fitted_choices']:,} fixations" in card
-    # People prefer salient places, the centre and short gaze shifts, and return rather to older fixations.
-    place = habits.place.view(10, 10)
-    assert float(habits.pull) > 0
-    assert place[4:6, 4:6].mean() > place[[0, 9]].mean()
-    assert bool((habits.step.diff() < 0).all())
-    assert bool((habits.back[:4].diff() > 0).all())
 
 
 @pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov import DirichletStatistics, FovealObservationModel
-from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief import TargetEvidence
 from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import read_cfg
 from semfov.errors import DataError
@@ -99,7 +99,7 @@ def darknet_files(draw: Draw, folder: Path) -> Case:
 
 def model_fields(draw: Draw, folder: Path) -> Case:
     """Models with a changed tensor or value, and a correct checksum: refused, or loaded exactly as the file says."""
-    model = draw.choose((_model, _evidence, _context), "model")()
+    model = draw.choose((_model, _evidence), "model")()
     kind = type(model)
     tensors = {name: tensor.detach().clone() for name, tensor in model._tensors().items()}
     record = json.loads(json.dumps({"kind": kind.kind, "version": "0", **model._record(), "metadata": model.metadata}))
@@ -173,10 +173,6 @@ def _evidence() -> TargetEvidence:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return TargetEvidence(2, 3, components=3)
-
-
-def _context() -> ContextPrior:
-    return ContextPrior(["cup", "cat"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1], weights={"map": (1.0, 0.5)})
 
 
 def _statistics() -> DirichletStatistics:

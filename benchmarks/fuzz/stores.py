@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov.io import storage
-from semfov.runs.results import SceneResults
+from semfov.runs.scene_run import SceneResults
 from semfov.runs.store import cell_store
 
 RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]

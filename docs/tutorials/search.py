@@ -34,7 +34,7 @@ print(decision.outcome, f"{decision.probability:.2f} anywhere, {decision.place:.
 print("box", [round(side) for side in decision.box.tolist()])
 
 # %%
-scanpath.to_frame()[["fixation", "column", "row", "probability", "presence", "seen", "score"]].round(2)
+scanpath.to_frame()[["look", "column", "row", "probability", "presence", "seen", "score"]].round(2)
 
 # %% [markdown]
 # `probability` is the probability of the target in the fixated cell, `presence` the probability that the photograph

@@ -26,7 +26,7 @@ from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches
 from semfov.runs.setup import if_shipped, make_learned
 
@@ -44,7 +44,7 @@ FIXATED, FARTHEST = "fixated", f"{BANDS[-1]:.2f} - …"
 CELL_GROUPS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
 """Groups of cells: the fixated cells, then all others by their distance from the closest fixation."""
 
-ALL_CLASSES = {
+_ALL_CLASSES = {
     "raw": PolicyConfig("non-predictive"),
     "calibrated": PolicyConfig("non-predictive", "calibrated"),
     "tempered": PolicyConfig("non-predictive", tempering=0.5),
@@ -59,20 +59,13 @@ class BeliefCalibrationRun(PolicyLooking):
 
     The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief
     guides it. All beliefs are updated with the same looks.
-
-    Args:
-        config: settings of the run; its `policies` are ignored.
-
-    Attributes:
-        observers: the observer that maintains each belief, by the belief's name in the tables.
-        left_out: for each belief without a shipped model, the reason why it is left out.
     """
 
     task: Task = "search"
     config: SearchConfig
 
     def __init__(self, config: SearchConfig) -> None:
-        super().__init__(replace(config, policies=tuple(ALL_CLASSES.values())))
+        super().__init__(replace(config, policies=tuple(_ALL_CLASSES.values())))
         self.left_out: dict[str, str] = {}
         belief, leave_out = self.config.belief, self.left_out.__setitem__
         evidence = if_shipped(
@@ -83,7 +76,7 @@ class BeliefCalibrationRun(PolicyLooking):
         )
         self.models = replace(self.models, evidence=evidence, map=evidence_map)
         self.observers: dict[str, Observer] = {
-            name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
+            name: self.strategies[label(choice, self.task)].observer for name, choice in _ALL_CLASSES.items()
         }
         if evidence is not None:
             self.observers[LEARNED] = Target(evidence)
@@ -130,21 +123,15 @@ class BeliefCalibrationRun(PolicyLooking):
         beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:
             steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
-            judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
+            judged = {str(n): _judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
             beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
         return {"seen": detected_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
 
 
-def judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
+def _judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
     """Sums over the cells of a search after a step, by group of cells.
 
-    Args:
-        step: a step of one search.
-        target: the target's class, 1..K.
-        goal: `(X·Y,)` boolean, the cells that the target overlaps.
-
-    Returns:
-        `BinarySums.record` of every group of `CELL_GROUPS` that is not empty.
+    Shapes: goal `(X·Y,)`.
     """
     belief = step.belief
     band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))

@@ -11,52 +11,41 @@ import torch
 from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
+from eval.calibration.cell_figure import plot_cell_reliability
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
+from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.tables import csv_text, table
-from semfov.viz import plot_cell_reliability
 from semfov.viz.style import save_figure
 
-Sums = dict[tuple[str, int, str], BinarySums]
+_Sums = dict[tuple[str, int, str], BinarySums]
 """Sums over predictions by belief, number of looks, and group of cells."""
 
 _HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
 
 
 def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
-    """Write the tables, the sums and the figure of a finished run.
-
-    Args:
-        run: the finished run.
-
-    Returns:
-        The tables as Markdown, and the files that were written.
-
-    Raises:
-        DataError: no scene has a class that may be searched for.
-    """
+    """Write the tables, the sums and the figure of a finished run."""
     records, seconds = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise target_area")
-    sums = add_up(records)
-    text = beliefs_summary(records, sums, run)
-    files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
+    sums = _add_up(records)
+    text = _beliefs_summary(records, sums, run)
+    files = {"beliefs.md": text, "beliefs.csv": _beliefs_csv(sums), "beliefs.json": _beliefs_json(sums)}
     files[MANIFEST] = manifest(run, "eval.calibration", seconds)
     written = write_texts(run.config.out, files)
     groups = (
-        f"distance from the closest fixation, as a fraction of the longer side, after {judged_after(sums)[-1]} looks"
+        f"distance from the closest fixation, as a fraction of the longer side, after {_judged_after(sums)[-1]} looks"
     )
-    figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
+    figure = save_figure(plot_cell_reliability(*_curves(sums), groups=groups), run.config.out / "beliefs.png")
     return text, [*written, figure]
 
 
-def add_up(records: Iterable[ResultRecord]) -> Sums:
+def _add_up(records: Iterable[ResultRecord]) -> _Sums:
     """Add up the sums of all searches."""
-    sums: Sums = defaultdict(BinarySums.nothing)
+    sums: _Sums = defaultdict(BinarySums.nothing)
     for record in records:
         for belief, measures in record["beliefs"].items():
             for looks, groups in measures["looks"].items():
@@ -65,26 +54,26 @@ def add_up(records: Iterable[ResultRecord]) -> Sums:
     return dict(sums)
 
 
-def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
+def _pooled(sums: _Sums, belief: str, looks: int) -> BinarySums:
     """Sums over all cells, whatever their group."""
     return sum(
         (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), BinarySums.nothing()
     )
 
 
-def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCalibrationRun) -> str:
+def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCalibrationRun) -> str:
     """The tables, as Markdown."""
     beliefs = list(run.observers)
     there = sum(record["present"] for record in records)
     by_looks = [["looks", "belief", "cells", *_HEAD]]
-    for looks in judged_after(sums):
-        rows = [(belief, pooled(sums, belief, looks)) for belief in beliefs]
-        by_looks += [[str(looks), belief, str(each.count), *measures_row(each)] for belief, each in rows]
-    last = judged_after(sums)[-1]
+    for looks in _judged_after(sums):
+        rows = [(belief, _pooled(sums, belief, looks)) for belief in beliefs]
+        by_looks += [[str(looks), belief, str(each.count), *_measures_row(each)] for belief, each in rows]
+    last = _judged_after(sums)[-1]
     by_distance = [["distance", "belief", "cells", *_HEAD]]
     for group in CELL_GROUPS:
         pairs = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
-        by_distance += [[group, belief, str(each.count), *measures_row(each)] for belief, each in pairs]
+        by_distance += [[group, belief, str(each.count), *_measures_row(each)] for belief, each in pairs]
     notes = [
         f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
     ]
@@ -93,7 +82,7 @@ def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCali
             f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
             "classes are present, so its probabilities are expected to be too low."
         )
-    every = pooled(sums, beliefs[0], last)
+    every = _pooled(sums, beliefs[0], last)
     alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
     return "\n".join(
         [
@@ -111,24 +100,24 @@ def beliefs_summary(records: Sequence[ResultRecord], sums: Sums, run: BeliefCali
             "",
             LANDINGS_TEXT,
             "",
-            *table([["belief", *LANDINGS], *landing_table(records)]),
+            *table([["belief", *LANDINGS], *_landing_table(records)]),
             "",
             *[line for note in notes for line in (note, "")],
         ]
     )
 
 
-def judged_after(sums: Sums) -> list[int]:
+def _judged_after(sums: _Sums) -> list[int]:
     """The numbers of looks for which there are sums."""
     return sorted({looks for _, looks, _ in sums})
 
 
-def measures_row(sums: BinarySums) -> list[str]:
+def _measures_row(sums: BinarySums) -> list[str]:
     """The measures as cells of a table row."""
     return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
 
 
-def landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
+def _landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
     """Rows of the table about the first look on the target (`landing`)."""
     landed = [record for record in records if record["seen"] is not None]
     return [
@@ -137,49 +126,41 @@ def landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
     ]
 
 
-def beliefs_csv(sums: Sums) -> str:
+def _beliefs_csv(sums: _Sums) -> str:
     """All measures as CSV: a row for each belief, number of looks and group of cells."""
     rows: list[list[object]] = [
         ["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"]
     ]
-    for belief, looks, group, each in sums_by_name(sums):
+    for belief, looks, group, each in _sums_by_name(sums):
         values = each.nll, each.brier, each.ece, each.probability, each.rate
         rows.append([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
     return csv_text(rows)
 
 
-def beliefs_json(sums: Sums) -> str:
+def _beliefs_json(sums: _Sums) -> str:
     """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
     entries = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
-        for belief, looks, group, each in sums_by_name(sums)
+        for belief, looks, group, each in _sums_by_name(sums)
     ]
     return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
 
 
-def sums_by_name(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
     """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
-        yield belief, looks, "all", pooled(sums, belief, looks)
+        yield belief, looks, "all", _pooled(sums, belief, looks)
         for group in CELL_GROUPS:
             if (belief, looks, group) in sums:
                 yield belief, looks, group, sums[belief, looks, group]
 
 
-def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
-    """The arguments of `plot_cell_reliability`.
-
-    Args:
-        sums: sums over all searches.
-
-    Returns:
-        The bins of the reliability diagram by number of looks and belief, and the expected calibration error by belief
-        and group of cells after the last look.
-    """
-    beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), judged_after(sums)
+def _curves(sums: _Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
+    """The arguments of `plot_cell_reliability`."""
+    beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), _judged_after(sums)
     panels = {
         f"after {looks} looks" if looks > 1 else "after 1 look": {
-            belief: pooled(sums, belief, looks).bins for belief in beliefs
+            belief: _pooled(sums, belief, looks).bins for belief in beliefs
         }
         for looks in numbers
     }

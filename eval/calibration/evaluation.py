@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar, cast
 
 import torch
 
@@ -12,10 +13,11 @@ from eval.calibration.beliefs import COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import write_belief_report
 from eval.comparison.summary import announce
 from eval.search.run import SearchConfig
+from semfov.eye import Eye
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
-from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig, SensorConfig, WorkConfig
-from semfov.runs.samples import Samples, SampleSettings, collect_samples
+from semfov.runs.config import BeliefConfig, DataConfig, EyeConfig, ProtocolConfig
+from semfov.runs.samples import Samples, collect_samples
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Count, Seed, Share, Side
 from semfov.runs.setup import make_observation
@@ -25,13 +27,12 @@ from semfov.viz.style import save_figure
 
 
 @dataclass(frozen=True)
-class CalibrationConfig(WorkConfig):
+class CalibrationConfig(EyeConfig):
     """Evaluate how well scores, and beliefs about a target, agree with the annotated objects.
 
     Args:
         data: photographs to evaluate on, by default all of them.
         detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
         model: fitted observation model, by name or file (None: the one shipped for the detector and sensor).
         fixations: number of random fixations in each photograph.
         iou: smallest intersection over union at which a detection matches an object.
@@ -47,7 +48,7 @@ class CalibrationConfig(WorkConfig):
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    shard: ClassVar[int] = 32
     model: str | None = None
     fixations: Count = 6
     iou: Share = 0.5
@@ -62,21 +63,20 @@ class CalibrationConfig(WorkConfig):
 
 def judge_calibration(config: CalibrationConfig) -> None:
     """Evaluate scores, then beliefs."""
-    judge_scores(config)
+    _judge_scores(config)
     if config.beliefs:
         judge_beliefs(config)
 
 
-def judge_scores(config: CalibrationConfig) -> None:
+def _judge_scores(config: CalibrationConfig) -> None:
     """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
-    settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
-    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
     samples = sampler.all()
-    model = make_observation(config.model, sampler.foveal_eye)
+    model = make_observation(config.model, cast(Eye, sampler.eye))
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
     predictions = {"raw": samples.scores, "calibrated": calibrated}
-    text = "\n".join(calibration_table(model, predictions, samples)) + "\n"
+    text = "\n".join(_calibration_table(model, predictions, samples)) + "\n"
     write_text(config.out / "calibration.md", text)
     write_text(config.out / "config.yaml", config.yaml())
     figure = plot_reliability({name: (p, samples.labels) for name, p in predictions.items()})
@@ -107,7 +107,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
     announce(*write_belief_report(run))
 
 
-def calibration_table(
+def _calibration_table(
     model: semfov.FovealObservationModel, predictions: dict[str, torch.Tensor], samples: Samples
 ) -> list[str]:
     """Measures of raw and of calibrated scores by level of distance, and over all levels."""
@@ -119,11 +119,11 @@ def calibration_table(
         chosen = torch.ones_like(level, dtype=torch.bool) if everything else level == number
         label = "all" if everything else f"{edges[number]} - {edges[number + 1]}"
         for name, probabilities in predictions.items():
-            rows.append([label, name, *calibration_row(calibration(probabilities[chosen], samples.labels[chosen]))])
+            rows.append([label, name, *_calibration_row(calibration(probabilities[chosen], samples.labels[chosen]))])
     return table(rows)
 
 
-def calibration_row(result: Calibration) -> list[str]:
+def _calibration_row(result: Calibration) -> list[str]:
     """The measures as cells of a table row."""
     return [
         str(result.count),

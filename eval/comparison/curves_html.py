@@ -22,14 +22,6 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
     """Curves over gaze shifts as an SVG, in percent, with bands of one standard error and a legend.
 
     Of more than seven curves the legend names some, as in `semfov.viz`; the others are grey.
-
-    Args:
-        curves: by name, values after 0, 1, … gaze shifts, in [0, 1].
-        errors: by name, standard errors of some of the curves.
-        label: description of the values.
-
-    Returns:
-        HTML.
     """
     last = max(len(curve) for curve in curves.values()) - 1
     highest = max(float(np.nanmax(curve)) for curve in curves.values())

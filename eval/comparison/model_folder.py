@@ -20,16 +20,6 @@ def with_models(config: _Config) -> _Config:
     If the settings also give a detector or weights, these are the new locations of the folder's files. The preset
     `recommended` stands for the policy of the folder's agent. Default policies that need a model that the folder lacks
     are left out.
-
-    Args:
-        config: the settings.
-
-    Returns:
-        The completed settings; `config` itself if it names no folder.
-
-    Raises:
-        InputError: a policy given in the settings needs a model that the folder lacks, or a setting is given twice.
-        DataError: it is no folder of models, or a file is missing or changed.
     """
     if config.models is None:
         return config
@@ -42,12 +32,12 @@ def with_models(config: _Config) -> _Config:
     columns, rows = folder.manifest.grid
     models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
     belief = replace(config.belief, columns=columns, rows=rows, **models)  # type: ignore[arg-type]
-    detector = detector_of(folder, config.detector)
+    detector = _detector_of(folder, config.detector)
     named = type(config)().policies != config.policies
-    policies = tuple(recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
+    policies = tuple(_recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
     chosen = []
     for policy in policies:
-        missing = next((part for part in needs(policy, config) if files[part] is None), None)
+        missing = next((part for part in _needs(policy, config) if files[part] is None), None)
         if missing is None:
             chosen.append(policy)
         elif named:
@@ -55,11 +45,17 @@ def with_models(config: _Config) -> _Config:
             raise InputError(
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
-    config = replace(config, detector=detector, sensor=sensor_config(folder), belief=belief, policies=tuple(chosen))
+    config = replace(
+        config,
+        detector=detector,
+        sensor=SensorConfig.of(folder.manifest.sensor),
+        belief=belief,
+        policies=tuple(chosen),
+    )
     return config.complete(folder)
 
 
-def detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig:
+def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig:
     """The settings of a folder's detector; name and weights in `settings` are the new locations of its files."""
     moved = None if settings.name == DetectorConfig().name else settings.name
     source, options = folder.detector_source(moved, settings.weights)
@@ -72,12 +68,7 @@ def detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig
     return DetectorConfig(name=source, **{"background": None, **options})
 
 
-def sensor_config(folder: ModelFolder) -> SensorConfig:
-    """The settings of a folder's sensor."""
-    return SensorConfig.of(folder.manifest.sensor)
-
-
-def recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
+def _recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
     """The policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
@@ -91,7 +82,7 @@ def recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
     )
 
 
-def needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
+def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:

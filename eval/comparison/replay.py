@@ -11,7 +11,7 @@ from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.setup import if_shipped, make_learned
 
 
@@ -21,14 +21,6 @@ def replay(run: PolicyLooking, index: int, record: ResultRecord) -> Scanpath:
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
     the learned map of the recommended agent or, if none is shipped for the eye, a map by Kaplan's rule from tempered
     scores.
-
-    Args:
-        run: the run that made the record.
-        index: index of the scene.
-        record: a record of `episodes.jsonl`.
-
-    Returns:
-        The scanpath.
     """
     grid, candidate = run.grid(index), run.candidate(record["policy"], index)
     cue = record.get("cue")

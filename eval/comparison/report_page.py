@@ -20,9 +20,9 @@ from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 
-MOST_BYTES = 4_500_000
+_MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""
 
 
@@ -37,21 +37,7 @@ def write_run_report(
     others: Mapping[str, FloatArray] | None = None,
     episodes: int = 18,
 ) -> Path:
-    """Write `report.html` to the folder of a run.
-
-    Args:
-        run: the finished run.
-        records: the records of its episodes.
-        curves: curves by average and policy.
-        titles: descriptions of the averages.
-        label: the quantity that the curves show, in percent.
-        shifts: gaze shifts for which the tables give values.
-        others: reference curves of the first average that belong to no policy.
-        episodes: show at least this many episodes, unless the page grows too large.
-
-    Returns:
-        The path of the page.
-    """
+    """Write `report.html` to the folder of a run."""
     sections = []
     for order, (average, policies) in enumerate(curves.items()):
         first = next(iter(policies.values()))
@@ -68,23 +54,15 @@ def write_run_report(
     values = {name: value for name, value in run.config.plain().items() if name not in WHERE}
     settings = escape(yaml.safe_dump(values, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
-    data = _episodes(run, choose_episodes(records, list(run.policies), episodes))
+    data = _episodes(run, _choose_episodes(records, list(run.policies), episodes))
     title = f"semfov: {run.task} with {run.eye.detector.name}"
     return write_page(run.config.out / "report.html", title, data, sections="\n".join(sections))
 
 
-def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count: int) -> list[ResultRecord]:
+def _choose_episodes(records: list[ResultRecord], policies: Sequence[str], count: int) -> list[ResultRecord]:
     """Choose records to show: in each scene the same episode with all policies side by side.
 
     The episode of a scene is the one from the first start, in searches for the commonest target.
-
-    Args:
-        records: the records of all episodes.
-        policies: the policies in the order in which they are shown.
-        count: scenes are added until there are at least this many records.
-
-    Returns:
-        The chosen records.
     """
     order = {policy: number for number, policy in enumerate(policies)}
     groups: dict[Any, list[ResultRecord]] = defaultdict(list)
@@ -102,7 +80,7 @@ def choose_episodes(records: list[ResultRecord], policies: Sequence[str], count:
 def _episodes(run: PolicyLooking, records: Sequence[ResultRecord]) -> list[Data]:
     data, size, settings, pictures = [], 0, run.eye.settings(), set[str]()
     for record in records:
-        if sum(map(len, pictures)) + size > MOST_BYTES:
+        if sum(map(len, pictures)) + size > _MOST_BYTES:
             break
         index = list(run.scenes.ids).index(record["scene"])
         scene, scanpath = run.scenes[index], replay(run, index, record)

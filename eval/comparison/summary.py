@@ -19,8 +19,7 @@ from semfov.io.state import without_settings
 from semfov.io.storage import checksum
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
+from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import csv_text, percent
 from semfov.version import __version__
@@ -41,15 +40,7 @@ class Curve:
 
 
 def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], FloatArray]) -> Curve:
-    """Average episodes: first over the episodes of each image, then over images.
-
-    Args:
-        records: records of one policy.
-        measure: maps an episode's record to its measure after 0, 1, … gaze shifts.
-
-    Returns:
-        The mean curve with its standard errors.
-    """
+    """Average episodes: first over the episodes of each image, then over images."""
     rows = [(record["scene"], record["repetition"], measure(record)) for record in records]
     means = np.stack([*by_scene((scene, curve) for scene, _, curve in rows).values()])
     repetitions = defaultdict(list)
@@ -70,12 +61,6 @@ def collect_records(run: PolicyLooking) -> tuple[list[ResultRecord], dict[str, f
 def by_scene(values: Iterable[tuple[Any, _Value]]) -> dict[Any, _Value]:
     """Mean value of each scene, from pairs of scene and value.
 
-    Args:
-        values: the pairs.
-
-    Returns:
-        The mean by scene.
-
     >>> {scene: float(mean) for scene, mean in by_scene([(7, 1.0), (7, 2.0), (8, 5.0)]).items()}
     {7: 1.5, 8: 5.0}
     """
@@ -94,10 +79,10 @@ def write_texts(folder: Path, files: Mapping[str, str]) -> list[Path]:
 
 def write_summary(out: Path, name: str, text: str, records: list[ResultRecord]) -> list[Path]:
     """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
-    return write_texts(out, {f"{name}.md": text, "records.jsonl": json_lines(records)})
+    return write_texts(out, {f"{name}.md": text, "records.jsonl": _json_lines(records)})
 
 
-def json_lines(records: Iterable[ResultRecord]) -> str:
+def _json_lines(records: Iterable[ResultRecord]) -> str:
     """Records as JSON, one in a line."""
     return "".join(json.dumps(record) + "\n" for record in records)
 
@@ -112,7 +97,7 @@ def write_files(
     """Write tables (text by file name), records, settings and manifest; returns the paths."""
     files = {
         **tables,
-        "episodes.jsonl": json_lines(records),
+        "episodes.jsonl": _json_lines(records),
         "config.yaml": run.config.yaml(),
         MANIFEST: manifest(run, program, seconds),
     }

@@ -13,10 +13,10 @@ from semfov.metrics.calibration import calibration_error, errors_by_chance
 from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.runs.tables import plus_minus, table
 
-SHARES = (0.01, 0.02, 0.05)
+_SHARES = (0.01, 0.02, 0.05)
 """False alarm rates at which the tables give the hit rate."""
 
-TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]
+TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in _SHARES)]
 """Column headings of `Telling.rows`."""
 
 CALIBRATED = ["ECE", "by chance"]
@@ -44,16 +44,7 @@ def class_frequencies(scenes: Scenes) -> list[Tensor]:
 class Telling:
     """Scores of the same searches by several ways to search, with the places that these report.
 
-    Args:
-        by_name: scores `(M,)` of the searches, by name of the way.
-        there: `(M,)` boolean, whether the target is present.
-        scenes: the scene of each search.
-        right: by name of the way, `(M,)`: 1 where it reports the right place, 0 for a wrong one, NaN for none. Ways
-            that report no places may be left out.
-
-    Attributes:
-        figures: area under the ROC curve, hit rates at the false alarm rates `SHARES`, and the share of right places,
-            for each way, `(ways, 2 + len(SHARES))`.
+    Shapes: by_name `(M,)`, there `(M,)`, right `(M,)`.
     """
 
     def __init__(
@@ -70,7 +61,7 @@ class Telling:
         places = torch.stack([self.places.get(name, nowhere).double() for name in by_name])
 
         def measure(index: Tensor) -> Tensor:
-            figures = torch.tensor([tells(score[index], there[index]) for score in scores], dtype=torch.float64)
+            figures = torch.tensor([_tells(score[index], there[index]) for score in scores], dtype=torch.float64)
             return torch.cat([figures, places[:, index].nanmean(1, keepdim=True)], 1)
 
         self.figures = Bootstrap.of(measure, scenes)
@@ -81,7 +72,7 @@ class Telling:
         return [
             [
                 plus_minus(float(value[0]), float(error[0]), 3) if value[0].isfinite() else "-",
-                *(spanned(*span) for span in zip(value[1:-1], least[1:-1], most[1:-1], strict=True)),
+                *(_spanned(*span) for span in zip(value[1:-1], least[1:-1], most[1:-1], strict=True)),
             ]
             for value, error, least, most in zip(self.figures.value, self.figures.error, low, high, strict=True)
         ]
@@ -89,7 +80,7 @@ class Telling:
     def place(self, name: str) -> str:
         """Share of right places of a way, in percent, with its interval."""
         way = self.names.index(name)
-        return spanned(self.figures.value[way, -1], *self.figures.interval()[:, way, -1], digits=1)
+        return _spanned(self.figures.value[way, -1], *self.figures.interval()[:, way, -1], digits=1)
 
     def differences(self, name: str) -> list[str]:
         """Table of the differences of all ways to one of them, paired over the searches."""
@@ -102,17 +93,17 @@ class Telling:
                 continue
             value, error = apart.value[way], apart.error[way]
             area = plus_minus(float(value[0]), float(error[0]), 3, sign="+") if value[0].isfinite() else "-"
-            spans = zip(value[1:], low[way, 1:], high[way, 1:], [0] * len(SHARES) + [1], strict=True)
-            cells = [spanned(middle, least, most, digits=digits, sign="+") for middle, least, most, digits in spans]
+            spans = zip(value[1:], low[way, 1:], high[way, 1:], [0] * len(_SHARES) + [1], strict=True)
+            cells = [_spanned(middle, least, most, digits=digits, sign="+") for middle, least, most, digits in spans]
             rows.append([other, area, *cells[: len(heads) - 1]])
         return table(rows)
 
 
-def tells(score: Tensor, there: Tensor) -> list[float]:
-    """Area under the ROC curve, and hit rates at the false alarm rates `SHARES`; NaN if all or none are present."""
+def _tells(score: Tensor, there: Tensor) -> list[float]:
+    """Area under the ROC curve, and hit rates at the false alarm rates `_SHARES`; NaN if all or none are present."""
     if not there.any() or there.all():
-        return [torch.nan] * (1 + len(SHARES))
-    return [area_under_roc(score, there), *(hits_at(score, there, share) for share in SHARES)]
+        return [torch.nan] * (1 + len(_SHARES))
+    return [area_under_roc(score, there), *(hits_at(score, there, share) for share in _SHARES)]
 
 
 def calibrated(probability: Tensor, there: Tensor) -> list[str]:
@@ -124,7 +115,7 @@ def calibrated(probability: Tensor, there: Tensor) -> list[str]:
     ]
 
 
-def spanned(value: Tensor, low: Tensor, high: Tensor, *, digits: int = 0, sign: str = "") -> str:
+def _spanned(value: Tensor, low: Tensor, high: Tensor, *, digits: int = 0, sign: str = "") -> str:
     """A share in percent with its interval, such as `66 (57 to 73)`; a dash where there is none."""
     if not value.isfinite():
         return "-"

@@ -16,19 +16,13 @@ from semfov.eye import Eye, View
 from semfov.runs.config import LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread, tight
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import finish, store_folder
+from semfov.runs.scene_run import ResultRecord, finish, store_folder
 from semfov.runs.settings import Share
 from semfov.runs.store import DetectionStore, cell_store
 
 
-class Proposed(Detector):
-    """A detector that selects at a threshold of its own among boxes that another detector has proposed.
-
-    Args:
-        detector: the other detector.
-        threshold: smallest confidence of a box.
-    """
+class _Proposed(Detector):
+    """A detector that selects at a threshold of its own among boxes that another detector has proposed."""
 
     def __init__(self, detector: Detector, threshold: float) -> None:
         super().__init__(
@@ -46,22 +40,15 @@ class Proposed(Detector):
         return self.candidates
 
 
-class ThresholdEyes:
+class _ThresholdEyes:
     """Eyes that differ in their score threshold alone, and share every pass of the detector.
 
     A pass costs far more than the selection of boxes. A look at all thresholds costs little more than one look.
-
-    Args:
-        eye: sensor and detector.
-        thresholds: the thresholds.
-
-    Attributes:
-        settings: `Eye.settings()` of an eye with each threshold.
     """
 
     def __init__(self, eye: Eye, thresholds: Sequence[float]) -> None:
         self._eye = eye
-        self._proposed = [Proposed(eye.detector, threshold) for threshold in thresholds]
+        self._proposed = [_Proposed(eye.detector, threshold) for threshold in thresholds]
         self._eyes = [Eye(eye.sensor, detector, reference=eye.reference) for detector in self._proposed]
         self.settings = [_at(eye.settings(), threshold) for threshold in thresholds]
 
@@ -95,20 +82,17 @@ class ThresholdLooksConfig(LookingConfig):
     thresholds: tuple[Share, ...] = (0.02, 0.1, 0.25, 0.5)
 
 
-class ThresholdLooking(Looking):
+class _ThresholdLooking(Looking):
     """Looks at scenes from every cell, which are stored for each of several thresholds.
 
     A run with one of these thresholds finds its looks stored, as if it had taken them itself.
-
-    Args:
-        config: the settings.
     """
 
     config: ThresholdLooksConfig
 
     def __init__(self, config: ThresholdLooksConfig) -> None:
         super().__init__(config)
-        self.eyes = ThresholdEyes(self.eye, config.thresholds)
+        self.eyes = _ThresholdEyes(self.eye, config.thresholds)
         folder, belief = store_folder(config.cache) / "looks", config.belief
         size, components = (belief.columns, belief.rows), len(self.scenes.classes) + 1
         self.stores = [cell_store(folder, settings, *size, components) for settings in self.eyes.settings]
@@ -120,7 +104,7 @@ class ThresholdLooking(Looking):
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Look at a scene from every cell, and store the looks that are missing; there are no records."""
         digest, grid = self.digest(index), self.grid(index)
-        missing = [number for number, store in enumerate(self.stores) if not holds(store, digest, len(grid))]
+        missing = [number for number, store in enumerate(self.stores) if not _holds(store, digest, len(grid))]
         if missing:
             with one_thread(), torch.inference_mode():
                 image = self.scenes[index].image[None]
@@ -133,7 +117,7 @@ class ThresholdLooking(Looking):
         return [], {}
 
 
-def holds(store: DetectionStore, digest: str, cells: int) -> bool:
+def _holds(store: DetectionStore, digest: str, cells: int) -> bool:
     """Whether a store holds the looks at a scene from all cells."""
     looks = store.load(digest)
     return all(cell in looks for cell in range(cells))
@@ -148,4 +132,4 @@ def _at(settings: dict[str, Any], threshold: float) -> dict[str, Any]:
 
 def look_at_thresholds(config: ThresholdLooksConfig) -> None:
     """Take the looks of all scenes that are not stored yet."""
-    finish(ThresholdLooking(config), "looking")
+    finish(_ThresholdLooking(config), "looking")

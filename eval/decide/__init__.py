@@ -3,21 +3,22 @@
     python -m eval.decide --data.root DIR --data.annotations instances.json --out runs/decide
 
 Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
-for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
-rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
-belief by Kaplan's rule with the same thresholds and with the rule of the published agent, and one sharp look at the
-whole photograph. Detections from every cell are stored and shared with `python -m eval.search`. `--references false`
-leaves out everything but the agent's own searches and the sharp look, which takes a tenth of the looks.
+for a class that is absent, until it decides: by windows, as it does by default, and with a fovea. The tables give the
+area under the ROC curve of the final probability, hit rates at several false alarm rates, and the decisions. For
+comparison they have plain rules (one unfoveated pass, with one or two closer looks, with four quarters), the same
+belief with random gaze, and the belief by Kaplan's rule with the same thresholds and with the rule of the published
+agent. Detections from every cell are stored and shared with `python -m eval.search`. `--references false` leaves out
+what needs them, which takes a tenth of the looks.
 """
 
 from eval.comparison.model_folder import with_models
 from eval.comparison.summary import announce, sensing, write_files
 from eval.decide.report import decision_summary, probabilities
+from eval.decide.roc import plot_roc
 from eval.decide.run import DecideConfig, DecisionRun
 from semfov.errors import DataError
 from semfov.runs.command import command
 from semfov.runs.scene_run import finish, gather
-from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
 
 

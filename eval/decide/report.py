@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
+from eval.decide.plain import plain_rules
 from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, landing_cells
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 
 SHARP = "one sharp look, highest score"
@@ -23,6 +24,8 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
     scores[SHARP] = torch.tensor([record["sharp"] for record in first])
     if first[0]["tiled"] is not None:
         scores["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+    if first[0]["plain"] is not None:
+        scores |= {name: rule[0] for name, rule in plain_rules(first).items()}
     scores[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
     return scores, torch.tensor([record["present"] for record in first])
 
@@ -34,10 +37,13 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     scores, there = probabilities(records)
     first = groups[names[0]]
     places = {name: torch.tensor([reported(record) for record in group]) for name, group in groups.items()}
-    telling = Telling(scores, there, [record["scene"] for record in first], {**places, SHARP: sharp_places(first)})
+    plain = plain_decisions(first)
+    places |= {SHARP: sharp_places(first), **{name: right for name, (right, _) in plain.items()}}
+    telling = Telling(scores, there, [record["scene"] for record in first], places)
     rows = [["", *TELLING, *CALIBRATED]]
-    # The references give scores, not probabilities.
-    errors = [calibrated(scores[name], there) if name in groups else ["-", "-"] for name in scores]
+    # The other references give scores, not probabilities.
+    sure = {*groups, *plain}
+    errors = [calibrated(scores[name], there) if name in sure else ["-", "-"] for name in scores]
     rows += [[name, *figures, *error] for name, figures, error in zip(scores, telling.rows(), errors, strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
                 "expected", "IoU"]]  # fmt: skip
@@ -60,6 +66,11 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
             ]
         )
     decided.append(sharp_decisions(first, telling.place(SHARP)))
+    for name, (right, passes) in plain.items():
+        finds = ~right.isnan()
+        shares = [share(int((finds & kind).sum()), int(kind.sum())) for kind in (there, ~there)]
+        means = [mean_or_dash(passes[kind].tolist()) for kind in (there, ~there)]
+        decided.append([name, *shares, "-", *means, telling.place(name) if bool(finds.any()) else "-", "-", "-"])
     closely = ""
     if any(record["closer"] for record in groups.get(AGENT, [])):
         each = mean_or_dash([record["closer"] for record in groups[AGENT]], 2)
@@ -76,8 +87,8 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
             f"Decisions in %, and mean numbers of looks.{closely} `place right`: the target overlaps the reported "
             "cell, in % of the searches that report one. `expected`: mean probability of these places by closer "
             "looks, in %. In the row with a detection at the gaze, a search ends when such a detection has a score of "
-            "0.5 or more. All other searches end at thresholds. The threshold of the sharp look's score is chosen so "
-            f"that it has as many hits as {names[0]}.",
+            "0.5 or more. All other searches end at thresholds. Those of the sharp look's score and of the plain rules "
+            f"are chosen so that they have as many hits as {names[0]}.",
             "",
             *table(decided),
             "",
@@ -92,6 +103,20 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
             "",
         ]
     )
+
+
+def plain_decisions(records: Sequence[ResultRecord]) -> dict[str, tuple[Tensor, Tensor]]:
+    """By plain rule, right places as in `reported`, with as many hits as the searches have, and passes; each `(M,)`."""
+    if records[0]["plain"] is None:
+        return {}
+    there = torch.tensor([record["present"] for record in records])
+    hits = sum(record["outcome"] == "found" for record in records if record["present"])
+    decisions = {}
+    for name, (_, place, right, passes) in plain_rules(records).items():
+        ranked = place[there].sort(descending=True).values
+        least = float(ranked[hits - 1]) if hits and float(ranked[hits - 1]) > 0 else float("inf")
+        decisions[name] = torch.where(place >= least, (right & there).float(), torch.nan), passes
+    return decisions
 
 
 def reported(record: ResultRecord) -> float:

@@ -12,15 +12,20 @@ import torch
 from torch import Tensor
 
 from eval.comparison.telling import class_frequencies
+from eval.decide.plain import plain_looks
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import USUAL_PASSES, WindowEpisode
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, conclude, confirms, decide
+from semfov.data.scene import Annotation
+from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conclude, confirms, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, Stopwatch, StoredLooks
+from semfov.eye import Eye
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
@@ -28,18 +33,25 @@ from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import choose_searches, search_steps
+from semfov.runs.scene_run import ResultRecord
+from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import if_shipped, make_learned, make_observation
 from semfov.runs.store import RememberedLooks
+from semfov.runs.zoom_store import StoredGlances
 from semfov.strategy import Strategy
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Glances
 
 _Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
+WINDOWS = "windows"
+"""The way of the recommended agent: a look at the whole photograph, and closer looks at windows."""
+
 AGENT, UNVERIFIED, RANDOM = "target-evidence", "target-evidence, no closer looks", "random gaze"
-"""Ways to search: the agent's, with closer looks and without, and the agent's belief with random gaze."""
+"""Ways to search with a fovea: with closer looks and without, and the same belief with random gaze."""
 
 PUBLISHED, CALIBRATED = "published belief", "calibrated belief"
 """Beliefs by Kaplan's rule from calibrated scores: with an observation model of the paper's, fitted by maximum
@@ -63,11 +75,13 @@ class DecideConfig(RunConfig):
         place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
             for a find (None: the model's own threshold).
         closer: largest number of closer looks in a search; 0 decides without them.
+        windows: evidence for windows, by name or file (None: the one of `models` if its agent uses it, or the one for
+            the detector, if one is shipped).
         verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
             one that is shipped for detector and sensor, if there is one).
+        rules: also measure plain rules: one unfoveated pass, with closer looks, and with quarters.
         references: also search without closer looks, with random gaze and with the published belief, for which
-            photographs are looked at from every cell, and look sharply at their quarters; without them the agent's
-            looks and one sharp look suffice.
+            photographs are looked at from every cell; without them the agent's looks suffice.
         out: folder for tables, records and the figure.
         models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
             verification.
@@ -79,15 +93,19 @@ class DecideConfig(RunConfig):
     give_up: Share | None = None
     place: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
+    windows: str | None = None
     verification: str | None = None
+    rules: bool = True
     references: bool = True
     out: Path = Path("runs/decide")
 
     def complete(self, folder: ModelFolder) -> Self:
-        """The settings with the folder's model of verification, if its agent uses one and none is given explicitly."""
-        if self.verification is not None or not folder.used("verification"):
-            return self
-        return replace(self, verification=str(folder.file("verification")))
+        """The settings with the folder's models that its agent uses, where none are given explicitly."""
+        own = {name: folder.file(name) for name in ("windows", "verification") if folder.used(name)}
+        missing: dict[str, Any] = {
+            name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None
+        }
+        return replace(self, **missing)
 
 
 class DecisionRun(PolicyLooking):
@@ -116,6 +134,10 @@ class DecisionRun(PolicyLooking):
         if config.closer and (config.verification or config.belief.target_model is None):
             self.verification = if_shipped(partial(make_learned, Verification), config.verification, self.eye)
         self.verified = {AGENT, RANDOM} if self.verification is not None else set()
+        self.by_windows = WindowEye(self.eye.detector).eval().requires_grad_(False)
+        self.windows = None
+        if config.belief.target_model is None or config.windows is not None:
+            self.windows = if_shipped(_window_evidence, config.windows, self.eye)
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
@@ -154,11 +176,48 @@ class DecisionRun(PolicyLooking):
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
         )
 
+    def _by_windows(self, glances: Glances, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
+        """What the agent that looks at windows makes of a search."""
+        config, target = self.config, search.target
+        assert self.windows is not None
+        path = (
+            WindowEpisode(
+                ("background", *self.eye.detector.classes),
+                self.windows,
+                target,
+                limits=EpisodeLimits(USUAL_PASSES),
+                confirm=config.confirm,
+                give_up=config.give_up,
+                closer=None if config.closer else 0,
+            )
+            .open(glances)
+            .run()
+        )
+        decision = path.decision
+        assert decision is not None
+        box = decision.box if decision.outcome == "found" else None
+        return {
+            "outcome": decision.outcome,
+            "probability": decision.probability,
+            "place": decision.place,
+            "looks": path.passes,
+            "closer": len(path.closer),
+            "right_place": None if box is None else bool(search.goal[cell_of(box, grid)]),
+            "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
+            "landing": None,
+            "landing_seen": None,
+        }
+
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
-        settings = [config.confirm, config.give_up, config.place, config.closer, config.references]
-        return {**super().depends_on(), "decisions": settings, "verification": self.verification}
+        settings = [config.confirm, config.give_up, config.place, config.closer, config.rules, config.references]
+        return {
+            **super().depends_on(),
+            "decisions": settings,
+            "verification": self.verification,
+            "windows": self.windows,
+        }
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
@@ -174,12 +233,13 @@ class DecisionRun(PolicyLooking):
         with torch.inference_mode():
             image = self.scenes[index].image[None]
             sharp = self.eye.detector(image)
-            tiles = [] if everywhere is None else [self.eye.detector(tile) for tile in quarters(image)]
+            tiles = [self.eye.detector(tile) for tile in quarters(image)] if self.config.rules else []
         watch.lap("look")
         store = self.store if self.config.store and everywhere is None else None
         remembered: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
+        glances = StoredGlances(self.by_windows, self.scenes, index, None)
         for search in searches:
             target, goal = search.target, search.goal
             common = {
@@ -188,9 +248,12 @@ class DecisionRun(PolicyLooking):
                 "present": search.present,
                 "sharp": float(highest_score(sharp, target)),
                 "frequency": float(self.frequencies[index][target]),
+                "plain": plain_looks(self.eye, image, sharp, target, grid, goal) if tiles else None,
                 "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)) if tiles else None,
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
+            if self.windows is not None:
+                records.append({"policy": WINDOWS, **common, **self._by_windows(glances, search, grid, annotation)})
             looks: Looks = CellLooks(remembered, grid, grid.centres, target)
             if everywhere is not None:
                 looks = StoredLooks(everywhere, grid, torch.tensor([target]))
@@ -229,6 +292,13 @@ class DecisionRun(PolicyLooking):
         remembered.save()
         watch.lap("search")
         return records, watch.seconds
+
+
+def _window_evidence(name: str | None, eye: Eye) -> GlimpseEvidence:
+    """Load evidence for windows by name, or the one shipped for the detector; check that it fits."""
+    model = GlimpseEvidence.from_pretrained(eye.detector.name if name is None else name)
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:

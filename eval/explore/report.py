@@ -20,14 +20,14 @@ from eval.explore.run import ExploreRun
 from semfov.errors import DataError
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.exploration import success_rate
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-EXPLORATION_SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+_EXPLORATION_SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""
 
-ANSWERS = {
+_ANSWERS = {
     "all classes": ("right", "as published: the answer is the most probable class, background included"),
     "without background": ("right_without_background", "the answer is the most probable class other than background"),
     "whole grid": ("right_everywhere", "all cells count: background is right where there is no object"),
@@ -42,20 +42,20 @@ def exploration_report(run: ExploreRun, *, pictures: bool = True) -> None:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
     # The reference of one sharp look comes after the policies.
     names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
-    curves = {answer: success(records, list(names), answer) for answer in ANSWERS}
-    summary = exploration_summary(curves, run.config.protocol.shifts, sensing(run))
+    curves = {answer: success(records, list(names), answer) for answer in _ANSWERS}
+    summary = _exploration_summary(curves, run.config.protocol.shifts, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
     written = write_files(run, "eval.explore", tables, records, seconds)
     if pictures:
-        written += [draw_exploration_curves(run, curves[answer], answer) for answer in ANSWERS]
+        written += [_draw_exploration_curves(run, curves[answer], answer) for answer in _ANSWERS]
         written.append(
             write_run_report(
                 run,
                 records,
                 curves,
-                titles={name: title for name, (_, title) in ANSWERS.items()},
+                titles={name: title for name, (_, title) in _ANSWERS.items()},
                 label="cells with the right class (%)",
-                shifts=EXPLORATION_SHIFTS,
+                shifts=_EXPLORATION_SHIFTS,
             )
         )
     announce(summary, written)
@@ -63,7 +63,7 @@ def exploration_report(run: ExploreRun, *, pictures: bool = True) -> None:
 
 def success(records: list[ResultRecord], policies: Sequence[str], answer: str) -> dict[str, Curve]:
     """Success rate of each policy after each gaze shift."""
-    measure = partial(_rate, field=ANSWERS[answer][0])
+    measure = partial(_rate, field=_ANSWERS[answer][0])
     return {policy: curve_of((r for r in records if r["policy"] == policy), measure) for policy in policies}
 
 
@@ -71,15 +71,15 @@ def _rate(record: ResultRecord, field: str) -> FloatArray:
     return success_rate(record[field], record["grid_cells" if field == "right_everywhere" else "object_cells"])
 
 
-def exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
+def _exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
     """The tables that the run prints: success rates with standard errors over images."""
-    shifts = [n for n in EXPLORATION_SHIFTS if n <= last]
+    shifts = [n for n in _EXPLORATION_SHIFTS if n <= last]
     head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
     lines = []
     for answer, policies in curves.items():
         first = next(iter(policies.values()))
         lines += [
-            f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
+            f"**{_ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
             "percentage of cells with a right answer after n gaze shifts, among the cells with objects unless all "
             "cells count, ± standard error over images)",
             "",
@@ -89,7 +89,7 @@ def exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing:
     return "\n".join(lines)
 
 
-def draw_exploration_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
+def _draw_exploration_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     """Draw the success rate against gaze shifts."""
     from semfov.viz import plot_success_rate
 

@@ -18,15 +18,15 @@ from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.exploration_protocol import (
+    COUNTS,
     Exploration,
-    Progress,
     counts_of,
     explorations_of,
     explore_noise,
     run_explorations,
 )
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 
 FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
 
@@ -34,19 +34,14 @@ FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
 _SURE = 0.2
 
 
-def sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
+def _sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
     """Maps of what is where from one sharp look at the whole picture.
 
     - fused: scores are used as likelihoods and fused by Kaplan's rule from a uniform prior, as published.
     - boxes: every cell gets the scores of the boxes that overlap it, class by class the highest; its answer is
       background where no score is higher than 0.2.
 
-    Args:
-        sharp: detections in the sharp picture, a batch of one.
-        grid: the grid over the picture.
-
-    Returns:
-        Maps `(1, X·Y, K+1)` by their names in tables.
+    Shapes: → `(1, X·Y, K+1)`.
     """
     observer = Semantic(sharp.scores.shape[-1])
     middle = grid.centres.to(sharp.scores).mean(0, keepdim=True)
@@ -122,22 +117,24 @@ class ExploreRun(PolicyLooking):
             records += [self._record(name, answers, *pair) for pair in zip(episodes, outcomes, strict=True)]
         with torch.inference_mode():
             sharp = self.eye.detector(self.scenes[index].image[None])
-            for name, probabilities in sharp_maps(sharp, grid).items():
-                counts = [tuple(each.tolist()) * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
-                records += [self._record(name, answers, episode, Progress((), *counts)) for episode in episodes]
+            for name, probabilities in _sharp_maps(sharp, grid).items():
+                counts = [each.tolist() * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
+                named: tuple[list[int], dict[str, list[int]]] = [], dict(zip(COUNTS, counts, strict=True))
+                records += [self._record(name, answers, episode, named) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds
 
-    def _record(self, policy: str, answers: Tensor, episode: Exploration, progress: Progress) -> ResultRecord:
+    def _record(
+        self, policy: str, answers: Tensor, episode: Exploration, progress: tuple[list[int], dict[str, list[int]]]
+    ) -> ResultRecord:
+        cells, counts = progress
         return {
             "policy": policy,
             "scene": self.scenes.ids[episode.scene],
             "repetition": episode.repetition,
             "start": episode.start,
-            "cells": list(progress.cells),
+            "cells": cells,
             "object_cells": int(answers.any(-1).sum()),
             "grid_cells": len(answers),
-            "right": list(progress.right),
-            "right_without_background": list(progress.right_without_background),
-            "right_everywhere": list(progress.right_everywhere),
+            **counts,
         }

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import ResultRecord, finish, gather
 from semfov.runs.tables import percent, plus_minus, table
 from semfov.viz.style import line_style, save_figure
 
@@ -27,7 +26,7 @@ def head(config: HeadConfig) -> None:
     run = HeadRun(config)
     finish(run, "looking around")
     records, _ = gather(run)
-    text = head_summary(records, config)
+    text = _head_summary(records, config)
     announce(text, [*write_summary(config.out, "head", text, records), *_curves(records, config)])
 
 
@@ -47,18 +46,18 @@ def compared(
     return float(values.mean()), next(errors), float(apart.mean()), next(errors)
 
 
-def value_by(record: ResultRecord, seconds: float, what: str) -> float:
+def _value_by(record: ResultRecord, seconds: float, what: str) -> float:
     """The measure `what` of an exploration after the last look that has ended by `seconds`; 0 before the first."""
     done = sum(second <= seconds for second in record["seconds"])
     return float(record[what][done - 1]) if done else 0.0
 
 
-def budgets(config: HeadConfig) -> list[float]:
+def _budgets(config: HeadConfig) -> list[float]:
     """The times in seconds for which the tables give results."""
     return sorted({second for second in (2.0, 5.0, 10.0) if second < config.seconds} | {config.seconds})
 
 
-def head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
+def _head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
     """Tables as Markdown."""
     groups: dict[tuple[str, str], list[ResultRecord]] = defaultdict(list)
     for record in records:
@@ -76,7 +75,7 @@ def head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
 
 def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
     limit, ours = config.seconds, searches[OURS]
-    times = budgets(config)
+    times = _budgets(config)
     rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", "less ours", "passes", "less ours"]]
     for way, group in searches.items():
         row = [way]
@@ -102,7 +101,7 @@ def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what
 
 
 def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
-    ours, times = explorations[OURS], budgets(config)
+    ours, times = explorations[OURS], _budgets(config)
     last = times[-1]
     rows = [
         ["", *(f"after {second:g} s" for second in times), f"less ours, after {last:g} s", "objects alone", "looks"]
@@ -110,10 +109,10 @@ def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, 
     for way, group in explorations.items():
         row = [way]
         for second in times:
-            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: value_by(r, s, "success"))  # type: ignore[misc]
+            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: _value_by(r, s, "success"))  # type: ignore[misc]
             row.append(percent(mean, error))
         row.append("" if way == OURS else plus_minus(100 * apart, 100 * error_apart))
-        mean, error, *_ = compared(group, ours, lambda r: value_by(r, last, "objects"))
+        mean, error, *_ = compared(group, ours, lambda r: _value_by(r, last, "objects"))
         looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
         rows.append([*row, percent(mean, error), f"{looks:.1f}"])
     return [
@@ -132,7 +131,7 @@ def _curves(records: list[ResultRecord], config: HeadConfig):  # type: ignore[no
     seconds = np.linspace(0, config.seconds, 101)
     measures: dict[str, tuple[str, Callable[..., float]]] = {
         "search": ("share of targets found", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
-        "exploration": ("share of cells named right", lambda r, s: value_by(r, s, "success")),
+        "exploration": ("share of cells named right", lambda r, s: _value_by(r, s, "success")),
     }
     written = []
     for task, (title, measure) in measures.items():

@@ -32,8 +32,7 @@ from semfov.head.world import Places, World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import SceneRun, store_folder
+from semfov.runs.scene_run import ResultRecord, SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks
@@ -41,7 +40,7 @@ from semfov.runs.store import DetectionStore, RememberedLooks
 OURS = "ours"
 """Name of the method that the others are compared with."""
 
-MOSAIC = 240.0
+_MOSAIC = 240.0
 """Width in degrees of a mosaic of 4 × 4 photographs."""
 
 _LOOKS = (*LOOK_SOURCES, "semfov.head.views", "semfov.head.panoramas", "semfov.data.mosaics", "semfov.head.episode")
@@ -96,11 +95,7 @@ class HeadConfig(WorkConfig):
 
 
 class HeadRun(SceneRun):
-    """Scenes, eye and models of a run; every process builds its own from the settings.
-
-    Attributes:
-        scenes: the panoramas or mosaics.
-    """
+    """Scenes, eye and models of a run; every process builds its own from the settings."""
 
     config: HeadConfig
 
@@ -139,7 +134,7 @@ class HeadRun(SceneRun):
         image, speeds = self.scenes[index].image, self.config.speeds
         if self.config.scene == "panorama":
             return Panorama(image, speeds=speeds)
-        return Flat(image, speeds=speeds, degree=image.shape[-1] / MOSAIC)
+        return Flat(image, speeds=speeds, degree=image.shape[-1] / _MOSAIC)
 
     def places(self, index: int) -> Places:
         """The places of the scene's objects."""
@@ -173,7 +168,7 @@ class HeadRun(SceneRun):
         """Every way of moving eye and head, by its name in the tables: its acquisition function after an action."""
         views, config = gain.views, self.config
         pose = start // views.cells
-        order = tiling_order(views, pose)
+        order = _tiling_order(views, pose)
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
             OURS: lambda action: PerSecond(gain, config.speeds, action),
@@ -181,7 +176,7 @@ class HeadRun(SceneRun):
             "ours, blind to time": lambda action: PerSecond(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),
-            "random head and eye": lambda action: Anywhere(views),
+            "random head and eye": lambda action: _Anywhere(views),
             "eye alone": lambda action: Scan(gain, [pose], 1, action),
         }
 
@@ -204,13 +199,13 @@ class HeadRun(SceneRun):
         observer = SceneObserver(Target(self.target_evidence), views, prior=config.prior)
         for target in self.targets(index):
             target_places, start = places[labels == target], self.start(index, views, target)
-            if bool(rests_on(views, start, target_places).any()):
+            if bool(_rests_on(views, start, target_places).any()):
                 continue  # no search starts on its target
             for name, acquire in self.ways(gain, start).items():
                 steps, found = list[HeadStep](), False
                 for step in self._steps(views, looks, observer, acquire, start, target, index):
                     steps.append(step)
-                    found = bool(rests_on(views, step.action, target_places).any())
+                    found = bool(_rests_on(views, step.action, target_places).any())
                     if found:
                         break
                 records.append(
@@ -236,7 +231,7 @@ class HeadRun(SceneRun):
         )  # fmt: skip
 
     def _explorations(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
-        answers = scene_answers(
+        answers = _scene_answers(
             views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes)
         )
         area, config = views.world.area * answers.any(-1), self.config
@@ -276,7 +271,7 @@ def turns(steps: list[HeadStep], views: Views) -> int:
     return sum(one != other for one, other in pairwise(poses))
 
 
-def tiling_order(views: Views, pose: int) -> list[int]:
+def _tiling_order(views: Views, pose: int) -> list[int]:
     """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
     rows = next(rows for rows in views.tiling if any(pose in row for row in rows))
     snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(rows)))]
@@ -284,20 +279,13 @@ def tiling_order(views: Views, pose: int) -> list[int]:
     return snake[at:] + snake[:at]
 
 
-def scene_answers(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
+def _scene_answers(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
     """Which classes are right for each cell of the scene, those of the objects that overlap it.
 
     A cell and an object overlap if the object contains the cell's centre, or the cell contains one of the points
     sampled over the object. Cells that no view shows have no answer.
 
-    Args:
-        views: the views of the scene.
-        places: the places of the objects.
-        labels: `(M,)`, the classes of the objects, 1..K.
-        classes: number of classes K.
-
-    Returns:
-        `(S, K+1)` boolean, for the S cells of the scene.
+    Shapes: labels `(M,)` → `(S, K+1)`.
     """
     world = views.world
     samples = places.samples()
@@ -308,12 +296,8 @@ def scene_answers(views: Views, places: Places, labels: Tensor, classes: int) ->
     return overlap.T.float() @ F.one_hot(labels, classes + 1).float() > 0
 
 
-class Anywhere(AcquisitionFunction):
-    """Baseline: a pose of the head and a fixation of the eye, drawn at random.
-
-    Args:
-        views: the possible views and fixations.
-    """
+class _Anywhere(AcquisitionFunction):
+    """Baseline: a pose of the head and a fixation of the eye, drawn at random."""
 
     def __init__(self, views: Views) -> None:
         super().__init__()
@@ -324,18 +308,12 @@ class Anywhere(AcquisitionFunction):
         return torch.zeros(1, len(self.views.grid))
 
 
-def rests_on(views: Views, action: int, places: Places) -> Tensor:
+def _rests_on(views: Views, action: int, places: Places) -> Tensor:
     """Which objects overlap the cell that an action fixates.
 
     A cell and an object overlap if one contains a point of the other. 9 × 9 points spread over each are tested.
 
-    Args:
-        views: the possible views and fixations.
-        action: number of the pose and cell.
-        places: regions that the objects cover.
-
-    Returns:
-        `(M,)`, boolean.
+    Shapes: → `(M,)`.
     """
     pose, cell = divmod(action, views.cells)
     edges = views.view_grid.edges[cell]

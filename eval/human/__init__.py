@@ -8,6 +8,11 @@ Free viewing: exploration policies, saliency, centre bias and random gaze, compa
 
     python -m eval.human viewing --people fixations.json --data.root images --detector.name yolox-nano
 
+Habits: a noisy choice by a policy's value, a centre bias, saccade length and return, fitted one after another to half
+of the people in half of the pictures, and evaluated on the others; the folder `out` gets the model and a report:
+
+    python -m eval.human habits --root images --fixations fixations.json --out runs/habits
+
 To continue a stopped run, give the same command again.
 """
 
@@ -15,6 +20,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from eval.human.habits.fit import HabitsConfig, fit_habits
 from eval.human.search.compare import compare
 from eval.human.search.run import PeopleSearchConfig
 from eval.human.viewing.report import viewing_report
@@ -37,6 +43,7 @@ def viewing(config: ViewingConfig) -> None:
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
     "search": (compare, PeopleSearchConfig),
     "viewing": (viewing, ViewingConfig),
+    "habits": (fit_habits, HabitsConfig),
 }
 
 

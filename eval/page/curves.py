@@ -12,14 +12,14 @@ from eval.comparison.summary import Curve, by_scene, curve_of
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import plus_minus
 
 OBJECTS = "right_without_background"
 
 
 @cache
-def read_records(folder: Path) -> tuple[ResultRecord, ...]:
+def _read_records(folder: Path) -> tuple[ResultRecord, ...]:
     """Read the records of all episodes of a run."""
     lines = (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
     return tuple(json.loads(line) for line in lines)
@@ -27,30 +27,30 @@ def read_records(folder: Path) -> tuple[ResultRecord, ...]:
 
 def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[ResultRecord]:
     """Records of a policy; with `commonest`, only searches for each image's commonest target, as in the paper."""
-    return [r for r in read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
+    return [r for r in _read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
 
 
 def policies_of(folder: Path) -> list[str]:
     """The policies of a run in their order."""
-    return list(dict.fromkeys(record["policy"] for record in read_records(folder)))
+    return list(dict.fromkeys(record["policy"] for record in _read_records(folder)))
 
 
-def curve_of_record(record: ResultRecord, last: int, field: str = "right") -> FloatArray:
+def _curve_of_record(record: ResultRecord, last: int, field: str = "right") -> FloatArray:
     """Measure of an episode after 0..`last` gaze shifts; in explorations, `field` says which answers are counted."""
     if "found_at" in record:
         return cumulative_performance(np.array([record["found_at"]]), last)
     return success_rate(record[field], record["object_cells"])[: last + 1]
 
 
-def per_image(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
+def _per_image(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:
     """Measure of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
-    means = by_scene((str(record["scene"]), curve_of_record(record, last, field)) for record in records)
+    means = by_scene((str(record["scene"]), _curve_of_record(record, last, field)) for record in records)
     return np.stack([means[scene] for scene in sorted(means)])
 
 
 def averaged(records: list[ResultRecord], last: int) -> Curve:
     """Mean measure after 0..`last` gaze shifts, with its standard errors over images and over repetitions."""
-    return curve_of(records, partial(curve_of_record, last=last))
+    return curve_of(records, partial(_curve_of_record, last=last))
 
 
 def paired_difference(
@@ -58,7 +58,7 @@ def paired_difference(
 ) -> tuple[FloatArray, FloatArray]:
     """`difference` of two policies of a run after 0..`last` gaze shifts."""
     both = (records_of(folder, policy, commonest=commonest) for policy in (one, other))
-    return difference(*(per_image(records, last, field) for records in both))
+    return difference(*(_per_image(records, last, field) for records in both))
 
 
 def difference(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -75,13 +75,6 @@ def points(mean: FloatArray, error: FloatArray, shifts: Sequence[int]) -> list[s
 def behind(mean: FloatArray, error: FloatArray) -> list[int]:
     """Gaze shifts, from 1, at which a paired difference is below zero, corrected for all shifts by Holm's method.
 
-    Args:
-        mean: mean difference after each gaze shift.
-        error: its standard error.
-
-    Returns:
-        The numbers of the gaze shifts.
-
     >>> behind(np.array([0.0, -0.3, -0.19, 0.4]), np.array([0.0, 0.1, 0.1, 0.1]))
     [1]
     """
@@ -97,13 +90,7 @@ def corrected_signs(mean: FloatArray, error: FloatArray, *, alpha: float = 0.05)
     probability of any wrong sign is then at most α, however the differences depend on each other (Holm, 1979, A simple
     sequentially rejective multiple test procedure).
 
-    Args:
-        mean: `(n,)`, mean differences.
-        error: `(n,)`, their standard errors.
-        alpha: probability of any wrong sign.
-
-    Returns:
-        `(n,)`, -1, 0 or 1.
+    Shapes: mean `(n,)`, error `(n,)`.
 
     >>> corrected_signs(np.array([-3.0, 2.1, 0.0]), np.ones(3))
     array([-1.,  0.,  0.])
@@ -120,12 +107,6 @@ def corrected_signs(mean: FloatArray, error: FloatArray, *, alpha: float = 0.05)
 
 def spans(numbers: list[int]) -> str:
     """Write ascending numbers as spans.
-
-    Args:
-        numbers: the numbers.
-
-    Returns:
-        The text.
 
     >>> spans([1, 2, 3, 7, 9, 10])
     '1 to 3, 7, 9 to 10'

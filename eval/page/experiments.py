@@ -34,13 +34,13 @@ FOVEAE: dict[SensorName, str] = {"published": "wide", "published-narrow": "narro
 CENTRAL = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
 """Non-predictive search with manually chosen settings."""
 
-GUIDED = (
+_GUIDED = (
     PolicyConfig("non-predictive", "calibrated", saliency="vocus2"),
     PolicyConfig("predictive", "calibrated", saliency="vocus2"),
 )
 """Searches with saliency as a prior over the cells."""
 
-PUBLISHED = (
+_PUBLISHED = (
     "random",
     "non-predictive-raw",
     "predictive-raw",
@@ -50,7 +50,7 @@ PUBLISHED = (
 )
 """Search policies of the paper."""
 
-PUBLISHED_EXPLORATION = (
+_PUBLISHED_EXPLORATION = (
     "random-raw",
     "kl-raw",
     "random-calibrated",
@@ -64,17 +64,17 @@ PUBLISHED_EXPLORATION = (
 SCORE_THRESHOLDS = (0.02, 0.1, 0.25, 0.5)
 """Score thresholds of the detector at which the page tests the findings of the paper, which gives none."""
 
-PROPOSED = (
+_PROPOSED = (
     "random",
     "non-predictive-calibrated",
     "neighbourhood-calibrated",
-    *GUIDED,
+    *_GUIDED,
     "vocus2",
     "itti-koch",
 )
 """Search policies that the paper proposes as future work, with its own sensor and observation model."""
 
-BEYOND = (
+_BEYOND = (
     "random",
     "non-predictive-raw",
     "non-predictive-calibrated",
@@ -85,7 +85,7 @@ BEYOND = (
 )
 """Search policies with semfov's own sensor and models."""
 
-BEYOND_EXPLORATION = (
+_BEYOND_EXPLORATION = (
     "random-raw",
     "kl-raw",
     "closer-look-raw",
@@ -100,10 +100,10 @@ BEYOND_EXPLORATION = (
 
 _SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
-EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
+_EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
 """Predictive searches with the expected scores, and with the expectation over drawn looks."""
 
-EXPECTED_EXPLORATION = tuple(
+_EXPECTED_EXPLORATION = tuple(
     PolicyConfig(policy, "calibrated", samples=samples)
     for policy in ("kl", "negative-entropy")
     for samples in (None, 16)
@@ -113,9 +113,9 @@ EXPECTED_EXPLORATION = tuple(
 Experiment = RunConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
 
-Changes = dict[str, dict[str, object]]
+_Changes = dict[str, dict[str, object]]
 
-SENSITIVITY: dict[str, Changes] = {
+_SENSITIVITY: dict[str, _Changes] = {
     "as published": {},
     "OpenCV's pyramid": {"sensor": {"convention": "opencv"}},
     "growth 2": {"sensor": {"growth": 2.0}},
@@ -136,19 +136,19 @@ SENSITIVITY: dict[str, Changes] = {
 }
 """Variations of non-predictive search with raw scores; each changes one setting."""
 
-_SENSORS: dict[str, Changes] = {
+_SENSORS: dict[str, _Changes] = {
     f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
     for sigma in (50, 100, 200)
     for growth in (1, 2)
 }
 """Variations of the sensor."""
 
-_WEIGHTS: dict[str, Changes] = {
+_WEIGHTS: dict[str, _Changes] = {
     f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
 }
 """Variations of the weight of a saliency map as a prior."""
 
-VIEWS: dict[str, Changes] = {
+_VIEWS: dict[str, _Changes] = {
     "foveated view, as published": {"saliency": {"view": "foveated"}},
     "whole photograph, once": {"saliency": {"view": "picture"}},
 }
@@ -156,18 +156,10 @@ VIEWS: dict[str, Changes] = {
 
 
 @dataclass(frozen=True)
-class Study:
-    """Runs on photographs of the fit set with different settings; a table row is a setting and a policy.
+class _Study:
+    """Runs on photographs of the fit set with different settings; a table row is a setting and a policy."""
 
-    Attributes:
-        settings: changes of the settings, by name.
-        policies: policies to compare.
-        explores: whether the runs are explorations; otherwise they are searches.
-        shifts: gaze shifts that the table shows.
-        model: ending of the observation model's name (None: the default model).
-    """
-
-    settings: dict[str, Changes]
+    settings: dict[str, _Changes]
     policies: tuple[PolicyChoice, ...]
     explores: bool = False
     shifts: tuple[int, ...] = (1, 5, 15, 30)
@@ -175,11 +167,11 @@ class Study:
 
 
 STUDIES = {
-    "sensitivity": Study(SENSITIVITY, ("non-predictive-raw",)),
-    "sensor": Study(_SENSORS, ("random", "non-predictive-raw", CENTRAL)),
-    "explore-sensor": Study(_SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
-    "saliency": Study(VIEWS, ("random", "vocus2", "itti-koch")),
-    "weights": Study(_WEIGHTS, GUIDED[:1], model="published"),
+    "sensitivity": _Study(_SENSITIVITY, ("non-predictive-raw",)),
+    "sensor": _Study(_SENSORS, ("random", "non-predictive-raw", CENTRAL)),
+    "explore-sensor": _Study(_SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
+    "saliency": _Study(_VIEWS, ("random", "vocus2", "itti-koch")),
+    "weights": _Study(_WEIGHTS, _GUIDED[:1], model="published"),
 }
 
 
@@ -254,19 +246,19 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
         for fovea in FOVEAE:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
-            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
-            yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=PUBLISHED_EXPLORATION)
+            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=_PUBLISHED)
+            yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=_PUBLISHED_EXPLORATION)
         few = {**common, "data": replace(data, limit=min(config.few, config.limit or config.few))}
         yield from _thresholds(name, settings, few)
         sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
-        yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
+        yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=_PROPOSED)
         if name == "nano":
             # One start: an expectation takes ten times as long as the published decision.
             options: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
-            yield "expected-search", SearchConfig(**options, protocol=ProtocolConfig(1), policies=EXPECTED)
+            yield "expected-search", SearchConfig(**options, protocol=ProtocolConfig(1), policies=_EXPECTED)
             once = ProtocolConfig(1, shifts=20)
-            yield "expected-explore", ExploreConfig(**options, protocol=once, policies=EXPECTED_EXPLORATION)
-        yield f"beyond-search-{name}", seek(policies=BEYOND)
+            yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
+        yield f"beyond-search-{name}", seek(policies=_BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
             yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
@@ -274,9 +266,9 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield f"decide-published-{name}", DecideConfig(**common, sensor=sensor)
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
-        yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
+        yield f"beyond-explore-{name}", tour(policies=_BEYOND_EXPLORATION)
         belief = BeliefConfig(model=f"{settings.name}-sharp")
-        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor, belief=belief)
+        yield f"beyond-explore-published-{name}", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)
 
 
 def at_threshold(kind: str, threshold: float, name: str) -> str:
@@ -300,8 +292,8 @@ def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> 
     for threshold in SCORE_THRESHOLDS:
         # Without a name, the observation model is the one that was fitted at the threshold.
         own = {**common, "detector": replace(settings, threshold=threshold), "sensor": sensor}
-        seek = SearchConfig(**own, policies=tuple(p for p in PUBLISHED if p != "vocus2"))
-        tour = ExploreConfig(**own, policies=PUBLISHED_EXPLORATION[:4])
+        seek = SearchConfig(**own, policies=tuple(p for p in _PUBLISHED if p != "vocus2"))
+        tour = ExploreConfig(**own, policies=_PUBLISHED_EXPLORATION[:4])
         yield at_threshold("search", threshold, name), seek
         yield at_threshold("explore", threshold, name), tour
 

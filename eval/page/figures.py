@@ -1,7 +1,11 @@
 """Figures of the pages of results: the paper's four, for both detectors and foveas, and one of score thresholds."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from eval.page.curves import averaged, records_of
 from eval.page.experiments import AT_THRESHOLDS, DETECTORS, SCORE_THRESHOLDS
@@ -10,39 +14,41 @@ from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
 from semfov.metrics.averages import FloatArray
-from semfov.viz.style import save_figure
+from semfov.viz.curves import draw_curves, legend_of
+from semfov.viz.style import make_figure, save_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
-class PaperFigure:
-    """A figure of the paper.
-
-    Attributes:
-        kind: kind of the experiment, `search` or `explore`.
-        policies: policies that the figure compares.
-    """
+class _PaperFigure:
+    """A figure of the paper."""
 
     kind: str
     policies: tuple[str, ...]
 
 
 PAGE_FIGURES = {
-    "prediction_and_calibration": PaperFigure(
+    "prediction_and_calibration": _PaperFigure(
         "search", ("predictive-raw", "predictive-calibrated", "non-predictive-raw", "non-predictive-calibrated")
     ),
-    "search_baselines": PaperFigure(
+    "search_baselines": _PaperFigure(
         "search", ("random", "vocus2", "predictive-calibrated", "non-predictive-calibrated")
     ),
-    "acquisition_functions": PaperFigure(
+    "acquisition_functions": _PaperFigure(
         "explore", ("kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
     ),
-    "exploration_baselines": PaperFigure(
+    "exploration_baselines": _PaperFigure(
         "explore", ("kl-raw", "kl-calibrated", "random-raw", "random-calibrated", "vocus2-calibrated")
     ),
 }
 """The figures by the names of their files."""
 
-LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
+Panel = tuple[dict[str, FloatArray], dict[str, FloatArray]]
+"""Curves in [0, 1] by their names, and their standard errors."""
+
+_LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
 
 
 THRESHOLD_FIGURE = "thresholds"
@@ -51,8 +57,6 @@ THRESHOLD_FIGURE = "thresholds"
 
 def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     """Draw the figures whose experiments are all finished; returns their files."""
-    from semfov.viz import plot_curve_panels
-
     written = []
     if not missing(AT_THRESHOLDS, runs):
         tested = {
@@ -62,19 +66,33 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
             if contrast.finding in (TESTED[0], TESTED[7])
         }
         drawn = plot_curve_panels(
-            {title: threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
+            {title: _threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
         )
         written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
         if missing(published(figure.kind).values(), runs):
             continue
         panels = {title: panel(folder, figure) for title, folder in published_columns(figure.kind, runs).items()}
-        drawn = plot_curve_panels(panels, label=LABELS[figure.kind])
+        drawn = plot_curve_panels(panels, label=_LABELS[figure.kind])
         written.append(save_figure(drawn, folder / f"{name}.png"))
     return written
 
 
-def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+@styled
+def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
+    """Curves of several experiments with the same policies side by side, two in a row, with one legend."""
+    rows = -(-len(panels) // 2)
+    figure, every = make_figure(rows, 2, width=8.8, height=2.9 * rows + 0.5)
+    for axes, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
+        draw_curves(axes, curves, errors)
+        axes.set(xlabel="gaze shifts", ylabel=label, title=title)
+    for axes in every[len(panels) :]:
+        axes.remove()
+    legend_of(figure, every[0], columns=3, inside=False)
+    return figure
+
+
+def panel(folder: Path, figure: _PaperFigure) -> Panel:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     curves = {
@@ -87,7 +105,7 @@ def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, FloatArray], dic
     )
 
 
-def threshold_panel(contrast: Contrast, name: str, runs: Runs) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def _threshold_panel(contrast: Contrast, name: str, runs: Runs) -> Panel:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
     means, errors = {}, {}
     for threshold in SCORE_THRESHOLDS:

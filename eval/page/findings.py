@@ -17,18 +17,13 @@ from semfov.runs.tables import table
 
 LAST = {"search": 30, "explore": 20}
 
-NO_DETECTOR = ("random", "vocus2")
+_NO_DETECTOR = ("random", "vocus2")
 """Policies that use no detector."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a run to a finding.
-
-    Attributes:
-        sizes: sizes of the difference, or the gaze shifts at which it is found.
-        verdict: one of `VERDICTS`.
-    """
+    """The answer of a run to a finding."""
 
     sizes: str
     verdict: str
@@ -51,16 +46,8 @@ VERDICTS = {
 """Verdicts and their meanings; signs are corrected for all differences that are shown."""
 
 
-def gain_verdict(signs: set[int], expected: int, within: bool) -> str:
+def _gain_verdict(signs: set[int], expected: int, within: bool) -> str:
     """The verdict on a finding about differences.
-
-    Args:
-        signs: the signs of the differences; 0 for a difference that the correction does not tell from zero.
-        expected: the sign that the finding claims.
-        within: whether every difference is within two standard errors of zero.
-
-    Returns:
-        The verdict.
 
     >>> [gain_verdict(signs, 1, False) for signs in ({1}, {1, 0}, {-1}, {-1, 0}, {1, -1}, {0})]
     ['holds', 'holds in part', 'reversed', 'reversed in part', 'mixed', 'open']
@@ -76,16 +63,8 @@ def gain_verdict(signs: set[int], expected: int, within: bool) -> str:
     return words.get(frozenset(signs), "mixed")
 
 
-def overtaken_verdict(leads: Sequence[int], trails: Sequence[int], within: bool) -> str:
+def _overtaken_verdict(leads: Sequence[int], trails: Sequence[int], within: bool) -> str:
     """The verdict on a finding about who leads at first.
-
-    Args:
-        leads: gaze shifts at which the policy is ahead.
-        trails: gaze shifts at which it is behind.
-        within: whether it is within two standard errors at all shifts.
-
-    Returns:
-        The verdict.
 
     >>> overtaken_verdict([1, 2], [9], False), overtaken_verdict([1], [], False), overtaken_verdict([], [4], False)
     ('holds', 'not overtaken', 'reversed')
@@ -108,13 +87,7 @@ def legend(used: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Measure:
-    """What is counted in episodes of a kind.
-
-    Attributes:
-        text: its name in tables.
-        commonest: for searches, only each image's commonest target, as in the paper.
-        field: for explorations, the answers that are counted.
-    """
+    """What is counted in episodes of a kind."""
 
     text: str
     commonest: bool = False
@@ -129,15 +102,8 @@ COUNTED = {
 
 
 @dataclass(frozen=True)
-class Advantage:
-    """The finding that one policy is better than another by so much, or no better.
-
-    Attributes:
-        one: the first policy.
-        other: the policy that is subtracted.
-        shifts: gaze shifts at which they are compared.
-        expected: 1 if the finding is that the first policy is better, 0 if it is that the two are level.
-    """
+class _Advantage:
+    """The finding that one policy is better than another by so much, or no better."""
 
     one: str
     other: str
@@ -150,7 +116,7 @@ class Advantage:
         sizes = " / ".join(points(mean, error, self.shifts))
         within = bool((np.abs(chosen) <= 2 * errors).all())
         signs = {int(sign) for sign in corrected_signs(chosen, errors)}
-        return Answer(sizes, gain_verdict(signs, self.expected, within))
+        return Answer(sizes, _gain_verdict(signs, self.expected, within))
 
     def published(self) -> str:
         """The paper's sizes, where it prints both policies."""
@@ -162,14 +128,8 @@ class Advantage:
 
 
 @dataclass(frozen=True)
-class Overtaken:
-    """The finding that a policy first leads another and is overtaken by it.
-
-    Attributes:
-        one: the policy.
-        other: the policy that overtakes it.
-        paper: until when it leads in the paper.
-    """
+class _Overtaken:
+    """The finding that a policy first leads another and is overtaken by it."""
 
     one: str
     other: str
@@ -180,7 +140,7 @@ class Overtaken:
         leads, trails = behind(-mean, error), behind(mean, error)
         text = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
         within = bool((np.abs(mean) <= 2 * error).all())
-        return Answer(text, overtaken_verdict(leads, trails, within))
+        return Answer(text, _overtaken_verdict(leads, trails, within))
 
     def published(self) -> str:
         """Until when it leads in the paper."""
@@ -189,19 +149,12 @@ class Overtaken:
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of the paper.
-
-    Attributes:
-        text: the finding.
-        kind: kind of the experiment that tests it.
-        sizes: description of the sizes.
-        test: the test.
-    """
+    """A finding of the paper."""
 
     text: str
     kind: str
     sizes: str
-    test: Advantage | Overtaken
+    test: _Advantage | _Overtaken
 
     def difference(self, folder: Path, measure: Measure) -> tuple[FloatArray, FloatArray]:
         """Difference of the policies in a run, by a measure, with its standard error, by gaze shift."""
@@ -215,7 +168,7 @@ class Finding:
     @property
     def detects(self) -> bool:
         """Whether a policy of the finding uses a detector."""
-        return not {self.test.one, self.test.other} <= set(NO_DETECTOR)
+        return not {self.test.one, self.test.other} <= set(_NO_DETECTOR)
 
 
 SEARCH, EXPLORE = paper.TABLE_SHIFTS, (1, 5, 15)
@@ -224,44 +177,44 @@ _CALIBRATED = "calibrated less raw at 5 / 15 / 30 shifts"
 
 TESTED = (
     Finding("Calibration is considerably beneficial for non-predictive search.", "search", _CALIBRATED,
-            Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH)),
+            _Advantage("non-predictive-calibrated", "non-predictive-raw", SEARCH)),
     Finding("Calibration does not influence predictive search.", "search", _CALIBRATED,
-            Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0)),
+            _Advantage("predictive-calibrated", "predictive-raw", SEARCH, expected=0)),
     Finding("Predictive search comfortably outperforms non-predictive search on raw scores", "search",
             "predictive less non-predictive at 5 / 15 / 30 shifts",
-            Advantage("predictive-raw", "non-predictive-raw", SEARCH)),
+            _Advantage("predictive-raw", "non-predictive-raw", SEARCH)),
     Finding("… and on calibrated scores.", "search", "the same",
-            Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH)),
+            _Advantage("predictive-calibrated", "non-predictive-calibrated", SEARCH)),
     Finding("Calibrated predictive search leads random gaze at first and is overtaken", "search", "gaze shifts",
-            Overtaken("predictive-calibrated", "random", "ahead to the 13th")),
+            _Overtaken("predictive-calibrated", "random", "ahead to the 13th")),
     Finding("… calibrated non-predictive search too,", "search", "gaze shifts",
-            Overtaken("non-predictive-calibrated", "random", "ahead to the 10th")),
+            _Overtaken("non-predictive-calibrated", "random", "ahead to the 10th")),
     Finding("… and raw non-predictive search.", "search", "gaze shifts",
-            Overtaken("non-predictive-raw", "random", "ahead initially")),
+            _Overtaken("non-predictive-raw", "random", "ahead initially")),
     Finding("KL divergence leads random gaze at first; random gaze overtakes it (calibrated).", "explore",
-            "gaze shifts", Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th")),
+            "gaze shifts", _Overtaken("kl-calibrated", "random-calibrated", "ahead to about the 4th")),
     Finding("The same with raw scores.", "explore", "gaze shifts",
-            Overtaken("kl-raw", "random-raw", "ahead to about the 4th")),
+            _Overtaken("kl-raw", "random-raw", "ahead to about the 4th")),
     Finding("Exploration has no particular advantage from calibration.", "explore",
-            "KL, calibrated less raw at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
+            "KL, calibrated less raw at 1 / 5 / 15 shifts", _Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
 )  # fmt: skip
 """Findings that are tested at every score threshold."""
 
-BASELINES = (
+_BASELINES = (
     Finding("VOCUS2 is far below random gaze in search.", "search", "random less VOCUS2 at 5 / 15 / 30 shifts",
-            Advantage("random", "vocus2", SEARCH)),
+            _Advantage("random", "vocus2", SEARCH)),
     Finding("KL divergence consistently outperforms negative entropy (calibrated).", "explore",
             "KL less negative entropy at 1 / 5 / 15 shifts",
-            Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE)),
+            _Advantage("kl-calibrated", "negative-entropy-calibrated", EXPLORE)),
     Finding("KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
             "explore", "KL less two-peak at 1 / 2 / 4 shifts",
-            Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4))),
+            _Advantage("kl-calibrated", "two-peaks-calibrated", (1, 2, 4))),
     Finding("KL divergence outperforms VOCUS2 in exploration (calibrated).", "explore",
-            "KL less VOCUS2 at 1 / 5 / 15 shifts", Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE)),
+            "KL less VOCUS2 at 1 / 5 / 15 shifts", _Advantage("kl-calibrated", "vocus2-calibrated", EXPLORE)),
 )  # fmt: skip
 """Findings that are tested at the default threshold alone."""
 
-FINDINGS = (*TESTED[:7], *BASELINES, *TESTED[7:])
+_FINDINGS = (*TESTED[:7], *_BASELINES, *TESTED[7:])
 """Findings that can be tested on curves; costs are measured by `python -m benchmarks.decisions`."""
 
 
@@ -269,7 +222,7 @@ def findings(runs: Runs) -> list[str]:
     """The table of all findings at the default threshold: sizes and verdicts for both detectors and both foveas."""
     folders = {kind: published_columns(kind, runs) for kind in LAST}
     rows = [["the paper finds", "shown", "in the paper", *folders["search"]]]
-    for finding in FINDINGS:
+    for finding in _FINDINGS:
         measure = COUNTED[finding.kind][-1 if finding.kind == "search" else 0]
         answers: dict[str, str] = {}
         for heading, folder in folders[finding.kind].items():

@@ -16,12 +16,9 @@ def missing(names: Iterable[str], runs: Runs) -> list[str]:
 def origin(folders: Iterable[Path]) -> str:
     """Commits, days and numbers of photographs of runs, each only once, as the pages say them."""
     manifests = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
-    commits = [_short(each["commit"]) for each in manifests]
+    # A commit by its seven digits, with `+` after uncommitted changes.
+    found = [each["commit"] for each in manifests]
+    commits = ["no commit" if commit is None else commit[:7] + commit[40:] for commit in found]
     days = [each["date"] for each in manifests]
     counts = [f"{each['scenes']} photographs" for each in manifests]
     return ", ".join(" and ".join(dict.fromkeys(values)) for values in (commits, days, counts))
-
-
-def _short(commit: str | None) -> str:
-    """The seven digits by which a commit is called, and `+` after uncommitted changes."""
-    return "no commit" if commit is None else commit[:7] + commit[40:]

@@ -16,7 +16,7 @@ from semfov.runs.tables import percent, table
 
 Runs = dict[str, Experiment]
 
-LARGER = 11
+_LARGER = 11
 """Number of target cells with which random gaze finds about as much as the paper measured."""
 
 
@@ -40,20 +40,20 @@ def beside_paper(runs: Runs) -> list[str]:
     rows = [["policy", "", "paper", *folders]]
     for policy, figures in (paper.TABLE_II | paper.TABLE_I).items():
         for place, n in enumerate(paper.TABLE_SHIFTS):
-            ours = [performance_cell(folder, policy, n) for folder in folders.values()]
+            ours = [_performance_cell(folder, policy, n) for folder in folders.values()]
             rows.append([policy if place == 0 else "", f"CP@{n}", f"{figures[place]:.2f}", *ours])
-        ours = [largest_error(folder, policy) for folder in folders.values()]
+        ours = [_largest_error(folder, policy) for folder in folders.values()]
         rows.append(["", "max. SEM", f"{figures[-1]:.3f}", *ours])
     return table(rows)
 
 
-def performance_cell(folder: Path, policy: str, shifts: int) -> str:
+def _performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
     curve = averaged(records_of(folder, policy, commonest=True), shifts)
     return percent(curve.mean[shifts], curve.over_images[shifts])
 
 
-def largest_error(folder: Path, policy: str) -> str:
+def _largest_error(folder: Path, policy: str) -> str:
     """Largest standard error of the mean over the repetitions, in percent, as published."""
     curve = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
     return f"{100 * curve.over_repetitions.max():.3f}"
@@ -69,8 +69,8 @@ def readings(runs: Runs) -> list[str]:
     first = {"n gaze shifts (the reading of this page)": 0, "n fixations, the first among them": 1}
     for reading, less in first.items():
         rows.append([reading, *(f"{100 * curve[n - less]:.1f}" for n in paper.TABLE_SHIFTS)])
-    larger = random_search(LARGER, max(paper.TABLE_SHIFTS))
-    title = f"n gaze shifts, if the target held {LARGER} cells of every image"
+    larger = random_search(_LARGER, max(paper.TABLE_SHIFTS))
+    title = f"n gaze shifts, if the target held {_LARGER} cells of every image"
     return table([*rows, [title, *(f"{100 * larger[n]:.1f}" for n in paper.TABLE_SHIFTS)]])
 
 
@@ -94,18 +94,11 @@ def markdown_table(name: str, number: int, folder: Path, columns: Sequence[str] 
     """The table of this number in a Markdown file, without the text around it; with `columns`, only these of it."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
-    return tables[number] if columns is None else with_columns(tables[number], columns)
+    return tables[number] if columns is None else _with_columns(tables[number], columns)
 
 
-def with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
+def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     """A Markdown table reduced to its first column and some others.
-
-    Args:
-        lines: the table.
-        columns: headings of the other columns.
-
-    Returns:
-        The table with these columns.
 
     >>> with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
     ['| a | c |', '|---|---|', '| 1 | 3 |']
@@ -116,21 +109,7 @@ def with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
 
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
-    """Table of the differences of policies from a baseline, paired over images, in percentage points.
-
-    Args:
-        folder: folder of the run.
-        baseline: name of the baseline policy.
-        shifts: gaze shifts that the table shows.
-        field: for explorations, the answers that are counted.
-        ending: only policies whose names end with this are compared.
-
-    Returns:
-        The table with standard errors, as lines of Markdown.
-
-    Raises:
-        DataError: the run has no records of the baseline.
-    """
+    """Table of the differences of policies from a baseline, paired over images, in percentage points."""
     names = [policy for policy in policies_of(folder) if policy.endswith(ending)]
     if baseline not in names:
         raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
@@ -149,16 +128,7 @@ def paired_maps(folder: Path, field: str = "right") -> list[str]:
 
 
 def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:
-    """Differences of policies with an expectation over drawn looks from the same with the expected scores.
-
-    Args:
-        folder: folder of the run.
-        shifts: gaze shifts that the table shows.
-        field: for explorations, the answers that are counted.
-
-    Returns:
-        The table with standard errors, in percentage points, as lines of Markdown.
-    """
+    """Differences of policies with an expectation over drawn looks from the same with the expected scores."""
     rows = [["difference to the expected scores", *(str(n) for n in shifts)]]
     for policy in policies_of(folder):
         plain, _, drawn = policy.partition(", samples ")

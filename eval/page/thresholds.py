@@ -16,24 +16,18 @@ def verdicts(runs: Runs) -> list[str]:
     for finding in TESTED:
         for number, measure in enumerate(COUNTED[finding.kind]):
             head = [finding.text, finding.test.published()] if number == 0 else ["", ""]
-            cells = (verdict_text(answers_at(finding, measure, name, runs)) for name in DETECTORS)
+            cells = (_verdict_text(_answers_at(finding, measure, name, runs)) for name in DETECTORS)
             rows.append([*head, measure.text, *cells])
     return table(rows)
 
 
-def answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> dict[float, Answer]:
+def _answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> dict[float, Answer]:
     """The answers to a finding at each score threshold, with one of `DETECTORS`."""
     return {t: finding.answer(runs[at_threshold(finding.kind, t, name)].out, measure) for t in SCORE_THRESHOLDS}
 
 
-def verdict_text(answers: dict[float, Answer]) -> str:
+def _verdict_text(answers: dict[float, Answer]) -> str:
     """Verdicts, each with the thresholds at which it is reached.
-
-    Args:
-        answers: the answers by threshold.
-
-    Returns:
-        The text.
 
     >>> verdict_text({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
     'holds at 0.02, 0.1; level at 0.25'
@@ -51,14 +45,7 @@ def words_of_verdicts(runs: Runs) -> list[str]:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The difference of the policies of a finding, as the page shows it at every score threshold.
-
-    Attributes:
-        text: its description.
-        finding: the finding.
-        measure: what is counted.
-        shifts: gaze shifts that the table shows.
-    """
+    """The difference of the policies of a finding, as the page shows it at every score threshold."""
 
     text: str
     finding: Finding

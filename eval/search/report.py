@@ -27,14 +27,14 @@ from semfov.io.files import clean, inside
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.paths import Stimulus
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-SEARCH_SHIFTS = (1, 5, 10, 15, 30)
+_SEARCH_SHIFTS = (1, 5, 10, 15, 30)
 """Gaze shifts at which tables show the cumulative performance."""
 
-AVERAGES = {
+_AVERAGES = {
     "all targets": "mean over images, every legal target of an image",
     "commonest": "mean over images, the target class with most instances",
 }
@@ -46,21 +46,21 @@ def search_report(run: SearchRun, *, pictures: bool = True) -> None:
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     shifts = run.config.protocol.shifts
-    curves = {average: performance(records, list(run.policies), shifts, average) for average in AVERAGES}
-    expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
-    summary = search_summary(curves, expected, sensing(run))
+    curves = {average: performance(records, list(run.policies), shifts, average) for average in _AVERAGES}
+    expected = _expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
+    summary = _search_summary(curves, expected, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
     written = write_files(run, "eval.search", tables, records, seconds)
     if pictures:
-        written += [draw_search_curves(run, curves["all targets"], expected), *draw_searches(run, records)]
+        written += [_draw_search_curves(run, curves["all targets"], expected), *_draw_searches(run, records)]
         written.append(
             write_run_report(
                 run,
                 records,
                 curves,
-                titles=AVERAGES,
+                titles=_AVERAGES,
                 label="targets found (%)",
-                shifts=SEARCH_SHIFTS,
+                shifts=_SEARCH_SHIFTS,
                 others={"random, by formula": expected},
             )
         )
@@ -79,7 +79,7 @@ def found(record: ResultRecord, shifts: int) -> FloatArray:
     return cumulative_performance(np.array([record["found_at"]]), shifts)
 
 
-def expected_random(records: list[ResultRecord], shifts: int, cells: int) -> FloatArray:
+def _expected_random(records: list[ResultRecord], shifts: int, cells: int) -> FloatArray:
     """Expected performance of random search for these targets (hypergeometric formula), mean over images."""
     targets: dict[Any, dict[int, int]] = defaultdict(dict)
     for record in records:
@@ -90,15 +90,15 @@ def expected_random(records: list[ResultRecord], shifts: int, cells: int) -> Flo
     return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
 
 
-def search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, sensing: str) -> str:
+def _search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, sensing: str) -> str:
     """The tables that the run prints: cumulative performance with standard errors over images."""
-    shifts = [n for n in SEARCH_SHIFTS if n < len(expected)]
+    shifts = [n for n in _SEARCH_SHIFTS if n < len(expected)]
     head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
     lines = []
     for average, policies in curves.items():
         first = next(iter(policies.values()))
         lines += [
-            f"**{AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
+            f"**{_AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
             "percentage of targets found after n gaze shifts, not counting the first fixation, ± standard error over "
             "images)",
             "",
@@ -110,7 +110,7 @@ def search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, se
     return "\n".join(lines)
 
 
-def draw_search_curves(run: SearchRun, curves: dict[str, Curve], expected: FloatArray) -> Path:
+def _draw_search_curves(run: SearchRun, curves: dict[str, Curve], expected: FloatArray) -> Path:
     """Draw the cumulative performance against gaze shifts."""
     from semfov.viz import plot_cumulative_performance
 
@@ -122,7 +122,7 @@ def draw_search_curves(run: SearchRun, curves: dict[str, Curve], expected: Float
     return save_figure(figure, run.config.out / "cumulative_performance.png")
 
 
-def draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
+def _draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
     """Draw a few episodes of the last policy in different scenes, preferring finds after two to six gaze shifts."""
     from semfov.viz import plot_episode
 

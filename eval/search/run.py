@@ -11,8 +11,8 @@ from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, EpisodeOutcome, episodes_of, looks_of, run_episodes, tie_noise
+from semfov.runs.scene_run import ResultRecord
+from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
 
@@ -23,12 +23,11 @@ class SearchConfig(RunConfig):
     Args:
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
-            `published` (predictive-calibrated), `target-evidence`, `ivsn`, `random`, `vocus2`, `itti-koch`;
+            `published` (predictive-calibrated), `target-evidence`, `random`, `vocus2`, `itti-koch`;
             and `non-predictive` (also called `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
             `place-information`, `entropy-limit` or `ideal-observer`, each followed by `-raw` or `-calibrated`. The last
             four also take `-learned`, which uses the same evidence as `target-evidence`;
             `maximum-a-posteriori-learned` is `target-evidence` itself.
-        templates: class templates of `ivsn`, by name or file (None: those shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         scanpaths: number of episodes to draw as figures.
     """
@@ -41,14 +40,8 @@ class SearchConfig(RunConfig):
         "predictive-calibrated",
         "target-evidence",
     )
-    templates: str | None = None
     out: Path = Path("runs/search")
     scanpaths: Whole = 3
-
-    @property
-    def class_templates(self) -> str | None:
-        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
-        return self.templates
 
 
 class SearchRun(PolicyLooking):
@@ -78,12 +71,12 @@ class SearchRun(PolicyLooking):
             records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
         return records, watch.seconds
 
-    def _record(self, policy: str, episode: Episode, outcome: EpisodeOutcome) -> ResultRecord:
+    def _record(self, policy: str, episode: Trial, outcome: EpisodeOutcome) -> ResultRecord:
         return {
             "policy": policy,
             **vars(episode),
             "scene": self.scenes.ids[episode.scene],
             "target_name": self.scenes.classes[episode.target - 1],
-            "cells": list(outcome.cells),
-            "found_at": outcome.found_at,
+            "cells": outcome[0],
+            "found_at": outcome[1],
         }

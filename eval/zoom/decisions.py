@@ -9,12 +9,12 @@ import torch
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
-from semfov.agents.limits import EpisodeLimits
-from semfov.agents.windows import search_windows
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import WindowEpisode
 from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
@@ -54,7 +54,8 @@ def decide_all(
     records: list[ResultRecord] = []
     ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
-        path = search_windows(glances, evidence, classes, target, EpisodeLimits(passes), closer=most)
+        episode = WindowEpisode(classes, evidence, target, limits=EpisodeLimits(passes), closer=most)
+        path = episode.open(glances).run()
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]

@@ -13,8 +13,7 @@ from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.metrics.bootstrap import Bootstrap
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import ResultRecord, finish, gather
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure

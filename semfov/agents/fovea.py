@@ -1,34 +1,45 @@
-"""Looks of a fovea at a photograph: the kind of agent that moves its gaze over a grid of cells."""
+"""Looks of a fovea at a photograph or at the frames of a stream: a gaze that moves over a grid of cells."""
 
-from collections.abc import Callable, Sequence
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from semfov.agents.limits import EpisodeLimits
+from semfov.agents.episode import Episode, EpisodeLimits
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
 from semfov.belief.verification import Verification
+from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.decision import (
+    MOST_CLOSER,
     OUTCOMES,
     CandidateCells,
+    CloseUp,
     Decision,
     Verifier,
     conclude,
+    decide,
     goal_cells,
     outcome_by_gain,
     outcome_of,
 )
-from semfov.episode import LiveLooks, Step, rollout
+from semfov.detection.detections import Detections
+from semfov.episode import LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
-from semfov.paths import Ending, Scanpath, Stimulus, Trace
+from semfov.paths import Ending, FoveaMoment, RecordedLook, Scanpath, Stimulus, Trace
+from semfov.paths.stimulus import in_bytes
 from semfov.strategy import Strategy
+
+RATE = 0.1
+"""Default rate at which the belief of a fovea fades, per frame."""
 
 _WORTH = 0.1
 """Default least gain of a look in an exploration by a learned map: the expected increase in the number of correctly
@@ -37,17 +48,18 @@ classified cells for which the exploration continues."""
 _MOST_SHIFTS = 10_000
 """Largest number of gaze shifts that can be asked for."""
 
+_LONGEST = 640  # longer side of the frames that records keep, in pixels
+_MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
+
 Start = int | tuple[int, int] | None
 """First cell of an episode: its number, its column and row, or None to draw one."""
 
 
 @dataclass(frozen=True)
 class FoveaAgent:
-    """An agent that moves its gaze over a photograph `(1, 3, H, W)`.
+    """The parts of an agent that moves its gaze over a photograph `(1, 3, H, W)`; cells `(columns, rows)`.
 
     The arguments of its methods are those of `ActivePerception`, which makes it.
-
-    Shapes: cells `(columns, rows)`.
     """
 
     eye: Eye
@@ -55,11 +67,6 @@ class FoveaAgent:
     exploring: Strategy
     verification: Verification | None
     cells: tuple[int, int]
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first."""
-        return ("background", *self.eye.detector.classes)
 
     def search(
         self,
@@ -76,37 +83,16 @@ class FoveaAgent:
         closer: int = 0,
     ) -> Scanpath:
         """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`)."""
-        strategy, index, weights = self.searching.sought(target, self.classes)
-        grid = self.grid(image)
+        strategy, index, weights = self.searching.sought(target, ("background", *self.eye.detector.classes))
+        episode = FoveaEpisode(
+            self, index, strategy=strategy, limits=limits, start=start, shifts=_shifts(shifts, 30, limits), seed=seed,
+            confirm=confirm, give_up=give_up, closer=closer if boxes is None else 0,
+        )  # fmt: skip
+        grid = episode.open(image)
         goal = None if boxes is None else goal_cells(boxes, grid, image)
-        chosen = strategy.observer.thresholds
-        thresholds = None if chosen is None else chosen.changed(confirm, give_up)
-        verifier, model = None, self.deciding(closer)
-        if model is not None and model.thresholds is not None and goal is None:
-            at = model.thresholds.changed(confirm, give_up)
-            places, close_up = CandidateCells(grid, index), partial(self.eye.close_up, image)
-            verifier = Verifier(model, places, close_up, at, closer)
-        outcome = outcome_of(weights, grid, goal, thresholds, 0.5 if confirm is None else confirm)
-        episode = _Episode(self, image, grid, strategy, index, limits, verifier, outcome)
-        scanpath, ended, last = episode.run(start, shifts, 30, seed)
-        index = class_meant(last.belief, index)
-        scanpath = replace(scanpath, found=OUTCOMES[ended] == "found", target=index)
-        if goal is not None:
-            return replace(scanpath, ending="box") if ended else scanpath
-        decision: Decision
-        if verifier is not None:
-            decision = verifier.conclude(episode.room)
-            found = decision.outcome == "found"
-            index = verifier.best.target if found else index
-            scanpath = replace(scanpath, found=found, target=index, closer=tuple(verifier.looks))
-        else:
-            # Without thresholds the target was found in the fixated cell.
-            cell = None if thresholds is not None else int(last.cell)
-            decision = conclude(ended, last.belief, scanpath.detections, grid, index, cell)
-        if ended:
-            calibrated = verifier is not None or thresholds is not None
-            scanpath = replace(scanpath, ending="decision" if calibrated else "detection")
-        return replace(scanpath, decision=decision)
+        episode.ends = outcome_of(weights, grid, goal, episode.thresholds, 0.5 if confirm is None else confirm)
+        episode.to_goal = goal is not None
+        return episode.run()
 
     def explore(
         self,
@@ -119,29 +105,25 @@ class FoveaAgent:
         worth: float | None = None,
     ) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`)."""
-        grid, observer, outcome = self.grid(image), self.exploring.observer, None
-        if isinstance(observer, LearnedMap):
-            outcome = outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
-        elif worth:
+        observer = self.exploring.observer
+        if worth and not isinstance(observer, LearnedMap):
             raise InputError(
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
             )
-        episode = _Episode(self, image, grid, self.exploring, None, limits, None, outcome)
-        scanpath, ended, _ = episode.run(start, shifts, 20, seed)
-        return replace(scanpath, ending="worth") if ended else scanpath
+        episode = FoveaEpisode(self, limits=limits, start=start, shifts=_shifts(shifts, 20, limits), seed=seed)
+        grid = episode.open(image)
+        if isinstance(observer, LearnedMap):
+            episode.ends = outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
+        return episode.run()
 
     def find_all(
         self, image: Tensor, targets: tuple[int, ...], limits: EpisodeLimits, *, shifts: int | None = None
     ) -> Scanpath:
         """Look for all objects of classes 1..K; none stand for all classes (`ActivePerception.find_all`)."""
         one = targets[0] if len(targets) == 1 else None
-        strategy = self.exploring if one is None else self.searching
-        episode = _Episode(self, image, self.grid(image), strategy, one, limits, None, None)
-        return replace(episode.run(None, shifts, 20, 0)[0], target=None, targets=targets)
-
-    def grid(self, image: Tensor) -> Grid:
-        """The grid of the belief over an image `(1, 3, H, W)`."""
-        return Grid(*self.cells, (image.shape[-1], image.shape[-2]))
+        episode = FoveaEpisode(self, one, limits=limits, shifts=_shifts(shifts, 20, limits), closer=0)
+        episode.open(image)
+        return replace(episode.run(), target=None, targets=targets)
 
     def deciding(self, closer: int) -> Verification | None:
         """The model for closer looks, if they are wanted and it can decide."""
@@ -149,81 +131,289 @@ class FoveaAgent:
         return model if closer and model is not None and model.thresholds is not None else None
 
 
-class _Episode:
-    """One episode in an image, until an outcome, a limit, or until no shift or cell is left."""
+class FoveaEpisode(Episode[Scanpath]):
+    r"""Looks of a fovea, with one gaze shift or one closer look for each pass of the detector.
+
+    With a model of verification the target is found by closer looks alone: a look is then either one of the fovea, or a
+    closer look at a place that seems to hold the target (`semfov.decision.Verifier`).
+
+    In a stream the gaze continues from its last position. Each frame multiplies the evidence of earlier frames by
+    :math:`e^{-r}`, with the rate r, so that the map returns to the prior without new evidence and can follow a scene
+    that moves. Fixated cells are free again after :math:`\ln 2 / r` frames (`semfov.episode.Forgetting`,
+    `Observer.fade`). With rate 0, frames of a still picture give the looks, the closer looks and the decision of a
+    search of the picture up to its end.
+
+    Args:
+        agent: the part of an agent that looks by a fovea.
+        target: class 1..K to search for; None explores.
+        strategy: observer and policy; None takes those of the agent for the task.
+        limits: limits of `run`; None sets none.
+        rate: r, per frame, 0 or more; None for a picture (`open`).
+        start: first cell; None draws one at random.
+        shifts: largest number of gaze shifts; None sets no limit.
+        seed: seed of the generator that draws the start and breaks ties.
+        confirm: least probability for `found`; None takes that of the model.
+        give_up: probability below which a cell is not worth a look; None takes that of the model, or in a stream that
+            of the belief alone, which a belief that fades can reach.
+        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames.
+        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+
+    Attributes:
+        ends: function from a step to the number of its outcome (`semfov.decision.OUTCOMES`), 0 to go on.
+        to_goal: whether the search ends on given cells, without a decision.
+
+    Example::
+
+        episode = FoveaEpisode(agent.fovea, agent.classes.index("cup"), rate=0.1)
+        for frame in frames:
+            print(episode.look(frame).fixation, episode.decision)
+    """
 
     def __init__(
         self,
         agent: FoveaAgent,
-        image: Tensor,
-        grid: Grid,
-        strategy: Strategy,
-        target: int | None,
-        limits: EpisodeLimits,
-        verifier: Verifier[Step] | None,
-        outcome: Callable[[Step], Tensor] | None,
+        target: int | None = None,
+        *,
+        strategy: Strategy | None = None,
+        limits: EpisodeLimits | None = None,
+        rate: float | None = None,
+        start: Start = None,
+        shifts: int | None = None,
+        seed: int = 0,
+        confirm: float | None = None,
+        give_up: float | None = None,
+        closer: int = MOST_CLOSER,
+        color: Color = "rgb",
     ) -> None:
-        self.agent, self.image, self.grid, self.strategy, self.target = agent, image, grid, strategy, target
-        self.limits, self.verifier, self.outcome = limits, verifier, outcome
-        mapper = agent.exploring.observer
-        beside, least = None if mapper is strategy.observer else mapper, agent.eye.detector.least
-        self.trace = Trace(grid, agent.classes, target, beside, least)
-        self.stimulus = Stimulus.of(agent.eye, image)
-        self.ended: int = 0
-        self.limit: Ending | None = None
+        super().__init__(("background", *agent.eye.detector.classes), target, (), limits, rate)
+        usual = agent.exploring if target is None else agent.searching
+        self.agent, self.eye, self.color = agent, agent.eye, color
+        self.strategy = usual if strategy is None else strategy
+        self.verification, self.closer = None if target is None else agent.deciding(closer), closer
+        own = self.strategy.observer.thresholds
+        chosen = own if self.verification is None else self.verification.thresholds
+        fading = own.give_up if rate and own is not None else None
+        self.thresholds = None if chosen is None else chosen.changed(give_up=fading).changed(confirm, give_up)
+        self.ends: Callable[[Step], Tensor] | None = None
+        self.to_goal = False
+        self._most = sys.maxsize if shifts is None else shifts + 1
+        columns, rows = agent.cells
+        self._first = first_cell(cell_at(start, agent.cells), seed, columns * rows)
+        self._looks: LiveLooks | None = None
+        self._verifier: Verifier[Step] | None = None
+        self._outcome = 0
+        self._concluded: Decision | None = None
 
-    @property
-    def passes(self) -> int:
-        """Number of passes of the detector so far."""
-        return len(self.trace.steps) + (0 if self.verifier is None else len(self.verifier.looks))
+    def open(self, image: Tensor) -> Grid:
+        """Begin with a picture, or with the first frame of a stream.
 
-    @property
-    def room(self) -> float:
-        """Number of passes that are left; none after another limit was reached."""
-        return self.limits.room(self.passes) if self.limit in (None, "passes") else 0
+        Args:
+            image: `(1, 3, H, W)`, RGB in [0, 1].
 
-    def run(self, start: Start, shifts: int | None, default: int, seed: int) -> tuple[Scanpath, int, Step]:
-        """Move the gaze; returns the scanpath, the number of the outcome and the last step."""
-        if shifts is None:
-            shifts = default if self.limits.passes is None else _MOST_SHIFTS
-        check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
-        first, generator = first_cell(cell_at(start, self.agent.cells), seed, len(self.grid))
-        eye, grid = self.agent.eye, self.grid
-        looks = LiveLooks(eye, eye.open(self.image), grid, self.target)
-        begin, choice = (
-            torch.tensor([first], device=self.image.device),
-            Greedy(drawn_by(generator, len(grid), self.image)),
+        Returns:
+            The cells over it.
+        """
+        self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
+        start, generator = self._first
+        self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target)
+        self._steps: Iterator[Step] = rollout(
+            self._looks,
+            self.strategy.observer,
+            self.strategy.policy(self.target, grid),
+            torch.tensor([start], device=image.device),
+            Greedy(drawn_by(generator, len(grid), image)),
+            most=self._most,
+            forgetting=self.forgetting,
         )
-        policy = self.strategy.policy(self.target, grid)
-        for _ in rollout(looks, self.strategy.observer, policy, begin, choice, most=shifts + 1, ends=self._ends):
-            pass
-        last = self.trace.steps[-1]
-        usual: Ending = "cells" if bool(last.visited.all()) else "shifts"
-        return replace(self._scanpath(), ending=self.limit or usual), self.ended, last
+        if self.verification is not None and self.target is not None:
+            places = CandidateCells(grid, self.target, self.forgetting)
+            self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
+        # A stream has no end, so it keeps the detections of the looks of which at least half the evidence is left.
+        span = min(self.forgetting.span, _MOST_RECENT) if self.forgetting is not None else None
+        self._recent: deque[Detections] = deque(maxlen=None if span is None else max(1, int(span)))
+        self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
+        if self.forgetting is None:
+            mapper = self.agent.exploring.observer
+            beside = None if mapper is self.strategy.observer else mapper
+            self._trace = Trace(grid, self.classes, self.target, beside, self.eye.detector.least)
+            self._stimulus = Stimulus.of(self.eye, image)
+        return grid
 
-    def _ends(self, step: Step) -> Tensor:
-        self.trace.add(step)
-        if self.verifier is not None:
-            self.verifier.see(step)
-            self.verifier.look_closely(self.limits.room(self.passes))
-            self.ended = self.verifier.outcome()
-        elif self.outcome is not None:
-            self.ended = int(self.outcome(step))
-        if not self.ended:
-            self.limit = self.limits.reached(self.passes, self._so_far)
-        elif self.limits.on_look is not None:
-            self.limits.on_look(self._so_far())
-        return torch.full_like(step.cell, bool(self.ended or self.limit), dtype=torch.bool)
+    def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
+        """Look by the fovea, or closely at a place that seems to hold the target."""
+        if frame is not None:
+            with torch.inference_mode():
+                return self._look_at(frame)
+        return self._fixate({}) if self._candidate is None else self._look_closely(self._candidate)
 
-    def _scanpath(self) -> Scanpath:
-        return replace(self.trace.scanpath(), stimulus=self.stimulus)
+    def _look_at(self, frame: ImageLike) -> RecordedLook | None:
+        """Spend a frame of a stream on a look."""
+        image = as_image(frame, like=self.eye.sensor.like, argument="frame", color=self.color)[None]
+        self._check_size((image.shape[-1], image.shape[-2]))
+        if self._verifier is not None:
+            self._verifier.wait()
+        if self._candidate is not None:
+            self._image = image
+            return self._look_closely(self._candidate)
+        watch = Stopwatch()
+        if self._looks is None:
+            self.open(image)
+        else:
+            self._image, self._looks.view = image, self.eye.open(image)
+            self._looks.frames = 1 if self._last is None else self.passes - self._last[1]
+        watch.lap("open")
+        return self._fixate(watch.seconds)
 
-    def _so_far(self) -> Scanpath:
-        """The scanpath so far, with the decision as it stands."""
-        verifier = self.verifier
-        if verifier is None:
-            return self._scanpath()
-        return replace(self._scanpath(), decision=verifier.decision(), closer=tuple(verifier.looks))
+    def _fixate(self, opened: dict[str, float]) -> RecordedLook | None:
+        """Move the gaze and look."""
+        step = next(self._steps, None)
+        if step is None:
+            return None
+        self._last = step, self.passes
+        self._recent.append(step.detections)
+        self.passes += 1
+        if self.forgetting is None:
+            self._trace.add(step)
+        if self._verifier is not None:
+            self._verifier.see(step)
+        elif self.ends is not None:
+            self._outcome = int(self.ends(step))
+        return self._looked(int(step.cell), step.detections, {**opened, **step.seconds}, None)
+
+    def _look_closely(self, cell: int) -> RecordedLook:
+        """Look closely at a place in a cell."""
+        assert self._verifier is not None
+        watch = Stopwatch()
+        closer = self._verifier.look()
+        watch.lap("detect")
+        return self._looked(cell, self._closely, watch.seconds, closer)
+
+    def _close_up(self, box: Tensor) -> Detections:
+        self.passes += 1
+        self._closely = self.eye.close_up(self._image, box)
+        return self._closely
+
+    def _looked(
+        self, cell: int, detections: Detections, seconds: dict[str, float], closer: CloseUp | None
+    ) -> RecordedLook:
+        """Keep what the moment tells of the look, and end the episode where it decides."""
+        self._present = cell, detections, seconds, closer
+        if self._verifier is not None and self._candidate is None:
+            self._outcome = self._verifier.outcome()
+        if self.forgetting is None and self._outcome and self._candidate is None:
+            self.ending = self._decided()
+        assert self._looks is not None
+        x, y = self._looks.grid.centres[cell].tolist()
+        size = self._image.shape[-1], self._image.shape[-2]
+        return RecordedLook(
+            self.passes - 1, (x, y), (0.0, 0.0, float(size[0]), float(size[1])), detections, sum(seconds.values())
+        )
+
+    def _decided(self) -> Ending:
+        """The reason for an end by the outcome of a look."""
+        if self.to_goal:
+            return "box"
+        if self.target is None:
+            return "worth"
+        return "detection" if self.thresholds is None else "decision"
+
+    def _end(self, limit: Ending | None) -> None:
+        step = self._last[0] if self._last is not None else None
+        assert step is not None
+        room = self.limits.room(self.passes) if limit in (None, "passes") else 0
+        if self._verifier is not None:
+            self._outcome = self._verifier.outcome()
+            self._concluded = self._verifier.conclude(room)
+        usual: Ending = "cells" if bool(step.visited.all()) else "shifts"
+        self.ending = self._decided() if self._outcome else limit or usual
+
+    @property
+    def decision(self) -> Decision | None:
+        """The decision as it stands; None in an exploration, and in a search that ends on given cells."""
+        if self._verifier is not None:
+            return self._concluded or self._verifier.decision()
+        if self.target is None or self.to_goal or self._last is None or self._looks is None:
+            return None
+        step, grid = self._last[0], self._looks.grid
+        if self.forgetting is not None:
+            if self.thresholds is None:
+                return None
+            outcome = int(decide(step, self.target, self.thresholds))
+            return conclude(outcome, step.belief, tuple(self._recent), grid, self.target)
+        if self.ends is None:
+            return None
+        # Without thresholds the target was found in the fixated cell.
+        cell = None if self.thresholds is not None else int(step.cell)
+        meant = class_meant(step.belief, self.target)
+        return conclude(self._outcome, step.belief, tuple(self._recent), grid, meant, cell)
+
+    def record(self) -> Scanpath:
+        """The scanpath so far."""
+        path, decision = self._trace.scanpath(), self.decision
+        if self.target is None or self._last is None:
+            return replace(path, stimulus=self._stimulus, ending=self.ending)
+        outcome = OUTCOMES[self._outcome] if decision is None else decision.outcome
+        target = class_meant(self._last[0].belief, self.target)
+        if self._verifier is not None and outcome == "found":
+            target = self._verifier.best.target
+        return replace(
+            path,
+            stimulus=self._stimulus,
+            ending=self.ending,
+            target=target,
+            found=outcome == "found",
+            decision=decision,
+            closer=() if self._verifier is None else tuple(self._verifier.looks),
+        )
+
+    def moment(self) -> FoveaMoment:
+        """What is known at the present frame."""
+        assert self._last is not None
+        assert self._looks is not None
+        (step, _), grid, belief = self._last, self._looks.grid, self._last[0].belief
+        cell, detections, seconds, closer = self._present
+        if self.target is None:
+            probability = 1 - belief.class_probabilities()[0, :, 0]
+        else:
+            probability = belief.probability(self.target)[0]
+        return FoveaMoment(
+            classes=self.classes,
+            target=self.target,
+            decision=self.decision,
+            number=self.passes - 1,
+            grid=grid,
+            cell=cell,
+            fixation=grid.centres[cell].to(step.fixation),
+            detections=detections,
+            probability=probability,
+            belief=belief,
+            visited=step.visited[0],
+            next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
+            seconds=seconds,
+            closer=None if closer is None else replace(closer, fixation=0),
+            photograph=_copy(self._image),
+        )
+
+    @property
+    def _candidate(self) -> int | None:
+        """Cell of the place that the next look is spent on; None for a look of the fovea."""
+        place = None if self._verifier is None else self._verifier.candidate
+        return None if place is None else place.cell
+
+
+def _copy(frame: Tensor) -> Tensor:
+    """A frame `(1, 3, H, W)` as bytes, reduced by a whole number: resampling a large frame takes as long as a look."""
+    side = -(-max(frame.shape[-2:]) // _LONGEST)
+    small = frame if side == 1 else F.avg_pool2d(frame, side, ceil_mode=True, count_include_pad=False)
+    return in_bytes(small[0])
+
+
+def _shifts(shifts: int | None, usual: int, limits: EpisodeLimits) -> int:
+    """The largest number of gaze shifts: as given, else the usual one, or with a limit of passes none."""
+    if shifts is None:
+        shifts = usual if limits.passes is None else _MOST_SHIFTS
+    check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
+    return shifts
 
 
 def cell_at(start: Start, cells: tuple[int, int]) -> int | None:

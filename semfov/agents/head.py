@@ -1,5 +1,6 @@
 """An agent that moves its eye and turns its head."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
@@ -7,24 +8,24 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, on_cpu
+from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
-from semfov.data.inputs import Color
+from semfov.data.inputs import Color, ImageLike
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
-from semfov.errors import check_number, check_whole
+from semfov.errors import check, check_number, check_whole
 from semfov.eye import Eye
-from semfov.head.belief import SceneBelief, SceneObserver
+from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
-from semfov.paths import Ending, HeadPath, reduced_copy
+from semfov.paths import Ending, HeadPath, RecordedLook, reduced_copy
 from semfov.sensor.foveation import Foveation
 
 SIGMA = 100.0
@@ -153,13 +154,16 @@ class HeadAgent(nn.Module):
         index = class_index(target, self.classes[1:], "target")
         check_thresholds(confirm, give_up)
         check_number(foresight, "foresight", 0, 1e6)
-        limits = self._limits(passes, seconds, on_look)
+        limits = EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
         views = self.views(scene, color)
         evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
         gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
         sure = _CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
-        return self._look(observer, gain, (index,), start, limits, duration, seed, thresholds=thresholds)
+        return HeadEpisode(
+            self, observer, gain, index,
+            thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed,
+        ).run()  # fmt: skip
 
     def find_all(
         self,
@@ -197,12 +201,15 @@ class HeadAgent(nn.Module):
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
         indices = class_numbers(target, self.classes[1:], "target")
-        limits = self._limits(passes, seconds, on_look)
+        limits = EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
         views = self.views(scene, color)
         check_number(worth, "worth", 0, float("inf"))
         evidence = on_cpu(self.map_evidence)
         gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return self._look(observer, gain, indices, start, limits, duration, seed, worth=worth)
+        return HeadEpisode(
+            self, observer, gain, None, indices,
+            worth=worth, limits=limits, start=start, duration=duration, seed=seed,
+        ).run()  # fmt: skip
 
     def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
         """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
@@ -220,76 +227,121 @@ class HeadAgent(nn.Module):
         """
         return self.find_all(scene, None, **options)
 
-    def _limits(self, passes: int | None, seconds: float | None, on_look: OnLook | None) -> EpisodeLimits:
-        return EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
 
-    @torch.inference_mode()
-    def _look(
+class HeadEpisode(Episode[HeadPath]):
+    """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second.
+
+    Args:
+        agent: eye and detector, and the names of the classes.
+        observer: makes the belief over the directions of a scene, with its views.
+        gain: expected gain of a look.
+        target: class 1..K to search for; None finds all objects.
+        targets: classes 1..K whose objects are all to be found; none: of all classes.
+        worth: least expected gain of a look for which it is worth it.
+        thresholds: probabilities at which a search ends.
+        limits: limits of `run`; None sets none.
+        start: first action (`Views`); None looks straight ahead.
+        duration: time limit of the scene in seconds.
+        seed: of the generator that breaks ties.
+
+    Raises:
+        InputError: an argument is out of range.
+
+    Example::
+
+        views = agent.views(semfov.Panorama("street.jpg"))
+        observer = SceneObserver(LearnedMap(agent.map_evidence), views)
+        episode = HeadEpisode(agent, observer, ExploreGain(views, agent.map_evidence), None)
+        print(episode.look().fixation)
+    """
+
+    def __init__(
         self,
+        agent: HeadAgent,
         observer: SceneObserver,
         gain: LookGain,
-        targets: tuple[int, ...],
-        start: int | None,
-        limits: EpisodeLimits,
-        duration: float,
-        seed: int,
+        target: int | None,
+        targets: tuple[int, ...] = (),
         *,
         worth: float = 0.0,
         thresholds: Thresholds | None = None,
-    ) -> HeadPath:
-        """Look around until a decision or a limit."""
+        limits: EpisodeLimits | None = None,
+        start: int | None = None,
+        duration: float = _DURATION,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(agent.classes, target, targets, limits)
         check_number(duration, "duration", 0, float("inf"))
         check_whole(seed, "seed", 0, 2**63 - 1)
-        views, target = observer.views, targets[0] if len(targets) == 1 else None
+        self.views = views = observer.views
         first = views.ahead if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
-        steps, maps = list[HeadStep](), list[Tensor]()
-        decision: Decision | None = None
-        ending: Ending | None = None
+        self.thresholds, self.duration, self.least = thresholds, duration, agent.eye.detector.least
+        self._steps = look_around(
+            views, live(agent.eye, views), observer, lambda action: PerSecond(gain, views.world.speeds, action), first,
+            target=self.target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
+        )  # fmt: skip
+        self._made, self._maps = list[HeadStep](), list[Tensor]()
+        self._decision: Decision | None = None
 
-        def record() -> HeadPath:
-            picture = views.world.image()
-            return HeadPath(
-                views=views,
-                target=target,
-                classes=self.classes,
-                least=self.eye.detector.least,
-                actions=tuple(step.action for step in steps),
-                seconds=tuple(step.seconds for step in steps),
-                detections=tuple(step.detections for step in steps),
-                maps=torch.stack(maps),
-                values=tuple(step.gain for step in steps),
-                found=decision is not None and decision.outcome == "found",
-                decision=decision,
-                ending=ending,
-                targets=targets if len(targets) > 1 else (),
-                photograph=None if picture is None else reduced_copy(picture),
-            )
+    def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
+        """Turn the eye, or eye and head, and look."""
+        check(frame is None, "frame", "None: a head looks around in the scene that it was given", type(frame).__name__)
+        with torch.inference_mode():
+            step = next(self._steps, None)
+            if step is None:
+                return None
+            self.passes += 1
+            self._made.append(step)
+            belief, target = step.belief, self.target
+            if target is not None:
+                cells = belief.probability(target)[0]
+            else:  # of any object, where the cell was seen
+                cells = (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
+            self._maps.append(cells)
+            if self.thresholds is not None and target is not None:
+                self._decision = _decide_look(self.views, step, target, self.thresholds)
+                self.ending = "decision" if self._decision.outcome != "undecided" else None
+            views, pose = self.views, self.views.poses[step.action // self.views.cells]
+            x, y = views.world.pixels_of(views.gaze[[step.action]])[0].tolist()
+            width, height = views.world.size
+            region = views.world.boxes(torch.tensor([[0.0, 0.0, width, height]]), pose)[0].tolist()
+            boxes = views.world.boxes(step.detections.boxes[0], pose)[None].to(step.detections.boxes)
+            value = step.gain if math.isfinite(step.gain) else None
+            seen = replace(step.detections, boxes=boxes)
+            return RecordedLook(self.passes - 1, (x, y), tuple(region), seen, step.seconds, value)
 
-        for step in look_around(
-            views, live(self.eye, views), observer, lambda action: PerSecond(gain, views.world.speeds, action), first,
-            target=target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
-        ):  # fmt: skip
-            steps.append(step)
-            maps.append(_probabilities_of(step.belief, target))
-            if thresholds is not None and target is not None:
-                decision = _decide_look(views, step, target, thresholds)
-            reached = limits.reached(len(steps), record)
-            ending = "decision" if decision is not None and decision.outcome != "undecided" else reached
-            if ending is not None:
-                return record()
-        if len(steps) == len(views.grid):
-            ending = "cells"
-        else:
-            ending = "duration" if step.seconds + step.ahead > duration else "worth"
-        return record()
+    def _end(self, limit: Ending | None) -> None:
+        step = self._made[-1]
+        usual: Ending = "duration" if step.seconds + step.ahead > self.duration else "worth"
+        if len(self._made) == len(self.views.grid):
+            usual = "cells"
+        self.ending = self.ending or limit or usual
 
+    @property
+    def decision(self) -> Decision | None:
+        """The decision of a search as it stands; None in an exploration."""
+        return self._decision
 
-def _probabilities_of(belief: SceneBelief, target: int | None) -> Tensor:
-    """Probability that each cell of a scene holds the target, `(S,)`; or any object, where the cell was seen."""
-    if target is not None:
-        return belief.probability(target)[0]
-    return (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
+    def record(self) -> HeadPath:
+        """The record of the looks so far."""
+        steps, decision, picture = self._made, self._decision, self.views.world.image()
+        return HeadPath(
+            views=self.views,
+            target=self.target,
+            classes=self.classes,
+            least=self.least,
+            actions=tuple(step.action for step in steps),
+            seconds=tuple(step.seconds for step in steps),
+            detections=tuple(step.detections for step in steps),
+            maps=torch.stack(self._maps),
+            values=tuple(step.gain for step in steps),
+            found=decision is not None and decision.outcome == "found",
+            decision=decision,
+            ending=self.ending,
+            targets=self.targets,
+            photograph=None if picture is None else reduced_copy(picture),
+        )
 
 
 def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:
@@ -300,4 +352,8 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     left = belief.chance(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), looked, left, thresholds))
     decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
-    return replace(decision, cell=int(cell)) if decision.outcome == "found" else decision
+    if decision.outcome != "found":
+        return decision
+    pose = views.poses[step.action // views.cells]
+    box = None if decision.box is None else views.world.boxes(decision.box[None], pose)[0]
+    return replace(decision, cell=int(cell), box=box)

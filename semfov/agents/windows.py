@@ -1,38 +1,38 @@
-"""An agent for pictures larger than its detector's input."""
+"""Looks at windows of a picture larger than the detector's input, or of the frames of a stream."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf, isfinite
+from time import perf_counter
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.limits import MOST_PASSES, EpisodeLimits, OnLook, on_cpu
+from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
+from semfov.agents.picture import pays
 from semfov.data.classes import class_index, class_numbers
-from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, picture_size
-from semfov.decision import check_thresholds
+from semfov.data.inputs import Color, ImageLike
+from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.decision import Decision, check_thresholds
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector, loader_options
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_options, check_whole
-from semfov.paths.endings import Ending
-from semfov.paths.stimulus import reduced_copy
-from semfov.paths.windows import ZoomPath
+from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import look_closely
-from semfov.zoom.decision import CLOSER, WindowDecisions, decide_by_score
+from semfov.zoom.closer import candidates, closer_window, look_closely
+from semfov.zoom.decision import WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
-from semfov.zoom.glances import Glance, Glances, LiveGlances
+from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import merge, probable_objects
+from semfov.zoom.objects import merge, probable_objects, without_replaced
 from semfov.zoom.slices import ranked, usual_slices
 
-_USUAL_PASSES = 24
+USUAL_PASSES = 24
 """Default for the largest number of passes of the detector."""
 
 LIKELY = 0.5
@@ -40,6 +40,9 @@ LIKELY = 0.5
 
 NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
+
+WINDOW_RATE = 0.03
+"""Default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames."""
 
 _Picture = LargePicture | ImageLike
 
@@ -124,9 +127,9 @@ class ZoomAgent(nn.Module):
         on_look: OnLook | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int | None = None,
     ) -> ZoomPath:
-        """Search for one object of a class and decide whether the picture holds one (`search_windows`).
+        """Search for one object of a class and decide whether the picture holds one (`WindowEpisode`).
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
         (`semfov.zoom.closer`).
@@ -142,8 +145,8 @@ class ZoomAgent(nn.Module):
                 evidence it is the least score of a detection; None takes 0.5.
             give_up: the search ends when no look shows the class with a probability of at least this value; None takes
                 the threshold of the evidence.
-            closer: largest number of closer looks, 0 to 100. 0 decides without them, as does evidence without fitted
-                verification.
+            closer: largest number of closer looks, 0 to 100; None takes 2 in a photograph, and in a larger picture as
+                many as there are passes for. 0 decides without them, as does evidence without fitted verification.
 
         Returns:
             The looks, the objects of the class, and the decision.
@@ -152,17 +155,14 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_thresholds(confirm, give_up)
-        check_whole(closer, "closer", 0, 100)
-        index = class_index(target, self.classes[1:], "target")
-        glances, evidence = self._open(picture), self._evidence()
-        with torch.inference_mode():
-            if evidence is None:
-                return _search_slices(glances, self.classes, index, limits, confirm)
-            return search_windows(
-                glances, evidence, self.classes, index, limits, confirm=confirm, give_up=give_up, closer=closer
-            )
+        check_whole(0 if closer is None else closer, "closer", 0, 100)
+        episode = self.episode(
+            class_index(target, self.classes[1:], "target"),
+            limits=EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look),
+            confirm=confirm, give_up=give_up, closer=closer,
+        )  # fmt: skip
+        return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
 
     def find_all(
         self,
@@ -201,27 +201,13 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(_USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:
             check_number(least, "least", 0, 1)
-        glances, evidence = self._open(picture), self._evidence()
-        one = targets[0] if len(targets) == 1 else None
-        turns: Iterator[WindowStep[Any]]
-        if evidence is None:
-            turns = look_by_look(glances, ranked(usual_slices(glances.lattice), targets), None)
-        else:
-            turns = find_everything(glances, evidence, one, batch=batch, worth=worth)
-        path = _Windows(glances, self.classes, one, targets if len(targets) > 1 else (), evidence, least)
-        ending: Ending | None = None
-        with torch.inference_mode():
-            for turn in turns:
-                path.add(turn)
-                ending = limits.reached(len(path.looks), path.record)
-                if ending is not None:
-                    break
-        return path.record(ending or ("windows" if evidence is None else "worth"))
+        episode = self.episode(None, targets, limits=limits, batch=batch, worth=worth, least=least)
+        return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
 
     def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
         """Find all objects of all classes.
@@ -239,164 +225,314 @@ class ZoomAgent(nn.Module):
         """
         return self.find_all(picture, None, **options)
 
-    def _evidence(self) -> GlimpseEvidence | None:
-        """The evidence on the CPU, where the looks are that it reads."""
-        return None if self.evidence is None else on_cpu(self.evidence)
+    def episode(self, target: int | None = None, targets: tuple[int, ...] = (), **settings: Any) -> "WindowEpisode":
+        """The episode of a search or an exploration, which looks when it is asked to.
 
-    def _open(self, picture: _Picture) -> LiveGlances:
-        return LiveGlances(self.eye, self.eye.open(picture))
+        Args:
+            target: class 1..K to search for; None finds all objects.
+            targets: classes 1..K whose objects are all to be found; none: of all classes.
+            **settings: further arguments of `WindowEpisode`.
+
+        Returns:
+            The episode, to be opened with looks at a picture, or given frames.
+        """
+        # The evidence computes on the CPU, where the looks are that it reads.
+        evidence = None if self.evidence is None else on_cpu(self.evidence)
+        return WindowEpisode(self.classes, evidence, target, targets, eye=self.eye, **settings)
 
 
-def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
-    """Tell whether a picture is large enough for windows to pay.
+@dataclass(frozen=True)
+class _Look:
+    """A look at a window: the number of its pass, the value that it was chosen for, and the time at its end."""
 
-    >>> pays((3840, 2160), (416, 416)), pays((640, 480), (416, 416))
-    (True, False)
+    number: int
+    glance: Glance
+    value: float
+    seconds: float
+    closely: bool = False
 
-    Shapes: size `(width, height)`, canvas `(width, height)`.
+
+class WindowEpisode(Episode[ZoomPath]):
+    r"""Looks at windows: of a picture, of the frames of a stream, or where it is told to.
+
+    In a search, places that seem to hold the target are looked at closely, and the target is `found` when it is
+    probable enough at such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without
+    closer looks it is `found` when the picture holds it with a probability of at least `confirm` and a detection shows
+    it (`semfov.decision.settle`). When the value of every look that is left is below `give_up`, or all closer looks
+    were made, the target is `absent` if its probability is below one half, and the search is `undecided` otherwise. It
+    is also `undecided` when the passes are used up. Without evidence slices are looked at in the order of the
+    overview's scores, and nothing is `absent`.
+
+    In a stream a look counts for :math:`\ln 2 / r` frames, with the rate r, or until the next look at the same window;
+    its window is then worth a look again (`semfov.zoom.episode.look_by_look`). The whole frame is looked at as often.
+    Objects are merged from the looks that count, and what a later look has shown as closely replaces what earlier ones
+    did. With rate 0 nothing is forgotten or replaced: frames of a still picture give the looks, the closer looks and
+    the objects of a search or an exploration of the picture up to its end.
+
+    Args:
+        classes: names of the classes, background first.
+        evidence: predicts from a look what closer looks will find; None for slices.
+        target: class 1..K to search for; None finds all objects.
+        targets: classes 1..K whose objects are all to be found; none: of all classes.
+        limits: limits of `run`; None sets none.
+        rate: r, per frame, 0 or more; None for a picture (`open`).
+        confirm: least probability for `found`, as for `ZoomAgent.search`.
+        give_up: probability that a look shows the target, below which no look is worth a pass.
+        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames; None as for `search`.
+        batch: number of windows that are chosen jointly and pass the detector together.
+        worth: an exploration ends when no look is expected to find more new objects than this.
+        least: probability or score from which on objects count; None takes 0.5 for probabilities and 0.3 for scores.
+        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+        eye: the eye that looks at frames; a picture is opened with its looks.
+
+    Example::
+
+        episode = agent.zoom.episode(rate=0.03)
+        for frame in frames:
+            episode.look(frame)
+            print(episode.moment().objects.boxes)
     """
-    return Lattice.over(size, canvas).levels >= 3
-
-
-def search_windows(
-    glances: Glances,
-    evidence: GlimpseEvidence,
-    classes: tuple[str, ...],
-    target: int,
-    limits: EpisodeLimits,
-    *,
-    confirm: float | None = None,
-    give_up: float | None = None,
-    closer: int = CLOSER,
-) -> ZoomPath:
-    """Search a picture for one object of a class and decide whether it is there.
-
-    Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
-    such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without closer looks it is
-    `found` when the picture holds it with a probability of at least `confirm` and a detection shows it
-    (`semfov.decision.settle`).
-
-    When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
-    if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
-    passes are used up.
-    """
-    path = _Windows(glances, classes, target, (), evidence)
-    looks, values = path.looks, path.values
-
-    def close_up(box: Tensor) -> Detections:
-        looks.append(look_closely(glances, box))
-        return looks[-1].detections
-
-    deciding = WindowDecisions(evidence, target, close_up, confirm=confirm, give_up=give_up, closer=closer)
-    ending: Ending | None = None
-    for turn in look_for(glances, evidence, target, confirm=float("inf")):
-        path.add(turn, counting=False)
-        ending = limits.reached(len(looks), path.record)
-        deciding.see(turn, len(looks), last=turn.ahead == 0 or limits.room(len(looks)) <= 1)
-        while ending is None and deciding.candidate is not None:
-            values.append(deciding.candidate.probability)
-            deciding.look()
-            ending = limits.reached(len(looks), path.record)
-        if deciding.outcome or ending is not None:
-            break
-    decision = deciding.decision(over=deciding.outcome > 0)
-    if deciding.outcome or decision.outcome == "found":
-        ending = "decision"
-    return replace(path.record(ending or "windows"), decision=decision, closer=tuple(deciding.looks))
-
-
-def _search_slices(
-    glances: Glances, classes: tuple[str, ...], target: int, limits: EpisodeLimits, confirm: float | None = None
-) -> ZoomPath:
-    """Search a picture by slices, in the order of the overview's scores; nothing is learned, so nothing is `absent`."""
-    path = _Windows(glances, classes, target)
-    ending: Ending | None = None
-    for turn in look_by_look(glances, ranked(usual_slices(glances.lattice), [target]), None):
-        path.add(turn)
-        ending = limits.reached(len(path.looks), path.record)
-        decision = decide_by_score(path.looks, target, confirm)
-        if decision.outcome == "found":
-            ending = "detection"
-        if ending is not None:
-            break
-    return replace(path.record(ending or "windows"), decision=decision)
-
-
-def least_of(certainty: Certainty | None) -> float:
-    """The default of `least`: of probabilities where there is a certainty, else of scores."""
-    return LEAST if certainty is None else LIKELY
-
-
-def window_objects(
-    glances: Sequence[Glance],
-    lattice: Lattice,
-    target: int | Sequence[int] | None,
-    certainty: Certainty | None,
-    belief: ZoomBelief | None,
-    promised: float,
-    *,
-    latest: bool = False,
-) -> tuple[Objects, tuple[float, float] | None]:
-    """The objects of some looks, and the number of those that no look has shown, with its variance."""
-    if certainty is None:
-        return merge(glances, target), None
-    # A belief about objects of any class says nothing about those of several.
-    several = target is not None and not isinstance(target, int)
-    remaining = (0.0, 0.0) if belief is None or several else belief.remaining()
-    return probable_objects(glances, lattice, target, certainty, remaining=remaining, promised=promised, latest=latest)
-
-
-class _Windows:
-    """The looks of an episode so far, of which records are made."""
 
     def __init__(
         self,
-        glances: Glances,
         classes: tuple[str, ...],
-        target: int | None,
+        evidence: GlimpseEvidence | None,
+        target: int | None = None,
         targets: tuple[int, ...] = (),
-        evidence: GlimpseEvidence | None = None,
+        *,
+        limits: EpisodeLimits | None = None,
+        rate: float | None = None,
+        confirm: float | None = None,
+        give_up: float | None = None,
+        closer: int | None = None,
+        batch: int = 1,
+        worth: float = NEW_OBJECTS,
         least: float | None = None,
+        color: Color = "rgb",
+        eye: WindowEye | None = None,
     ) -> None:
-        self.glances, self.classes, self.target, self.targets = glances, classes, target, targets
+        super().__init__(classes, target, targets, limits, rate)
+        self.evidence, self.eye, self.color = evidence, eye, color
         self.certainty = None if evidence is None else evidence.certainty
-        self.least = least_of(self.certainty) if least is None else least
-        self.belief: ZoomBelief | None = None
-        self.promised = 0.0
-        self.looks: list[Glance] = []
-        self.values: list[float] = []
-        self.picture = glances.view.picture if isinstance(glances, LiveGlances) else None
-        self.source = None if self.picture is None or self.picture.path is None else str(self.picture.path)
+        self.batch, self.worth, self._least = batch, worth, least
+        self._confirm = confirm
+        self._decisions: WindowDecisions | None = None
+        if evidence is not None and target is not None:
+            self._decisions = WindowDecisions(
+                evidence, target, self._close_up,
+                confirm=confirm, give_up=give_up, closer=closer, forgetting=self.forgetting,
+            )  # fmt: skip
+        self._glances: Glances | None = None
+        self._last: WindowStep[Any] | None = None
+        self._looks: list[_Look] = []
+        self._concluded: Decision | None = None
+        self._began = perf_counter()
+
+    def open(self, glances: Glances, *, told: bool = False) -> Self:
+        """Begin with a picture, or with the first frame of a stream.
+
+        Args:
+            glances: the looks at it.
+            told: whether `look` is told each window, instead of choosing it.
+
+        Returns:
+            The episode.
+        """
+        self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
+        self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
+        self._turns: Iterator[WindowStep[Any]]
+        if told:
+            self.searches, self._decisions = False, None
+            belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
+            self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
+        elif self.evidence is None or (self._slicing and not self.searches):
+            order = ranked(usual_slices(glances.lattice), sought)
+            self._turns = look_by_look(glances, order, None, forgetting=self.forgetting)
+        elif self.searches and self.target is not None:
+            self._turns = look_for(glances, self.evidence, self.target, confirm=inf, forgetting=self.forgetting)
+        else:
+            self._turns = find_everything(
+                glances, self.evidence, self.target, batch=self.batch, worth=self.worth, forgetting=self.forgetting
+            )
+        return self
+
+    def look(self, frame: ImageLike | LargePicture | None = None, window: Window | None = None) -> RecordedLook | None:
+        """Look at the next window, at a given one, or closely at a place that seems to hold the target."""
+        with torch.inference_mode():
+            if frame is not None:
+                self._show(frame)
+            assert self._glances is not None
+            if window is not None:
+                self._window = window
+            candidate = None if self._decisions is None else self._decisions.candidate
+            if self._decisions is not None and candidate is not None:
+                self._decisions.look()
+                self._looks[-1] = replace(self._looks[-1], value=candidate.probability)
+            elif not self._turn():
+                return None
+            if self.forgetting is None:
+                self._judge()
+            seen, lattice = self._looks[-1], self._glances.lattice
+            return RecordedLook(
+                self.passes - 1,
+                seen.glance.window.centre(lattice),
+                seen.glance.window.region(lattice),
+                seen.glance.detections,
+                seen.seconds,
+                seen.value if isfinite(seen.value) else None,
+            )
+
+    def _show(self, frame: ImageLike | LargePicture) -> None:
+        """Take the next frame of a stream."""
+        assert self.eye is not None
+        view = self.eye.open(open_large(frame, color=self.color))
+        self._check_size(view.picture.size)
+        if self._glances is None:
+            self.open(LiveGlances(self.eye, view))
+        assert isinstance(self._glances, LiveGlances)
+        self._glances.show(view, self.passes)
+        if self._decisions is not None:
+            self._decisions.wait()
+
+    def _turn(self) -> bool:
+        """Make the next look of the search or the exploration; returns whether one was left."""
+        turn = next(self._turns, None)
+        if turn is None:
+            return False
+        self._last = turn
+        self._looks.append(_Look(self.passes, turn.glance, turn.worth, perf_counter() - self._began))
+        if self.forgetting is not None:
+            counting, oldest = {id(look) for look in turn.looks}, self.passes - self.forgetting.span
+            self._looks = [
+                look for look in self._looks if (look.number >= oldest if look.closely else id(look.glance) in counting)
+            ]
+        self.passes += 1
+        if self._decisions is not None:
+            last = turn.ahead == 0 or self.limits.room(self.passes) <= 1
+            self._decisions.see(turn, self.passes, last=last)
+        return True
+
+    def _close_up(self, box: Tensor) -> Detections:
+        """Spend a pass on a closer look at a box."""
+        assert self._glances is not None
+        glance = look_closely(self._glances, box)
+        self._looks.append(_Look(self.passes, glance, 0.0, perf_counter() - self._began, closely=True))
+        self.passes += 1
+        return candidates(glance)
+
+    def _judge(self) -> None:
+        """End the search where the look decides it."""
+        if self._decisions is not None and self._decisions.outcome and self._decisions.candidate is None:
+            self.ending = "decision"
+        elif self.searches and self.evidence is None and self.decision is not None:
+            self.ending = "detection" if self.decision.outcome == "found" else None
+
+    def _end(self, limit: Ending | None) -> None:
+        decided: Ending = "decision"
+        if self._decisions is not None:
+            self._concluded = self._decisions.decision(over=self._decisions.outcome > 0)
+        elif self.searches:
+            self._concluded, decided = self.decision, "detection"
+        found = self._concluded is not None and self._concluded.outcome == "found"
+        usual: Ending = "windows" if self.searches or self._slicing else "worth"
+        over = found or (self._decisions is not None and self._decisions.outcome > 0)
+        self.ending = decided if over else limit or usual
+
+    @property
+    def least(self) -> float:
+        """Probability, or score, from which on objects count."""
+        usual = LEAST if self.certainty is None else LIKELY
+        return usual if self._least is None else self._least
+
+    @property
+    def _slicing(self) -> bool:
+        """Whether all objects are looked for in slices: without evidence, and in a photograph."""
+        return self.evidence is None or (self._glances is not None and self._glances.lattice.levels == 1)
+
+    @property
+    def decision(self) -> Decision | None:
+        """The decision of a search as it stands; by the scores of detections alone where nothing was learned."""
+        if self._concluded is not None:
+            return self._concluded
+        if self._decisions is not None:
+            return self._decisions.decision()
+        if not self.searches or self.target is None:
+            return None
+        return decide_by_score(self.glances, self.target, self._confirm)
+
+    @property
+    def belief(self) -> ZoomBelief | None:
+        """The belief after the last look; None without evidence, and before the first look."""
+        return None if self._last is None else self._last.belief
+
+    @property
+    def glances(self) -> list[Glance]:
+        """The looks that count, in their order."""
+        return [look.glance for look in self._looks]
+
+    def record(self) -> ZoomPath:
+        """The record of the looks so far."""
+        return ZoomPath(**self._recorded(), photograph=self._photograph, source=self._source, ending=self.ending)
+
+    def moment(self) -> WindowMoment:
+        """What is known at the present frame."""
+        assert self._last is not None
+        assert isinstance(self._glances, LiveGlances)
+        candidate = None if self._decisions is None else self._decisions.candidate
+        return WindowMoment(
+            **self._recorded(),
+            photograph=reduced_copy(self._glances.view.picture),
+            number=self.passes - 1,
+            next_window=self._last.choices[0][0]
+            if candidate is None
+            else closer_window(self._glances.lattice, candidate.box),
+        )
+
+    def _recorded(self) -> dict[str, Any]:
+        """What the record of a picture and that of a frame share."""
+        assert self._glances is not None
+        lattice, glances = self._glances.lattice, self.glances
+        fading = self.forgetting is not None and self.forgetting.rate > 0
+        closer = () if self._decisions is None else self._decisions.looks
+        places = {look.number: place for place, look in enumerate(self._looks)}
+        current = without_replaced(glances, lattice) if fading else glances
+        objects, unseen = self._objects(current, lattice, latest=fading)
+        return {
+            "lattice": lattice,
+            "classes": self.classes,
+            "target": self.target,
+            "targets": self.targets,
+            "decision": self.decision,
+            "glances": tuple(glances),
+            "values": tuple(look.value for look in self._looks),
+            "seconds": tuple(look.seconds for look in self._looks),
+            "candidates": objects,
+            "unseen": unseen,
+            "least": self.least,
+            "closer": tuple(replace(look, number=places[look.number]) for look in closer if look.number in places),
+        }
+
+    def _objects(
+        self, glances: Sequence[Glance], lattice: Lattice, *, latest: bool
+    ) -> tuple[Objects, tuple[float, float] | None]:
+        """The objects of some looks, and the number of those that no look has shown, with its variance."""
+        target = self.targets or self.target
+        if self.certainty is None:
+            return merge(glances, target), None
+        belief = None if self.searches else self.belief
+        # A belief about objects of any class says nothing about those of several.
+        remaining = (0.0, 0.0) if belief is None or self.targets else belief.remaining()
+        further = [look.value for look in self._looks[1:] if not look.closely and isfinite(look.value)]
+        return probable_objects(
+            glances, lattice, target, self.certainty, remaining=remaining, promised=sum(further), latest=latest
+        )
+
+    @property
+    def _source(self) -> str | None:
+        path = self._glances.view.picture.path if isinstance(self._glances, LiveGlances) else None
+        return None if path is None else str(path)
 
     @cached_property
-    def photograph(self) -> Tensor | None:
+    def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
-        return None if self.picture is None else reduced_copy(self.picture)
-
-    def add(self, turn: WindowStep[Any], *, counting: bool = True) -> None:
-        """Add a look; `counting` in an exploration, in which the value of a look is a number of expected objects."""
-        if counting:
-            self.promised += turn.worth if self.looks else 0.0
-            self.belief = turn.belief
-        self.looks.append(turn.glance)
-        self.values.append(turn.worth)
-
-    def record(self, ending: Ending | None = None) -> ZoomPath:
-        """The record so far."""
-        objects, unseen = window_objects(
-            self.looks, self.glances.lattice, self.targets or self.target, self.certainty, self.belief, self.promised
-        )
-        return ZoomPath(
-            lattice=self.glances.lattice,
-            classes=self.classes,
-            target=self.target,
-            targets=self.targets,
-            glances=tuple(self.looks),
-            values=tuple(self.values),
-            candidates=objects,
-            unseen=unseen,
-            least=self.least,
-            ending=ending,
-            photograph=self.photograph,
-            source=self.source,
-        )
+        return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None

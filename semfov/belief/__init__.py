@@ -5,7 +5,6 @@ A look is one fixation with the detections that are seen from there.
 
 from semfov.belief import fusion, observers
 from semfov.belief.belief import Belief, DirichletBelief
-from semfov.belief.context import ContextPrior
 from semfov.belief.fusion import fuse
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
@@ -15,7 +14,6 @@ from semfov.belief.verification import Verification
 
 __all__ = [
     "Belief",
-    "ContextPrior",
     "DirichletBelief",
     "Footprint",
     "Grid",

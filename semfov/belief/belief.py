@@ -213,14 +213,7 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
 
 
 def pick(values: Tensor, target: Tensor) -> Tensor:
-    """Select the values of one class along the last dimension.
-
-    >>> pick(torch.tensor([[[0.1, 0.9]], [[0.3, 0.7]]]), torch.tensor([1, 0]))
-    tensor([[0.9000],
-            [0.3000]])
-
-    Shapes: values `(B, ..., K+1)`, target `(B,)` → `(B, ...)`.
-    """
+    """The values of one class along the last dimension: values `(B, ..., K+1)`, target `(B,)` → `(B, ...)`."""
     components = values.shape[-1]
     if values_known(target):
         inside = bool(((target >= 0) & (target < components)).all())
@@ -232,17 +225,10 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Apply a function to each row of tensors separately, and concatenate the results.
+    """Apply a function to each row `(B, ...)` separately, so that no result depends on the other rows of its batch.
 
-    The rounding of matrix products depends on their size. So does that of exponentials and logarithms, because the last
-    few elements of a tensor are not computed in vectors. Computed separately, the result for an episode does not depend
-    on how many other episodes run with it. While a graph is traced, and inside `torch.func.vmap`, all rows are computed
-    at once.
-
-    >>> one_by_one(lambda row: row @ torch.ones(3, 1), torch.ones(2, 1, 3)).shape
-    torch.Size([2, 1, 1])
-
-    Shapes: rows `(B, ...)` → `(B, ...)`.
+    The rounding of matrix products, exponentials and logarithms depends on the size of the tensor. While a graph is
+    traced, and inside `torch.func.vmap`, all rows are computed at once.
     """
     if not values_known(*rows) or len(rows[0]) <= 1:
         return function(*rows)

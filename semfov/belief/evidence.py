@@ -22,11 +22,7 @@ _REACH = 1 / 6
 
 @dataclass(frozen=True)
 class Gathered:
-    """Accumulated evidence about one class from all looks of an episode so far.
-
-    Shapes: nearest `(B, X·Y)`, best `(B, X·Y)`, mean `(B, X·Y)`, distance `(B, X·Y)`, score `(B,)`, looks `(B,)`,
-    visited `(B, X·Y)`, target `(B,)`.
-    """
+    """Evidence about one class from all looks so far: score, looks and target `(B,)`, the others `(B, X·Y)`."""
 
     nearest: Tensor
     best: Tensor
@@ -52,13 +48,6 @@ class Evidence(PretrainedForEye):
 
     where φ are the features of `look_features`, and g and h are networks with two hidden layers. The evidence depends
     on the class through its score and through a prior, one number for each class.
-
-    Args:
-        look_width: hidden units of g.
-        readout_width: hidden units of h.
-        components: K + 1, number of classes of the detector with background.
-        more: number of further inputs of h, beyond `READOUT`.
-        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was trained for).
     """
 
     def __init__(
@@ -78,41 +67,16 @@ class Evidence(PretrainedForEye):
         self.prior = nn.Parameter(torch.zeros(components))
 
     def evidence(self, features: Tensor) -> Tensor:
-        """Evidence of looks, from their features.
-
-        Args:
-            features: `(..., 10)` (`look_features`).
-
-        Returns:
-            `(...)`, log odds.
-        """
+        """Evidence of looks, log odds `(...)`, from their features `(..., 10)` (`look_features`)."""
         value: Tensor = self.look(features)
         return value[..., 0]
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Evidence of a look from one longer side away without detections.
-
-        Args:
-            like: a tensor that gives dtype and device.
-
-        Returns:
-            `()`, log odds.
-        """
+        """Evidence of a look from one longer side away without detections, log odds `()`."""
         return self.evidence(nothing_seen(like.new_ones(1)))[0]
 
     def read_out(self, reader: nn.Module, nearest: Tensor, gathered: Gathered, columns: int, *more: Tensor) -> Tensor:
-        """Correct the evidence of the closest looks, given all gathered evidence.
-
-        Args:
-            reader: the network.
-            nearest: `(B, X·Y)`, the evidence to correct.
-            gathered: evidence of all looks.
-            columns: X, cells in a row.
-            more: further inputs of the network, each broadcast to `(B, X·Y)`.
-
-        Returns:
-            `(B, X·Y)`, log odds.
-        """
+        """Correct the evidence of the closest looks `(B, X·Y)` by a network that reads all gathered evidence."""
         odds = nearest.sigmoid()
         eccentricity, row = _places(columns, nearest.shape[-1] // columns, nearest.dtype, nearest.device)
         inputs = [
@@ -136,13 +100,7 @@ class Evidence(PretrainedForEye):
 
 
 def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Size) -> Tensor:
-    """Apply a network with one output to its inputs, one tensor each.
-
-    >>> apply_network(nn.Linear(2, 1), [torch.ones(3, 4), torch.ones(1)], torch.Size([3, 4])).shape
-    torch.Size([3, 4])
-
-    Shapes: network `(M, n)`.
-    """
+    """Apply a network with one output to its inputs, one tensor each, broadcast to `shape`."""
     # Each input is copied in one piece, and the matrix product reads the table transposed. To interleave the inputs
     # takes longer than the product.
     table = torch.stack([each.expand(shape) for each in inputs]).flatten(1)
@@ -171,13 +129,7 @@ def logarithm(odds: Tensor) -> Tensor:
 
 
 def blur(values: Tensor, columns: int, sigma: float) -> Tensor:
-    """Gaussian average over the neighbourhood, with σ in cells; cells outside the grid count as 0.
-
-    >>> blur(torch.tensor([[0.0, 1.0, 0.0]]), columns=3, sigma=0.6).argmax()
-    tensor(1)
-
-    Shapes: values `(B, X·Y)` → `(B, X·Y)`.
-    """
+    """Gaussian average `(B, X·Y)` over the neighbourhood, with σ in cells; cells outside the grid count as 0."""
     rows = values.shape[-1] // columns
     across, down = (_averages(length, sigma, values.dtype, values.device) for length in (columns, rows))
     # One product for the lines of all maps: a convolution of one channel takes eight times as long.
@@ -209,13 +161,7 @@ def _places(columns: int, rows: int, dtype: torch.dtype, device: torch.device) -
 
 
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
-    """Largest value in the square about each cell of maps.
-
-    >>> neighbourhood_peak(torch.tensor([[[1.0, 0.0, 0.0, 2.0]]]), 3)
-    tensor([[[1., 1., 2., 2.]]])
-
-    Shapes: values `(T, rows, columns)` → `(T, rows, columns)`.
-    """
+    """Largest value in the square about each cell of maps `(T, rows, columns)`."""
     # One axis after the other: fewer comparisons.
     along = F.max_pool1d(values, side, 1, side // 2)
     return F.max_pool1d(along.mT, side, 1, side // 2).mT

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import as_positions
-from semfov.errors import check, check_finite, check_shape, check_whole, lookup, values_known
+from semfov.errors import check, check_finite, check_shape, check_whole, lookup
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 
@@ -85,7 +85,7 @@ class Grid:
         tensor([0, 5])
         """
         check_shape(points, "points", 2)
-        _check_numbers(points, "points")
+        check_finite(points, "points")
         points = as_positions(points)
         step = ((points + 0.5) / self._align(self._cell_size(), points)).floor()
         column = step[..., 0].clamp(0, self.columns - 1).long()
@@ -123,17 +123,24 @@ class Grid:
                 [ True,  True]])
         """
         check_shape(boxes, "boxes", None, 4)
-        _check_numbers(boxes, "boxes")
+        check_finite(boxes, "boxes")
         lookup(rule, get_args(Footprint), "footprint rule")
         boxes = as_positions(boxes)
         full = (boxes[..., 2] > boxes[..., 0]) & (boxes[..., 3] > boxes[..., 1])
         low, high = boxes[..., None, :2], boxes[..., None, 2:]
         if rule == "overlap":
-            across = _overlaps(self._borders(0).to(boxes), low[..., 0], high[..., 0])
-            down = _overlaps(self._borders(1).to(boxes), low[..., 1], high[..., 1])
+            shared = []
+            for axis, count in enumerate((self.columns, self.rows)):
+                extent = self.extent[..., axis, None] if self.extent.ndim == 1 else self.extent[:, None, axis, None]
+                borders = (torch.arange(count + 1, device=extent.device) * (extent / count)).to(boxes)
+                shared.append((borders[..., :-1] < high[..., axis]) & (borders[..., 1:] > low[..., axis]))
+            across, down = shared
             return (down[..., :, None] & across[..., None, :] & full[..., None, None]).flatten(-2)
         if rule == "soft":
-            return self._window(boxes) * self.footprint(boxes)
+            half = self._align(self._cell_size(), boxes)[..., None, :] / 2
+            offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - (low + high) / 2
+            window = (-1.5 * (offset / torch.hypot((high - low) / 2, half)).square()).sum(-1).exp()
+            return window * self.footprint(boxes)
         own = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
         central = own[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
@@ -163,8 +170,8 @@ class Grid:
         """
         check_shape(boxes, "boxes", None, 4)
         check_shape(fixation, "fixation", 2)
-        _check_numbers(boxes, "boxes")
-        _check_numbers(fixation, "fixation")
+        check_finite(boxes, "boxes")
+        check_finite(fixation, "fixation")
         boxes, fixation = as_positions(boxes), as_positions(fixation)
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
@@ -190,14 +197,6 @@ class Grid:
         offset = self.centres.to(fixation) - fixation[..., None, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1).to(fixation)[..., None]
 
-    def _window(self, boxes: Tensor) -> Tensor:
-        """Weights of the `soft` footprint, including cells that a box does not overlap."""
-        half = self._align(self._cell_size(), boxes)[..., None, :] / 2
-        box_half = (boxes[..., None, 2:] - boxes[..., None, :2]) / 2
-        middle = (boxes[..., None, :2] + boxes[..., None, 2:]) / 2
-        offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - middle
-        return (-1.5 * (offset / torch.hypot(box_half, half)).square()).sum(-1).exp()
-
     @property
     def cell_distance(self) -> Tensor:
         """Distance between the centres of each pair of cells, in longer sides: `(X·Y, X·Y)` or `(B, X·Y, X·Y)`.
@@ -209,27 +208,11 @@ class Grid:
         offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]
 
-    def _borders(self, axis: int) -> Tensor:
-        """Borders between the cells along x (0) or y (1), `(n+1,)`, or `(B, 1, n+1)` for a batch of sizes."""
-        count = (self.columns, self.rows)[axis]
-        extent = self.extent[..., axis, None] if self.extent.ndim == 1 else self.extent[:, None, axis, None]
-        return torch.arange(count + 1, device=extent.device) * (extent / count)
-
     def _align(self, values: Tensor, points: Tensor) -> Tensor:
         """Reshape per-image values `(B, 2)` so that they broadcast over points `(B, ..., 2)`."""
         extra = points.ndim - values.ndim
         aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
         return aligned.to(points)
-
-
-def _check_numbers(values: Tensor, argument: str) -> None:
-    if values_known(values):
-        check_finite(values, argument)
-
-
-def _overlaps(borders: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Whether each interval between successive `borders` shares a positive length with `low`..`high`."""
-    return (borders[..., :-1] < high) & (borders[..., 1:] > low)
 
 
 def check_cells(grid: tuple[int, int]) -> None:

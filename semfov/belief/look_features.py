@@ -13,21 +13,14 @@ _FLOOR = 1e-6
 
 
 def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
-    """Highest score of a class among the detections of each look; 0 without detections.
-
-    >>> seen = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.2, 0.8], [0.7, 0.3]]]), torch.ones(1, 2).bool())
-    >>> highest_score(seen, 1)
-    tensor([0.8000])
-
-    Shapes: target `(T,)` → `(B,)`.
-    """
+    """Highest score of classes `(T,)` among the detections of each look, `(B, T)`; 0 without detections."""
     scores = detections.scores * detections.mask[..., None]
     highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
     return highest[..., target]
 
 
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-    r"""Ten features that describe the evidence of looks for a target in every cell.
+    r"""Ten features that describe the evidence of looks for a target in every cell, `(B, X·Y, 10)`.
 
     Let :math:`s_l` be the scores of detection l, :math:`w_l(x)` its weight in cell x (the `soft` footprint of `Grid`),
     and b the detection with the largest :math:`s_{lt} w_l(x)`. The features, each scaled to about unit size, are
@@ -42,18 +35,6 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
     8. the strongest objectness, :math:`\max_l (1 - s_{l0}) w_l`,
     9. the strongest evidence for other classes, :math:`\max_l (1 - s_{l0} - s_{lt}) w_l`,
     10. whether no detection overlaps the cell.
-
-    Args:
-        detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
-        fixation: `(B, 2)`, as `(x, y)` in pixels.
-        grid: the cells of one image.
-        target: class 1..K.
-
-    Returns:
-        `(B, X·Y, 10)`.
-
-    Raises:
-        InputError: the class is out of range, or the shape of `fixation` does not fit.
     """
     components = detections.scores.shape[-1]
     check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
@@ -102,13 +83,7 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
 
 
 def nothing_seen(distance: Tensor) -> Tensor:
-    """`look_features` for a look without detections.
-
-    >>> nothing_seen(torch.tensor([0.5])).shape
-    torch.Size([1, 10])
-
-    Shapes: → `(..., 10)`.
-    """
+    """`look_features` `(..., 10)` for a look without detections from distances `(...)`."""
     none = torch.zeros_like(distance)
     least = _log(none)
     features = [4 * distance, least, least, none, none, none, none, none, none, none + 1]

@@ -21,11 +21,7 @@ _EMPTY = -8.0
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds on probabilities at which a search decides.
-
-    >>> Thresholds(confirm=0.9, give_up=0.3).changed(confirm=0.8)
-    Thresholds(confirm=0.8, give_up=0.3, place=0.0)
-    """
+    """Thresholds on probabilities at which a search decides."""
 
     confirm: float
     give_up: float

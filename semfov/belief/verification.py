@@ -91,7 +91,7 @@ class Verification(PretrainedForEye):
 def closer_features(
     presence: float, cell: float, evidence: float, closer: Detections, box: Tensor, target: int
 ) -> tuple[Tensor, Tensor]:
-    r"""Describe a closer look at a place, and find the box of the target in it.
+    r"""Describe a closer look at a place `(7,)`, and find the box of the target in it `(4,)`.
 
     Let :math:`s_l` be the scores of detection l of the closer look, :math:`o_l` its overlap (intersection over union)
     with the examined box, and :math:`m = \arg\max_l s_{lt} o_l`. The features are the logits of
@@ -103,23 +103,8 @@ def closer_features(
     6. :math:`\max_l o_l \max_{k \ne t} s_{lk}`, the evidence for other classes there,
     7. :math:`s_{mt}`,
 
-    with probabilities kept between 0.001 and 0.999.
-
-    Args:
-        presence: probability that the image holds the target.
-        cell: probability that the cell holds the target.
-        evidence: evidence for the target in the cell.
-        closer: detections of the closer look, a batch of one.
-        box: `(4,)`, the examined box.
-        target: class 1..K.
-
-    Returns:
-        The features `(7,)`, and the box `(4,)` of detection m, or the examined box if they overlap by less than 0.3.
-
-    >>> box = torch.tensor([0.0, 0.0, 9.0, 9.0])
-    >>> nothing = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
-    >>> closer_features(0.9, 0.8, 0.5, nothing, box, 1)[0].round(decimals=1)
-    tensor([ 2.2000,  1.4000,  0.0000, -6.9000, -6.9000, -6.9000, -6.9000])
+    with probabilities kept between 0.001 and 0.999. The box is that of detection m if they overlap by 0.3 or more,
+    otherwise the examined box.
     """
     real = closer.mask[0]
     boxes, scores = closer.boxes[0][real], closer.scores[0][real]
@@ -138,19 +123,6 @@ def closer_features(
 
 
 def best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
-    r"""Find the detection that best shows the target in a box: :math:`m = \arg\max_l s_l o_l`.
-
-    Args:
-        boxes: `(L, 4)`, boxes of at least one detection.
-        scores: `(L,)`, their scores s for the target.
-        box: `(4,)`, the box.
-
-    Returns:
-        The number m, and the overlaps o (intersection over union), `(L,)`.
-
-    >>> boxes = torch.tensor([[0.0, 0.0, 8.0, 9.0], [30.0, 0.0, 39.0, 9.0]])
-    >>> best_detection(boxes, torch.tensor([0.5, 0.9]), torch.tensor([0.0, 0.0, 9.0, 9.0]))[0]
-    0
-    """
+    r"""Detection that best shows the target in a box, :math:`m = \arg\max_l s_l o_l`, and all overlaps o `(L,)`."""
     overlap = box_iou(boxes, box[None])[:, 0]
     return int((scores * overlap).argmax()), overlap

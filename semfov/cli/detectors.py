@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os import fspath
 
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.cli.options import DetectorsOptions
-from semfov.cli.text import columns, table_lines
+from semfov.cli.text import table_lines
 from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, cache_folder
+from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
 from semfov.zoom import GlimpseEvidence
@@ -20,6 +22,7 @@ _PURPOSES: dict[str, type[Pretrained]] = {
     "closer looks": Verification,
     "explore": MapEvidence,
     "large pictures": GlimpseEvidence,
+    "gaze": FixationDensity,
 }
 """Models that are shipped for some detectors, by what they are for."""
 
@@ -31,7 +34,7 @@ def list_detectors(options: DetectorsOptions) -> int:
         folder = options.name.is_dir()
         classes = Manifest.read(options.name).classes if folder else check_detector(name)
         classes = load_detector(name).classes if classes is None else classes
-        print(f"{name} knows {len(classes)} classes:\n{columns(classes)}")
+        print(f"{name} knows {len(classes)} classes:\n{_columns(classes)}")
         return 0
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
@@ -44,3 +47,15 @@ def list_detectors(options: DetectorsOptions) -> int:
     print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")
     print("A detector without shipped models runs with --agent raw, or after semfov fit.")
     return 0
+
+
+def _columns(names: Sequence[str], width: int = 100) -> str:
+    r"""Names in columns, in order down each column.
+
+    >>> _columns(["cup", "fork", "oven"], 12)
+    'cup   oven\nfork'
+    """
+    wide = max(map(len, names)) + 2
+    across = max(1, width // wide)
+    down = -(-len(names) // across)
+    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))

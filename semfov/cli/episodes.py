@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from semfov.agent import ActivePerception, How, PictureLike
+from semfov.agent import ActivePerception
+from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import ResultsFile, kind_of
@@ -34,8 +35,7 @@ from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
 from semfov.report import write_page
 from semfov.runs.config import WHERE
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
+from semfov.runs.scene_run import SceneResults, digest_of
 from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 

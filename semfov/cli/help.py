@@ -11,6 +11,7 @@ semfov: active perception with any detector, in photographs, large pictures, sce
   semfov search kitchen.jpg --target cup            is there a cup, and where?
   semfov find harbour.tif --target person           all people in a large picture, and how many
   semfov explore street.jpg --report street.html    what is where, as a page with every look
+  semfov gaze poster.jpg --report poster.html       where people look, and in what order
   semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
   semfov detectors                                  detectors that can be named, and their licences
@@ -19,12 +20,13 @@ Commands:
   search      search pictures for a class, and decide whether it is there
   find        find all objects of one class, of several or of all
   explore     learn what is where, without a target
+  gaze        predict where people look
   live        search or explore a video, a camera or a network stream
   fit         fit all models to your own detector
   detectors   list detectors, or the classes of one
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
-Without a picture, search, find and explore take an embedded scene, so `semfov search --target cup` tries it out.
+Without a picture, search, find, explore and gaze take an embedded scene, so `semfov search --target cup` tries it out.
 """
 
 _AGENT = """\
@@ -47,7 +49,8 @@ _OUTPUT = """\
 A picture of several that cannot be read is reported and skipped; the exit code is then 1. If the command is stopped,
 the same command continues with the pictures that are left. --help-all: all options."""
 
-SEARCH = f"""\
+HELP = {
+    "search": f"""\
 semfov search: is it there, and where?
 
   semfov search kitchen.jpg --target cup
@@ -66,9 +69,8 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
   --closer N           most closer looks at places that seem to hold the target (0: none)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
-"""
-
-FIND = f"""\
+""",
+    "find": f"""\
 semfov find: all objects, and how many
 
   semfov find harbour.tif --target person
@@ -87,9 +89,8 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
   --least P            objects count from this probability on, in small pictures from this score on
   --batch N            windows that are looked at together
 {_OUTPUT}
-"""
-
-EXPLORE = f"""\
+""",
+    "explore": f"""\
 semfov explore: what is where
 
   semfov explore street.jpg
@@ -106,9 +107,29 @@ usage: semfov explore [PICTURE ...] [options]
                        picture to show this many new objects (default 0.1 and 0.01)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
-"""
+""",
+    "gaze": """\
+semfov gaze: where people look in a picture that they view freely
 
-LIVE = f"""\
+  semfov gaze poster.jpg --report poster.html
+  semfov gaze drafts/*.png --people 30 --seconds 5 --out drafts.csv
+  semfov gaze poster.jpg --out density.npy
+
+usage: semfov gaze [PICTURE ...] [options]
+
+  PICTURE              photographs, or folders of them (none: an embedded scene)
+  --detector NAME      the detector whose features are read: yolov3-tiny (default), yolox-nano, nanodet-plus-m-1.5x
+  --weights FILE       its weights, where they are not downloaded
+  --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
+  --seconds S          time for which each views a picture (default 3)
+  --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
+  --out FOLDER         scanpaths, and a heat map of each picture
+  --report PAGE.html   a page with heat map, contours and scanpaths, in which to step through the fixations
+
+It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
+pages of text or to interfaces. --help-all: all options.
+""",
+    "live": f"""\
 semfov live: one look at each frame of a video, a camera or a network stream
 
   semfov live --camera 0 --target cup
@@ -132,9 +153,8 @@ usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] 
   --out FILE           video to write, with gaze and belief, or windows and objects
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
-"""
-
-FIT = """\
+""",
+    "fit": """\
 semfov fit: fit all models to your own detector
 
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
@@ -155,9 +175,8 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
 scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
-"""
-
-LIST_DETECTORS = """\
+""",
+    "detectors": """\
 semfov detectors: detectors that can be named, or the classes of one
 
   semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
@@ -170,7 +189,9 @@ usage: semfov detectors [NAME]
 
 Weights are downloaded when a detector is first used, into $SEMFOV_CACHE or the user's cache folder. A detector without
 shipped models runs with --agent raw, or after semfov fit.
-"""
+""",
+}
+"""The help of each subcommand: one screen."""
 
 _COMMANDS = {
     "agent.classes lists": "`semfov detectors NAME` lists",

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from time import perf_counter
 
 from semfov.agents.fovea import cell_at
 from semfov.cli.agent import detector_classes, make_agent, one_class, several_classes
 from semfov.cli.options import LiveOptions, start_of
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
-from semfov.live import FrameRate, LivePerception
-from semfov.paths import FoveaMoment, Moment, WindowMoment, detections_in_words
+from semfov.live import LivePerception
+from semfov.paths import Moment, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
 _UNKNOWN_RATE = 15.0
 """Frames per second of the written video if the source does not give its own."""
+
+_WARM_UP = 3
+"""Number of first frames that take longer than the others, because the detector gets ready; they have no rate."""
 
 
 def look_live(options: LiveOptions) -> int:
@@ -30,12 +35,14 @@ def look_live(options: LiveOptions) -> int:
     check(fits, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", options.out)
     start = start_of(options.start)
     _sought(options, detector_classes(options))
-    stream = _open_live(options)
+    source = options.source if options.camera is None else options.camera
+    assert source is not None
+    stream = open_stream(source, options.frames)
     agent = make_agent(options)
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
     running = agent.live(_sought(options, agent.classes[1:]), start=first, **settings)
-    written = watch(running, stream, options.out)
+    written = _watch(running, stream, options.out)
     if written is not None:
         print(f"written:\n  {written}")
     return 0
@@ -46,49 +53,46 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
     return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
 
 
-def _open_live(options: LiveOptions) -> Stream:
-    """Open the video, the camera or the stream that the options name."""
-    source = options.source if options.camera is None else options.camera
-    assert source is not None
-    return open_stream(source, options.frames)
-
-
-def watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
+def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:
     """Look at every frame, print detections and belief until Ctrl-C, and return the path of the video, if any."""
     if path is not None:
         path = path if path.suffix and not path.is_dir() else path / f"live{video_suffix()}"
-    rate = FrameRate()
+    count, began, ends = 0, 0.0, deque[float](maxlen=20)
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add:
         try:
             for picture in stream.frames:
                 moment = live.step(picture.image)
-                rate.add()
+                count += 1
+                if count >= _WARM_UP:
+                    ends.append(perf_counter())
+                    began = began or ends[0]
+                rate = _rate(len(ends) - 1, ends[-1] - ends[0]) if ends else ""
                 print(f"  {_moment_line(moment)}  {rate}", flush=True)
                 if add is not None:
                     add(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
         except KeyboardInterrupt:
             print("  stopped")
-    print(rate.summary())
+    mean = _rate(count - _WARM_UP, ends[-1] - began) if ends else ""
+    print(f"{count} frame{'' if count == 1 else 's'}{mean and f', {mean} after the first {_WARM_UP}'}")
     return path
+
+
+def _rate(frames: int, seconds: float) -> str:
+    return f"{frames / seconds:.1f} frames/s" if frames > 0 and seconds > 0 else ""
 
 
 def _moment_line(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
-    if isinstance(moment, WindowMoment):
-        x, y = moment.window.centre(moment.lattice)
-        look = f"{moment.number:4d}  at ({x:.0f}, {y:.0f}) × {moment.window.fixation[2]:.2f}: "
-        if moment.examined is None:
-            look += detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)
-        else:
-            look += f"closely, p {moment.examined.place:.2f} there"
-        return f"{look:60s}  {moment.describe()}"
-    assert isinstance(moment, FoveaMoment)
-    best = int(moment.probability.argmax())
-    row, column = divmod(moment.cell, moment.grid.columns)
-    detections = detections_in_words(moment.detections, moment.classes, 2, CONFIDENT)
-    look = f"{moment.number:4d}  at ({column}, {row}): {detections}"
-    if moment.closer is not None:
-        look = f"{moment.number:4d}  closely at ({column}, {row}): p {moment.closer.place:.2f} there"
-    row, column = divmod(best, moment.grid.columns)
-    return f"{look:60s}  {moment.describe()}, most likely at ({column}, {row})"
+    row, believed = moment.rows()[-1], moment.belief_map(len(moment) - 1)
+    if believed is None:
+        at, likely = f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}", ""
+    else:
+        columns = believed[0].columns
+        at = f"({row['column']}, {row['row']})"
+        likely = f", most likely at ({row['highest_cell'] % columns}, {row['highest_cell'] // columns})"
+    if moment.examined is None:
+        look = f"at {at}: {detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)}"
+    else:
+        look = f"closely at {at}: p {moment.examined.place:.2f} there"
+    return f"{f'{moment.number:4d}  {look}':60s}  {moment.describe()}{likely}"

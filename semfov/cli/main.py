@@ -6,75 +6,72 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli import help as texts
-from semfov.cli.options import DetectorsOptions, ExploreOptions, FindOptions, LiveOptions, SearchOptions
-from semfov.runs.command import GOES_ON, make_parser, run_command
 from semfov.version import __version__
 
+_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
 
-@dataclass(frozen=True)
-class _Subcommand:
-    """A subcommand."""
+_SUBCOMMANDS: dict[str, tuple[str, str]] = {
+    "search": _PICTURES,
+    "find": _PICTURES,
+    "explore": _PICTURES,
+    "live": ("source", "video file, or address"),
+    "gaze": _PICTURES,
+    "fit": ("model", "the detector: a name or a file, as for semfov.load_detector"),
+    "detectors": ("name", "detector, or folder of models"),
+}
+"""The positional argument of each subcommand, and its text."""
 
-    text: str
-    options: Callable[[], type[Any]]
-    run: Callable[[Any], int | None]
-    positional: tuple[str, str]
-    goes_on: str = ""
+_LOOKING = "search", "find", "explore", "live"
 
 
-def _pictures(options: Any) -> int:
+def options_of(name: str) -> type[Any]:
+    """The options of a subcommand, imported when they are asked for: help and mistakes need no tensors."""
+    if name == "fit":
+        from semfov.fit.settings import FitDetectorConfig
+
+        return FitDetectorConfig
+    from semfov.cli import options
+
+    by_name: dict[str, type[Any]] = {
+        "search": options.SearchOptions,
+        "find": options.FindOptions,
+        "explore": options.ExploreOptions,
+        "live": options.LiveOptions,
+        "gaze": options.GazeOptions,
+        "detectors": options.DetectorsOptions,
+    }
+    return by_name[name]
+
+
+def _run(name: str, options: Any) -> int | None:
+    """Run a subcommand; what it needs is imported now."""
+    if name == "fit":
+        from semfov.fit.detector import fit_folder
+
+        fit_folder(options)
+        return None
+    if name == "live":
+        from semfov.cli.live import look_live
+
+        return look_live(options)
+    if name == "gaze":
+        from semfov.cli.gaze import predict_gaze
+
+        return predict_gaze(options)
+    if name == "detectors":
+        from semfov.cli.detectors import list_detectors
+
+        return list_detectors(options)
     from semfov.cli.search import look_at
 
     return look_at(options)
-
-
-def _live(options: Any) -> int:
-    from semfov.cli.live import look_live
-
-    return look_live(options)
-
-
-def _fit_options() -> type[Any]:
-    from semfov.fit.detector_settings import FitDetectorConfig
-
-    return FitDetectorConfig
-
-
-def _fit(options: Any) -> None:
-    from semfov.fit.detector import fit_folder
-
-    fit_folder(options)
-
-
-def _detectors(options: Any) -> int:
-    from semfov.cli.detectors import list_detectors
-
-    return list_detectors(options)
-
-
-_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
-_MODEL = ("model", "the detector: a name or a file, as for semfov.load_detector")
-
-_SUBCOMMANDS: dict[str, _Subcommand] = {
-    "search": _Subcommand(texts.SEARCH, lambda: SearchOptions, _pictures, _PICTURES),
-    "find": _Subcommand(texts.FIND, lambda: FindOptions, _pictures, _PICTURES),
-    "explore": _Subcommand(texts.EXPLORE, lambda: ExploreOptions, _pictures, _PICTURES),
-    "live": _Subcommand(texts.LIVE, lambda: LiveOptions, _live, ("source", "video file, or address")),
-    "fit": _Subcommand(texts.FIT, _fit_options, _fit, _MODEL, GOES_ON),
-    "detectors": _Subcommand(
-        texts.LIST_DETECTORS, lambda: DetectorsOptions, _detectors, ("name", "detector, or folder of models")
-    ),
-}
-"""The subcommands by name. What they need is imported when they run."""
-
-_LOOKING = "search", "find", "explore", "live"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,23 +86,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("--help", "-h", "--help-all"):
         print(texts.OVERVIEW, end="")
         return 0
-    refused = _of_other_commands(_SUBCOMMANDS[name], rest) if name in _SUBCOMMANDS else _unknown(name)
+    if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
+        print(texts.HELP[name], end="")
+        return 0
+    refused = _of_other_commands(name, rest) if name in _SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
-    command = _SUBCOMMANDS[name]
-    if "--help" in rest or "-h" in rest:
-        print(command.text, end="")
-        return 0
-    options, program = command.options(), f"semfov {name}"
+    from semfov.runs.command import GOES_ON, make_parser, run_command
+
+    options, positional, program = options_of(name), _SUBCOMMANDS[name], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
-        usage = command.text.partition("\nusage:")[0]
-        make_parser(options, usage, command.positional, program).print_help()
+        usage = texts.HELP[name].partition("\nusage:")[0]
+        make_parser(options, usage, positional, program).print_help()
         return 0
     words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
-    names: dict[str, Any] = {"positional": command.positional, "program": program, "goes_on": command.goes_on}
+    names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": GOES_ON if name == "fit" else ""}
     with _plain_warnings(words):
-        return run_command(command.run, options, command.text, rest, words=words, **names)
+        return run_command(partial(_run, name), options, texts.HELP[name], rest, words=words, **names)
 
 
 def _unknown(name: str) -> str:
@@ -119,21 +117,17 @@ def _unknown(name: str) -> str:
     return f"unknown command {name!r}; {hint}"
 
 
-def _of_other_commands(command: _Subcommand, rest: Sequence[str]) -> str | None:
+def _of_other_commands(own: str, rest: Sequence[str]) -> str | None:
     """What to say about an option that only other subcommands have; None if there is none."""
+    if own not in _LOOKING:
+        return None
+    names = {each: {field.name for field in fields(options_of(each))} - {_SUBCOMMANDS[each][0]} for each in _LOOKING}
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
-        having = [
-            name for name in _LOOKING if option in _options(_SUBCOMMANDS[name]) and option not in _options(command)
-        ]
-        if having and command in map(_SUBCOMMANDS.get, _LOOKING):
+        having = [each for each in _LOOKING if option in names[each] - names[own]]
+        if having:
             return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
-
-
-def _options(command: _Subcommand) -> set[str]:
-    """Names of the options of a subcommand."""
-    return {field.name for field in fields(command.options())} - {command.positional[0]}
 
 
 @contextmanager

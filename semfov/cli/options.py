@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from semfov.agent import How
-from semfov.agents.limits import MOST_PASSES
+from semfov.agents.episode import MOST_PASSES
+from semfov.agents.picture import How
 from semfov.errors import InputError
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
 from semfov.runs.workers import Where
@@ -176,6 +176,32 @@ class LiveOptions(AgentOptions):
     give_up: Share | None = None
     closer: _MostCloserLooks | None = None
     out: Path | None = None
+
+
+@dataclass(frozen=True)
+class GazeOptions(Settings):
+    """Predict where people look.
+
+    Args:
+        pictures: photographs, or folders of them (none: an embedded scene).
+        detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
+        weights: file of the weights, for a detector whose weights are not downloaded.
+        people: number of viewers whose scanpaths are drawn.
+        seconds: time in seconds for which each views a picture.
+        seed: seed of all draws.
+        out: file of scanpaths, `.csv`; of the density of one picture, `.npy`, `.tif` or `.png`; or a folder for
+            scanpaths and a heat map of each picture.
+        report: HTML page to write, in which to step through the fixations.
+    """
+
+    pictures: tuple[str, ...] = ()
+    detector: str = AgentOptions.detector
+    weights: Path | None = None
+    people: Annotated[int, Range(1, 1000)] = 15
+    seconds: Annotated[float, Range(0.1, 60)] = 3.0
+    seed: Seed = 0
+    out: Path | None = None
+    report: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,9 @@ from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of, result_row
 from semfov.cli.sources import PictureSource
 from semfov.cli.text import looks_text, outcome_text
-from semfov.paths import GazeRecord, Scanpath, ZoomPath
-from semfov.report import episode_data, zoom_data
-from semfov.viz.animation import film_of
+from semfov.paths import GazeRecord, Scanpath
 from semfov.viz.belief import plot_belief_bars, plot_belief_strip
-from semfov.viz.scanpath import plot_foveated_strip, plot_scanpath
+from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import save_figure
 
@@ -39,33 +37,23 @@ class PictureOutcome:
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
-def _drawings_of(options: PictureOptions) -> tuple[Drawing, ...]:
-    """The figures to draw: those that are named, or the usual ones if the output is a folder."""
-    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
-    return usual if options.draw is None else options.draw
-
-
 def picture_outcome(
     record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
 ) -> PictureOutcome:
     """Make the text, the row, the part of a page and the figures of a record, as the options say."""
-    drawings = _drawings_of(options)
-    views: list[Tensor] = []
-    if isinstance(record, Scanpath) and (options.report or {"views", "animation"} & set(drawings)):
-        views = record.views()
+    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
+    drawings = usual if options.draw is None else options.draw
     text = outcome_text(record, source.name, seconds)
     row = episode = None
     if options.out is not None:
         row = result_row(record, source.name, seconds, kind_of(options.out), source.file)
     if options.report is not None:
         name = Path(source.name).name
-        if isinstance(record, Scanpath):
-            episode = episode_data(record, record.image, views, name=name, boxes=source.boxes)
-        else:
-            # A scene has no more pixels than the record keeps.
-            whole = source.file if source.scene is None else source.scene.image
-            episode = zoom_data(record, whole if isinstance(record, ZoomPath) else None, name=name, settings=settings)
-    figures = _draw_episode(record, source.boxes, views, drawings)
+        # Others have no more pixels than the record keeps.
+        whole = source.file if source.scene is None else source.scene.image
+        picture = whole if record.how == "windows" else None
+        episode = record.page_data(picture, name=name, settings=settings, boxes=source.boxes)
+    figures = _draw_episode(record, source.boxes, drawings)
     return PictureOutcome(
         ended="looked at" if record.decision is None else record.decision.outcome,
         text=f"{text}\n{looks_text(record)}" if options.looks else text,
@@ -76,16 +64,13 @@ def picture_outcome(
     )
 
 
-def _draw_episode(
-    record: GazeRecord, boxes: Tensor | None, views: list[Tensor], drawings: Sequence[Drawing]
-) -> dict[str, bytes]:
+def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:
     """Draw those figures and the animation that a record of this kind has; returns the files by name."""
     if not drawings:
         return {}
-    figures: dict[str, Callable[[], Any]] = {"scanpath": record.plot}
+    figures: dict[str, Callable[[], Any]] = {"scanpath": lambda: record.plot(boxes=boxes)}
     if isinstance(record, Scanpath):
-        figures["scanpath"] = lambda: plot_scanpath(record, boxes=boxes)
-        figures["views"] = lambda: plot_foveated_strip(record, views)
+        figures["views"] = lambda: plot_foveated_strip(record)
         if record.target is not None:
             figures["belief"] = lambda: plot_belief_strip(record)
             figures["belief_bars"] = lambda: plot_belief_bars(record)
@@ -95,9 +80,6 @@ def _draw_episode(
     with tempfile.TemporaryDirectory() as folder:
         drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
         if "animation" in drawings:
-            path = Path(folder) / "animation.gif"
-            if isinstance(record, Scanpath):
-                drawn += film_of(record, views=views, boxes=boxes).save(path)
-            else:
-                drawn.append(Path(record.animate(path)))
+            film: Any = record.animate(boxes=boxes)
+            drawn += film.save(Path(folder) / "animation.gif")
         return {path.name: path.read_bytes() for path in drawn}

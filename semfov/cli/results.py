@@ -45,10 +45,15 @@ def result_row(
     if kind == ".geojson":
         collection = record.to_geojson(source=file)
         row["coordinates"] = collection["coordinates"]
-        row["parts"] = [_of_picture(each, name) for each in collection["features"]]
+        row["parts"] = [
+            {**each, "properties": {"picture": name, **each["properties"]}} for each in collection["features"]
+        ]
     elif kind == ".coco.json":
         row["categories"] = _categories(record.classes[1:])
-        row["parts"] = [_area(each) for each in record.to_coco(0, row["categories"])]
+        row["parts"] = [
+            {**each, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
+            for each in record.to_coco(0, row["categories"])
+        ]
     return row
 
 
@@ -135,13 +140,3 @@ def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:
     if {canonical_name(name) for name in classes} <= {canonical_name(each["name"]) for each in categories}:
         return categories
     return [{"id": number, "name": name} for number, name in enumerate(classes, 1)]
-
-
-def _area(annotation: dict[str, Any]) -> dict[str, Any]:
-    """An annotation as data sets have it, with its area."""
-    *_, width, height = annotation["bbox"]
-    return {**annotation, "area": width * height, "iscrowd": 0}
-
-
-def _of_picture(feature: dict[str, Any], name: str) -> dict[str, Any]:
-    return {**feature, "properties": {"picture": name, **feature["properties"]}}

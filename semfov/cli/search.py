@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, get_args
 
-from semfov.agent import PictureLike
+from semfov.agents.picture import PictureLike
 from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
@@ -29,9 +29,9 @@ class _SearchJob(PictureJob):
         super().__init__(options)
         self.start = _check(options)
         classes = detector_classes(options)
-        weights = None if classes is None else meant(options, classes)
+        weights = None if classes is None else _meant(options, classes)
         self.agent = make_agent(options)
-        self.weights = meant(options, self.agent.classes[1:]) if weights is None else weights
+        self.weights = _meant(options, self.agent.classes[1:]) if weights is None else weights
         self.target = next(iter(self.weights))
         self.title = f"search for “{self.target}”"
 
@@ -43,9 +43,10 @@ class _SearchJob(PictureJob):
         """Search a picture."""
         agent, options, weights = self.agent, self.options, self.weights
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
-        kind = agent.kind_of_look(picture, shared["how"])
-        if kind != "fovea":
-            _only_likeliest(weights)
+        foveal = len(weights) > 1 or self.start is not None or shared.get("shifts") is not None
+        kind = agent.kind_of_look(picture, shared["how"], foveal=foveal)
+        if kind != "fovea" and len(weights) > 1:
+            print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
         start = start_beside(agent, source, options.seed) if beside else self.start
@@ -115,7 +116,7 @@ def _check(options: PictureOptions) -> Any:
     return start_of(options.start)
 
 
-def meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
+def _meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
     """The classes that a target may mean, each with a weight, the most likely first."""
     target = options.target or ""
     try:
@@ -138,9 +139,3 @@ def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
         if len([class_index(name.strip(), classes) for name in names]) > 1:
             return "; a search is for one class, and `semfov find` takes several"
     return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"
-
-
-def _only_likeliest(weights: dict[str, float]) -> None:
-    """Say so if only the most likely class of a description is searched for."""
-    if len(weights) > 1:
-        print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")

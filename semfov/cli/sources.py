@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.agent import ActivePerception, How, PictureLike
+from semfov.agent import ActivePerception
+from semfov.agents.picture import How, PictureLike
 from semfov.belief.grid import Grid
 from semfov.data.large import picture_size
 from semfov.data.sources import Picture, is_video, picture_files

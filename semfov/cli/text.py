@@ -18,7 +18,9 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
-    lines = [f"{name}, {width} × {height} px: {_headline(record)}"]
+    decision = record.decision
+    headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
+    lines = [f"{name}, {width} × {height} px: {headline}"]
     lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
     if record.decision is None:
         lines += _regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
@@ -26,15 +28,10 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     return "\n".join(lines)
 
 
-def _headline(record: GazeRecord) -> str:
-    if record.decision is not None:
-        return _decision_text(record, record.decision)
-    return record.objects_in_words()
-
-
 def _decision_text(record: GazeRecord, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    name, probability = record.target_name, f"{record.decided_by} {decision.probability:.2f}"
+    what = "probability that the picture holds it:" if record.decided_by == "probability" else record.decided_by
+    name, probability = record.target_name, f"{what} {decision.probability:.2f}"
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"
@@ -72,7 +69,7 @@ def _objects_lines(record: GazeRecord) -> list[str]:
 def _box_text(box: Sequence[float]) -> str:
     """Corners of a box in whole pixels.
 
-    >>> box_text((380.2, 190.0, 443.9, 276.4))
+    >>> _box_text((380.2, 190.0, 443.9, 276.4))
     '380,190–444,276'
     """
     x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
@@ -95,7 +92,7 @@ def _regions_lines(scanpath: Scanpath) -> list[str]:
 
 
 def looks_text(record: GazeRecord) -> str:
-    """The looks as a table: where, which part of the picture, what was detected, and how long it took."""
+    """The looks as a table: where, which part of the picture, what was detected, and when it ended."""
     rows = [
         [
             str(look.number),
@@ -103,13 +100,11 @@ def looks_text(record: GazeRecord) -> str:
             "the whole picture" if record.is_whole(look.region) else _box_text(look.region),
             detections_in_words(look.detections, record.classes, score=CONFIDENT),
             "" if look.value is None else f"{look.value:.3f}",
-            "" if look.seconds is None else f"{1000 * look.seconds:.0f}",
+            "" if look.seconds is None else f"{look.seconds:.2f}",
         ]
         for look in record
     ]
-    head = ["look", "at (x, y)", "shows", "detections", "value", "ms"]
-    if not any(row[-1] for row in rows):  # windows have no times
-        rows, head = [row[:-1] for row in rows], head[:-1]
+    head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
@@ -125,25 +120,6 @@ def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def columns(names: Sequence[str], width: int = 100) -> str:
-    r"""Names in columns, in order down each column.
-
-    Args:
-        names: the names.
-        width: width of the text in letters.
-
-    Returns:
-        Lines of text.
-
-    >>> columns(["cup", "fork", "oven"], 12)
-    'cup   oven\nfork'
-    """
-    wide = max(map(len, names)) + 2
-    across = max(1, width // wide)
-    down = -(-len(names) // across)
-    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
 
 
 def plain_name(name: str) -> str:

@@ -38,7 +38,7 @@ def _read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = Path(folder, "instances.json")
     ...     _ = path.write_text('{"images": [], "annotations": [], "categories": []}')
-    ...     coco, digest = read_annotations(path)
+    ...     coco, digest = _read_annotations(path)
     >>> coco.getImgIds()
     []
     """

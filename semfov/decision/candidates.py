@@ -107,22 +107,11 @@ class CandidatePlaces(ABC, Generic[LookType]):
         raise NotImplementedError(f"{type(self).__name__} has no belief towards which closer looks could fade")
 
 
-@dataclass(frozen=True)
-class _Dismissed:
-    """Boxes `(2, 4)` and cells `(X·Y,)` of a place that was examined at a frame."""
-
-    frame: int
-    boxes: Tensor
-    cells: Tensor
-
-
 class CandidateCells(CandidatePlaces[Step]):
-    """Cells that seem to hold the target of one search.
+    """Cells that seem to hold the target of one search: those with the largest product of probability and evidence.
 
-    A candidate is the cell with the largest product of probability and evidence. Detections that overlap a box that was
-    examined by half, and the cells that it covers, are left out. A place is due when a fixated cell is nearly as
-    probable as the most probable one (`place_known`), or when no other look follows.
-
+    Detections that overlap a box that was examined by half, and the cells that it covers, are left out. A place is due
+    when a fixated cell is nearly as probable as the most probable one (`place_known`), or when no other look follows.
     In a scene that changes, evidence of earlier frames counts less, and places that were examined are listed again when
     half of the evidence is left (`semfov.episode.Forgetting`).
     """
@@ -132,7 +121,7 @@ class CandidateCells(CandidatePlaces[Step]):
         self.grid, self._target = grid, target
         self._frame = 0
         self._looks: list[tuple[int, Detections]] = []  # with their frames
-        self._dismissed: list[_Dismissed] = []
+        self._dismissed: list[tuple[int, Tensor, Tensor]] = []  # frame, boxes (2, 4) and cells (X·Y,) of each place
 
     _step: Step
 
@@ -163,7 +152,9 @@ class CandidateCells(CandidatePlaces[Step]):
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """The most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
-        cells = self._open(self._step.belief.probability(self._target)[0])
+        cells = self._step.belief.probability(self._target)[0]
+        for _, _, examined in self._dismissed:
+            cells = cells.masked_fill(examined, 0)
         if not (last or bool(place_known(cells, self._step.visited[0], least))):
             return None
         looks, target = self._left(), self.target
@@ -180,7 +171,7 @@ class CandidateCells(CandidatePlaces[Step]):
         boxes = torch.stack([candidate.box, box])
         covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
         covered[candidate.cell] = True
-        self._dismissed.append(_Dismissed(self._frame, boxes, covered))
+        self._dismissed.append((self._frame, boxes, covered))
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look, after the last fixation."""
@@ -191,7 +182,7 @@ class CandidateCells(CandidatePlaces[Step]):
         self._frame += 1
         oldest = self._frame - self.forgetting.span
         self._looks = [(frame, look) for frame, look in self._looks[-_MOST_LOOKS:] if frame >= oldest]
-        self._dismissed = [place for place in self._dismissed if place.frame >= oldest]
+        self._dismissed = [place for place in self._dismissed if place[0] >= oldest]
 
     def move(self, look: CloseUp, box: Tensor) -> CloseUp:
         """The record of a closer look whose target has moved to another box, and its cell."""
@@ -201,12 +192,6 @@ class CandidateCells(CandidatePlaces[Step]):
         """Present probability that the target is in the cell of a closer look."""
         return float(self._step.belief.probability(self._target)[0, look.cell])
 
-    def _open(self, cells: Tensor) -> Tensor:
-        """The probabilities, with 0 for the cells that were examined."""
-        for place in self._dismissed:
-            cells = cells.masked_fill(place.cells, 0)
-        return cells
-
     def _left(self) -> list[Detections]:
         """The looks with faded scores, without the detections of objects that were examined."""
         looks = [
@@ -215,5 +200,5 @@ class CandidateCells(CandidatePlaces[Step]):
         ]
         if not self._dismissed:
             return looks
-        boxes = torch.cat([place.boxes for place in self._dismissed])
+        boxes = torch.cat([boxes for _, boxes, _ in self._dismissed])
         return [replace(look, mask=look.mask & (box_iou(look.boxes[0], boxes) < SAME).all(-1)) for look in looks]

@@ -26,6 +26,10 @@ NEARLY = 0.9
 """A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
 
 
+ABSENT = 0.5
+"""A search that ends without a find decides that the target is absent below this probability of the picture."""
+
+
 @dataclass(frozen=True)
 class Decision:
     """Decision of a search; box `(4,)`."""
@@ -56,7 +60,7 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
     probable as the most probable one (`NEARLY`) and probable enough itself. A search gives up if no remaining cell is
     probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
-    then absent, unless the image holds it with a probability of at least one half.
+    then absent, unless the image holds it with a probability of at least `ABSENT`.
 
     Shapes: target `(A,)` → `(A,)`.
     """
@@ -74,7 +78,7 @@ def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Threshold
 
     Shapes: presence `(A,)`, looked `(A,)`, left `(A,)` → `(A,)`.
     """
-    rest = torch.where(left < thresholds.give_up, torch.where(presence < 0.5, 2, 3), 0)
+    rest = torch.where(left < thresholds.give_up, torch.where(presence < ABSENT, 2, 3), 0)
     return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
 
 
@@ -133,7 +137,7 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
     """Decide a search after closer looks.
 
     It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
-    enough; otherwise the target is absent if the picture holds it with a probability below one half.
+    enough; otherwise the target is absent if the picture holds it with a probability below `ABSENT`.
 
     >>> verified([0.3, 0.96], 0.9, 0.9, over=False), verified([0.92], 0.9, 0.9, over=False)
     (1, 0)
@@ -145,7 +149,7 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
         return OUTCOMES.index("found")
     if not over:
         return 0
-    return OUTCOMES.index("absent") if presence < 0.5 else len(OUTCOMES) - 1
+    return OUTCOMES.index("absent") if presence < ABSENT else len(OUTCOMES) - 1
 
 
 def outcome_of(

@@ -174,10 +174,13 @@ class Verifier(Generic[LookType]):
 
     @property
     def presence(self) -> float:
-        """Probability that the picture holds the target: the largest after a closer look, or that without them."""
+        """Probability that the picture holds the target: after the look at the best place, or that without one."""
         without = self.places.presence
-        recent = (each for each in self.verdicts if self._recent(each))
-        return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
+        recent = [(self._chance(each), each) for each in self.verdicts if self._recent(each)]
+        if not recent:
+            return without
+        _, best = max(recent, key=lambda pair: pair[0])
+        return self._faded(best.look.presence, without, best.age)
 
     @property
     def best(self) -> CloseUp:
@@ -246,7 +249,7 @@ def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
 
     >>> box, scores = torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]])
     >>> detections = Detections(box, scores, torch.ones(1, 1).bool())
-    >>> follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
+    >>> _follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
     tensor([ 3.,  0., 11.,  8.])
 
     Shapes: box `(4,)` → `(4,)`.

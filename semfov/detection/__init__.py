@@ -2,6 +2,7 @@
 
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.objects import LEAST, Objects, merge_boxes
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
@@ -12,6 +13,7 @@ __all__ = [
     "Candidates",
     "Detections",
     "Detector",
+    "FeatureMaps",
     "LEAST",
     "Objects",
     "Placement",

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.darknet_config import Section
+from semfov.detection.feature_maps import NetworkStep, landmarks
 from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
 from semfov.io.files import check_regular
@@ -328,8 +329,8 @@ class Darknet(nn.Module):
         - input: `(B, C, H, W)`
         - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
 
-    >>> from semfov.detection.darknet_config import yolov3_tiny
-    >>> [tuple(m.shape) for m in Darknet(yolov3_tiny())(torch.zeros(1, 3, 64, 96))]
+    >>> from semfov.detection.darknet_config import _yolov3_tiny
+    >>> [tuple(m.shape) for m in Darknet(_yolov3_tiny())(torch.zeros(1, 3, 64, 96))]
     [(1, 255, 2, 3), (1, 255, 4, 6)]
 
     Shapes: input_size `(width, height)`.
@@ -377,6 +378,20 @@ class Darknet(nn.Module):
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
         last = self.sources[self.sources[head][0]][0]
         return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, last + 1)[last]
+
+    def landmarks(self) -> dict[str, int]:
+        """Numbers of the layers whose maps have a name by their place (`semfov.detection.feature_maps`)."""
+        steps = []
+        same: dict[int, int] = {}  # layers that hand on the map of another one
+        for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
+            reads = [same.get(source, source) for source in sources]
+            if len(reads) == 1 and (isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)):
+                same[index] = reads[0]
+                continue
+            names = tuple(str(read) for read in reads if read >= 0)
+            stride, convolution = round(float(self.steps[index])), isinstance(layer, Convolution)
+            steps.append(NetworkStep(str(index), stride, names, convolution))
+        return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:
         """sha256 of the sections."""

@@ -81,7 +81,7 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
     Raises:
         DataError: a line is none of these.
 
-    >>> [s.kind for s in parse_cfg("[net]\nwidth=416\n\n[maxpool]\nsize=2")]
+    >>> [s.kind for s in _parse_cfg("[net]\nwidth=416\n\n[maxpool]\nsize=2")]
     ['net', 'maxpool']
     """
     sections: list[Section] = []

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -156,13 +156,19 @@ class _NetworkGraph(Graph):
         return self.add("Cast", self.add("Concat", *pair, axis=2), to=1)
 
 
-def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None) -> Any:
-    """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None)."""
+def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()) -> Any:
+    """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None).
+
+    The maps of `layers` are further outputs, `layer_0`, `layer_1`, ….
+    """
     try:
         from onnx import TensorProto, helper
     except ImportError as error:
         raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
-    graph = _build(network)
+    graph, names = _build(network)
+    for layer in layers:
+        graph.add("Identity", names[layer])
+        graph.name_last(f"layer_{layer}")
     batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
     boxes, classes = None if size else "boxes", network.heads[0].classes
     shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
@@ -171,7 +177,10 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
             graph.nodes,
             name,
             [helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])],
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in _OUTPUTS],
+            [
+                *(helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in _OUTPUTS),
+                *(helper.make_tensor_value_info(f"layer_{layer}", TensorProto.FLOAT, None) for layer in layers),
+            ],
             list(graph.constants.values()),
         ),
         producer_name="semfov",
@@ -180,8 +189,8 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
     )
 
 
-def _build(network: Darknet) -> _NetworkGraph:
-    """The whole graph, from `images` to `_OUTPUTS`."""
+def _build(network: Darknet) -> tuple[_NetworkGraph, dict[int, str]]:
+    """The whole graph, from `images` to `_OUTPUTS`, and the names of the outputs of all layers."""
     graph = _NetworkGraph()
     names = {-1: "images"}
     heads = []
@@ -192,7 +201,7 @@ def _build(network: Darknet) -> _NetworkGraph:
     for name, outputs in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
         graph.add("Concat", *outputs, axis=1)
         graph.name_last(name)
-    return graph
+    return graph, names
 
 
 class OnnxTwin:
@@ -206,7 +215,7 @@ class OnnxTwin:
         self.digest = digest
         self._versions: tuple[object, ...] | None = None
         self._same = False
-        self._opened: tuple[tuple[int, int], OnnxSession] | None = None
+        self._opened: dict[tuple[int, ...], tuple[tuple[int, int], OnnxSession]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OnnxTwin, (self.digest,)
@@ -242,22 +251,29 @@ class OnnxTwin:
 
     def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
+        return self.with_features(network, canvas, {})[0]
+
+    def with_features(
+        self, network: Darknet, canvas: Tensor, layers: Mapping[str, int]
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """The same, and the maps of layers by name, in one run."""
         network.check_image(canvas)
-        outputs = self._session(network)(canvas.float())
-        return Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+        outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
+        candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+        return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
 
-    def _session(self, network: Darknet) -> OnnxSession:
+    def _session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
         key = (os.getpid(), torch.get_num_threads())
-        if self._opened is None or self._opened[0] != key:
-            self._opened = key, self._open(network)
-        return self._opened[1]
+        if layers not in self._opened or self._opened[layers][0] != key:
+            self._opened[layers] = key, self._open(network, layers)
+        return self._opened[layers][1]
 
-    def _open(self, network: Darknet) -> OnnxSession:
+    def _open(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
         try:
-            path = exported(network, cache_folder() / "exported")
+            path = exported(network, cache_folder() / "exported", layers)
         except DataError:  # the cache cannot be written to
             with tempfile.TemporaryDirectory() as folder:
-                return OnnxSession(exported(network, Path(folder)), checked=False)
+                return OnnxSession(exported(network, Path(folder), layers), checked=False)
         return OnnxSession(path, checked=False)
 
 
@@ -269,14 +285,14 @@ def network_digest(network: Darknet) -> str:
     return digest.hexdigest()
 
 
-def exported(network: Darknet, folder: Path) -> Path:
+def exported(network: Darknet, folder: Path, layers: Sequence[int] = ()) -> Path:
     """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
-    source = json.dumps([network_digest(network), _VERSION, torch.__version__])
+    source = json.dumps([network_digest(network), _VERSION, torch.__version__, *layers])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
     whole = _whole(folder.glob(f"{key}.*.onnx"))
     if whole is not None:
         return whole
-    content = network_model(network, "darknet").SerializeToString()
+    content = network_model(network, "darknet", layers=layers).SerializeToString()
     path = folder / f"{key}.{hashlib.sha256(content).hexdigest()}.onnx"
     write_bytes(path, content)
     return path

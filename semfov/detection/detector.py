@@ -1,7 +1,7 @@
 """The interface of detectors."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
+from semfov.detection.feature_maps import FeatureMaps, no_features
 from semfov.detection.objects import LEAST
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
@@ -170,8 +171,48 @@ class Detector(StatedModule, ABC):
         canvas, placement = self.fit(images)
         return self.detect(canvas, placement)
 
-    def features(self, canvas: Tensor) -> Tensor:
-        """Compute the features that the first head reads.
+    def features(self, images: Tensor, layers: Sequence[str] | None = None) -> FeatureMaps:
+        """Detect objects in images, and keep feature maps of the same pass of the network.
+
+        Args:
+            images: `(B, 3, H, W)`, RGB in [0, 1].
+            layers: names of the maps (`FeatureMaps`), or of tensors of an ONNX model or layers of a Darknet cfg; None
+                for all that have a name.
+
+        Returns:
+            The maps by name, with the detections.
+
+        Raises:
+            InputError: the detector hides its feature maps, or has no map of this name.
+
+        Example::
+
+            semfov.load_detector("yolox-nano").features(images).maps["backbone8"]
+        """
+        canvas, placement = self.fit(images)
+        candidates, maps = self.propose_with_features(canvas, layers)
+        detections = select(candidates.precise(), placement, self.selection, self.background)
+        return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, detections)
+
+    def propose_with_features(
+        self, canvas: Tensor, layers: Sequence[str] | None = None
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """Compute all boxes of the head, and feature maps, in one pass.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+            layers: names of the maps, as for `features`.
+
+        Returns:
+            The boxes in canvas pixels, with their scores, and the maps by name.
+
+        Raises:
+            InputError: the detector hides its feature maps, or has no map of this name.
+        """
+        raise no_features(self.name)
+
+    def head_input(self, canvas: Tensor) -> Tensor:
+        """Compute the features that the first head reads, and nothing after them.
 
         Args:
             canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
@@ -180,7 +221,7 @@ class Detector(StatedModule, ABC):
             Features `(B, C, h, w)`.
 
         Raises:
-            InputError: the detector does not give access to its features, for instance because it is an ONNX model.
+            InputError: the detector does not give access to them, for instance because it is an ONNX model.
         """
         raise InputError(
             f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"

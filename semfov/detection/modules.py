@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import chosen, no_features, recorded, stride_of
 from semfov.detection.placement import Placement
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError, check_shape
@@ -29,6 +30,26 @@ class ModuleDetector(Detector):
         super().__init__(name, names, input_size, **options)
         self.model = model.eval()
         self._places, self._count = places, len(classes)
+
+    def feature_modules(self) -> dict[str, nn.Module]:
+        """Modules of the network that return feature maps, by what the maps are called before their stride."""
+        return {}
+
+    def propose_with_features(
+        self, canvas: Tensor, layers: Sequence[str] | None = None
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """Compute all boxes and feature maps in one pass."""
+        modules = self.feature_modules()
+        if not modules:
+            raise no_features(self.name)
+        with recorded(modules) as found:
+            candidates = self.propose(canvas)
+        maps = {
+            f"{place.rstrip('0123456789')}{stride_of(canvas.shape[-1], each.shape[-1])}": each
+            for place, several in found.items()
+            for each in several
+        }
+        return candidates, {layer: maps[layer] for layer in chosen(layers, [*maps], self.name)}
 
     def _pixels(self, canvas: Tensor) -> Tensor:
         """A canvas in the precision of the network; raises `InputError` for anything else."""

@@ -272,7 +272,7 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
     """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
 
-    >>> survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
+    >>> _survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
     array([0, 2])
 
     Shapes: better `(P,)`, worse `(P,)`.

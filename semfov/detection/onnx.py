@@ -12,7 +12,15 @@ from torch import Tensor
 
 from semfov.detection.class_names import COCO_CLASSES, keep_classes, named_outputs
 from semfov.detection.detector import Detector
-from semfov.detection.onnx_file import check_canvas, check_elements, model_digest, read_settings, with_input_size
+from semfov.detection.feature_maps import chosen, landmarks
+from semfov.detection.onnx_file import (
+    check_canvas,
+    check_elements,
+    model_digest,
+    network_steps,
+    read_settings,
+    with_input_size,
+)
 from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
@@ -67,6 +75,9 @@ class OnnxDetector(Detector):
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
+        self._layers: dict[str, str] | None = None
+        self._named_layers: tuple[str, ...] = ()
+        self._wide = session
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
@@ -79,6 +90,24 @@ class OnnxDetector(Detector):
         """Compute all boxes of the head on a canvas of bytes `(B, 3, H, W)`, converted directly to the input."""
         self._check_canvas(canvas)
         return self._run(self.preprocessing.of_bytes(canvas))
+
+    def propose_with_features(
+        self, canvas: Tensor, layers: Sequence[str] | None = None
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """Compute all boxes and feature maps in one run of a session that has the maps as further outputs."""
+        self._check_canvas(canvas)
+        if self._layers is None:
+            steps = network_steps(self.session.path, self.session.image, (canvas.shape[-1], canvas.shape[-2]))
+            inside = {step.name: step.name for step in steps if step.stride is not None}
+            self._layers, self._named_layers = inside | landmarks(steps), tuple(landmarks(steps))
+        wanted = self._named_layers if layers is None else layers
+        tensors = {layer: self._layers[layer] for layer in chosen(wanted, [*self._layers], self.name)}
+        if not set(tensors.values()) <= {name for name, _ in self._wide.outputs}:
+            self._wide = self.session.widened([*tensors.values()])
+        outputs = self._wide(self.preprocessing(canvas.detach()))
+        own = {name: outputs[name] for name, _ in self.session.outputs}
+        candidates = self.decode(own, (canvas.shape[-1], canvas.shape[-2]))
+        return candidates, {layer: outputs[name] for layer, name in tensors.items()}
 
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""

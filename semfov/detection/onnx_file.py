@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_heads import cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
@@ -230,3 +231,34 @@ def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int], strides:
     for output in graph.output:
         for side in output.type.tensor_type.shape.dim[1:2]:
             side.Clear()
+
+
+def with_outputs(path: Path, names: Iterable[str]) -> bytes:
+    """The content of a model with further tensors among its outputs; weights in other files stay there."""
+    import onnx
+
+    model = onnx.load(path, load_external_data=False)
+    have = {output.name for output in model.graph.output}
+    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names if name not in have)
+    return model.SerializeToString()
+
+
+def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[NetworkStep]:
+    """The steps of a model in order, with the strides of the maps that follow from `image`, of `(width, height)`."""
+    import onnx
+
+    model = _without_weights(onnx.load(path, load_external_data=False))
+    sides = next(value for value in model.graph.input if value.name == image).type.tensor_type.shape.dim
+    for side, size in zip(sides, (1, 3, canvas[1], canvas[0]), strict=True):
+        side.dim_value = size
+    graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+    shapes = {value.name: _dims(value) for value in [*graph.value_info, *graph.output]}
+    steps, reached = [], {image}  # stored weights are no maps
+    for node in graph.node:
+        reached.update(node.output if reached.intersection(node.input) else ())
+        for output in node.output:
+            shape = shapes.get(output, [])
+            is_map = output in reached and len(shape) == 4 and min(shape[2:]) > 1
+            stride = stride_of(canvas[0], shape[3]) if is_map else None
+            steps.append(NetworkStep(output, stride, tuple(node.input), node.op_type == "Conv"))
+    return steps

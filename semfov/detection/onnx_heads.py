@@ -147,7 +147,7 @@ def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Can
 def _decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR that returns one tensor.
 
-    >>> decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
+    >>> _decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
 
     Shapes: rows `(B, Q, 4 + K)`, canvas `(width, height)`.

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.onnx_file import MOST_BATCH, check_file
+from semfov.detection.onnx_file import MOST_BATCH, check_file, with_outputs
 from semfov.errors import DataError, InputError, check
 
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -30,7 +30,7 @@ class OnnxSession:
 
     Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
 
-    Shapes: providers `(name, options)`.
+    Shapes: providers `(name, options)`. `further` names tensors inside the model that are outputs too.
     """
 
     def __init__(
@@ -42,10 +42,11 @@ class OnnxSession:
         providers: Sequence[Provider] | None = None,
         spinning: bool = False,
         checked: bool = True,
+        further: Sequence[str] = (),
     ) -> None:
         import onnxruntime as ort
 
-        self.path, self.spinning = Path(path), spinning
+        self.path, self.spinning, self.further = Path(path), spinning, tuple(further)
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
         self.device = torch.device(device)
@@ -60,7 +61,12 @@ class OnnxSession:
         try:
             chosen = _providers(self.device) if self.providers is None else _available_providers(self.providers)
             # onnxruntime's fallback would print messages and try the same again.
-            self._session = ort.InferenceSession(fspath(path), options, providers=chosen, disable_fallback=1)
+            model: str | bytes = fspath(path)
+            if further:
+                model = with_outputs(self.path, further)
+                folder = "session.model_external_initializers_file_folder_path"
+                options.add_session_config_entry(folder, fspath(self.path.parent))
+            self._session = ort.InferenceSession(model, options, providers=chosen, disable_fallback=1)
         except InputError:
             raise
         except Exception as error:  # onnxruntime's own exceptions share no base class
@@ -111,7 +117,8 @@ class OnnxSession:
         if short:
             source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])
         runs = [self._run(part.contiguous()) for part in source.split(size)]
-        return {name: torch.cat([run[name] for run in runs])[:batch].to(image) for name, _ in self.outputs}
+        joined = runs[0] if len(runs) == 1 else {name: torch.cat([run[name] for run in runs]) for name in runs[0]}
+        return {name: joined[name][:batch].to(image) for name, _ in self.outputs}
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         feed = {self.image: image.numpy()} | {name: _EXTRA_INPUTS[name](image).numpy() for name in self._extra}
@@ -130,13 +137,23 @@ class OnnxSession:
         return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (self.path, self.threads, self.device, self.providers, self.spinning)
+        return _reopen, (self.path, self.threads, self.device, self.providers, self.spinning, self.further)
+
+    def widened(self, further: Sequence[str]) -> "OnnxSession":
+        """A session of the same model, with the same settings, that also returns tensors inside it."""
+        return _reopen(self.path, self.threads, self.device, self.providers, self.spinning, further)
 
 
 def _reopen(
-    path: Path, threads: int, device: torch.device, providers: Sequence[Provider] | None, spinning: bool
+    path: Path,
+    threads: int,
+    device: torch.device,
+    providers: Sequence[Provider] | None,
+    spinning: bool,
+    further: Sequence[str] = (),
 ) -> OnnxSession:
-    return OnnxSession(path, threads=threads, device=device, providers=providers, spinning=spinning, checked=False)
+    settings: dict[str, Any] = {"threads": threads, "device": device, "providers": providers, "spinning": spinning}
+    return OnnxSession(path, **settings, checked=False, further=further)
 
 
 def _available_providers(providers: Sequence[Provider]) -> list[Any]:

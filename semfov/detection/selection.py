@@ -2,14 +2,19 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates, score_vectors
 from semfov.errors import check, check_finite, check_number, check_whole, values_known
+
+_BLOCK = 128  # boxes that are compared with each other at once: their table stays in the cache of the processor
 
 
 @dataclass(frozen=True)
@@ -107,18 +112,34 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
 
 def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
     """Indices of the boxes that survive suppression, among boxes in descending order of confidence."""
-    from torchvision.ops import batched_nms, nms
+    if boxes.device.type != "cpu" or not values_known(boxes):
+        from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
 
-    def first(count: int) -> Tensor:
         if selection.per_class:
-            return batched_nms(boxes[:count], confidence[:count], labels[:count], selection.iou)
-        return nms(boxes[:count], confidence[:count], selection.iou)
+            return batched_nms(boxes, confidence, labels, selection.iou)[: selection.limit]
+        return nms(boxes, confidence, selection.iou)[: selection.limit]
+    corners, kinds, survivors = boxes.numpy(), labels.numpy(), np.zeros(0, np.int64)
+    for start in range(0, len(corners), _BLOCK):
+        block = np.arange(start, min(start + _BLOCK, len(corners)))
+        rivals = np.concatenate([survivors, block])
+        over = _overlaps(corners[rivals], corners[block], selection.iou)
+        if selection.per_class:
+            over &= kinds[rivals, None] == kinds[block]
+        beaten: NDArray[np.bool_] = over[: len(survivors)].any(axis=0)  # type: ignore[assignment]
+        for number, row in enumerate(over[len(survivors) :]):
+            if not beaten[number]:
+                beaten[number + 1 :] |= row[number + 1 :]
+        survivors = np.concatenate([survivors, block[~beaten]])
+        if len(survivors) >= selection.limit:
+            break
+    return torch.from_numpy(survivors[: selection.limit])
 
-    # A box is suppressed by more confident ones alone, so the first survivors are those of the first boxes. Time grows
-    # with the square of their number.
-    count = 8 * selection.limit
-    keep = first(count)
-    while len(keep) < selection.limit and count < len(boxes):
-        count *= 2
-        keep = first(count)
-    return keep[: selection.limit]
+
+def _overlaps(boxes: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], iou: float) -> NDArray[np.bool_]:
+    """Whether the intersection over union of each two boxes is above a limit; boxes `(M, 4)`, others `(N, 4)`."""
+    (x1, y1, x2, y2), (left, top, right, bottom) = boxes.T[:, :, None], others.T[:, None]
+    shared = (np.minimum(x2, right) - np.maximum(x1, left)).clip(0)
+    shared *= (np.minimum(y2, bottom) - np.maximum(y1, top)).clip(0)
+    together = (x2 - x1) * (y2 - y1) + (right - left) * (bottom - top) - shared
+    above: NDArray[np.bool_] = shared > iou * together
+    return above

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -110,6 +110,10 @@ class _TorchvisionDetector(ModuleDetector):
         best = places[candidates.classes.argmax(-1)]
         own = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
         return Candidates(own, candidates.classes)
+
+    def feature_modules(self) -> dict[str, nn.Module]:
+        """The backbone with its pyramid."""
+        return {"pyramid": cast(nn.Module, self.model.backbone)}
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""

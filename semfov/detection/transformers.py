@@ -88,6 +88,13 @@ class _TransformersDetector(ModuleDetector):
         candidates = decode_detr(logits, boxes, size) if self.softmax else decode_rtdetr(logits, boxes, size)
         return self._named(candidates)
 
+    def feature_modules(self) -> dict[str, nn.Module]:
+        """The convolutional backbone; a model of another kind has none."""
+        modules = dict(self.model.named_modules())
+        ends = "conv_encoder", "backbone"
+        found = [module for end in ends for name, module in modules.items() if name.rpartition(".")[2] == end]
+        return {"backbone": found[0]} if found else {}
+
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""
         own = {"softmax": self.softmax, "preprocessing": self.preprocessing.settings()}

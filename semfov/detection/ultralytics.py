@@ -49,6 +49,12 @@ class _UltralyticsDetector(ModuleDetector):
             digest=digest,
         )
 
+    def feature_modules(self) -> dict[str, nn.Module]:
+        """The layers that the head reads; a network without a list of layers has none."""
+        layers: Any = getattr(self.model, "model", None)
+        read = getattr(layers[-1], "f", None) if isinstance(layers, nn.Sequential) else None
+        return {f"head{place}": layers[place] for place in read} if isinstance(read, list | tuple) else {}
+
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         outputs = self.model(self._pixels(canvas))

@@ -8,6 +8,7 @@ from torch import Tensor
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_onnx import RUNTIMES, OnnxTwin, Runtime, network_digest
 from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import chosen, recorded
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import InputError, check
@@ -94,10 +95,20 @@ class YoloV3(Detector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        if self._onnxruntime(canvas):
+            assert self._twin is not None
+            return self._twin(self.network, canvas)
+        return self._propose_by_torch(canvas)
+
+    def _onnxruntime(self, canvas: Tensor) -> bool:
+        """Whether onnxruntime computes the network on this canvas; raises `InputError` for one without floats."""
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
-        if self._twin is not None and self._chosen(self._twin.obstacle_here(self.network, canvas)) == "onnxruntime":
-            return self._twin(self.network, canvas)
+        twin = self._twin
+        return twin is not None and self._chosen(twin.obstacle_here(self.network, canvas)) == "onnxruntime"
+
+    def _propose_by_torch(self, canvas: Tensor) -> Candidates:
+        """All boxes of all heads, by torch."""
         maps = self.network(canvas.to(next(self.network.parameters()).dtype))
         maps = [raw.float() if raw.dtype in HALVES else raw for raw in maps]
         size = (canvas.shape[-1], canvas.shape[-2])
@@ -110,7 +121,22 @@ class YoloV3(Detector):
             torch.cat([some.objectness for some in candidates if some.objectness is not None], 1),
         )
 
-    def features(self, canvas: Tensor) -> Tensor:
+    def propose_with_features(
+        self, canvas: Tensor, layers: Sequence[str] | None = None
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """Compute all boxes and feature maps in one pass; layers are also named by their number in the cfg."""
+        named = self.network.landmarks()
+        numbers = {**{str(n): n for n in range(len(self.network.layers))}, **named}
+        asked = [*named] if layers is None else layers
+        wanted = {layer: numbers[layer] for layer in chosen(asked, [*numbers], self.name)}
+        if self._onnxruntime(canvas):
+            assert self._twin is not None
+            return self._twin.with_features(self.network, canvas, wanted)
+        with recorded({layer: self.network.layers[number] for layer, number in wanted.items()}) as maps:
+            candidates = self._propose_by_torch(canvas)
+        return candidates, {layer: each[0] for layer, each in maps.items()}
+
+    def head_input(self, canvas: Tensor) -> Tensor:
         """Compute the input of the last convolution before the first head, by torch with any runtime."""
         return self.network.features(canvas.to(next(self.network.parameters()).dtype))
 

@@ -11,36 +11,26 @@ try:
 except ImportError:
     raise DataError('semfov.envs needs Gymnasium: pip install "semfov[envs]"') from None
 
-from semfov.envs.agents import MaskedRandom, PolicyAgent, Ran, ZoomPolicyAgent, run_agent
 from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv, ZoomExplore, ZoomSearch
 from semfov.envs.registration import register
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.envs.vector import GazeVectorEnv
-from semfov.envs.wrappers import BeliefObservation, GlimpseObservation, VectorBeliefObservation
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 
 register()
 
 __all__ = [
-    "BeliefObservation",
     "EpisodeEnv",
     "GazeEnv",
     "GazeExplore",
     "GazeSearch",
     "GazeVectorEnv",
-    "GlimpseObservation",
-    "MaskedRandom",
-    "PolicyAgent",
-    "Ran",
     "Scenery",
-    "VectorBeliefObservation",
     "ZoomEnv",
     "ZoomExplore",
-    "ZoomPolicyAgent",
     "ZoomScenery",
     "ZoomSearch",
     "open_scenery",
     "open_zoom_scenery",
     "register",
-    "run_agent",
 ]

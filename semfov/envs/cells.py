@@ -22,7 +22,7 @@ from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks, a
 from semfov.errors import check, check_whole
 from semfov.metrics.exploration import count_right
 from semfov.paths import Scanpath, Stimulus, trace
-from semfov.runs.search_protocol import Episode
+from semfov.runs.search_protocol import Trial
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation
 
@@ -165,7 +165,7 @@ class CellGazes(Gazes):
         scenery, episode, boxes = self.scenery, self.episodes[0], None
         if self._stimulus is None:
             self._stimulus = Stimulus.of(scenery.eye, scenery.image(episode.scene))
-        if isinstance(episode, Episode):
+        if isinstance(episode, Trial):
             objects = scenery.annotation(episode.scene)
             boxes = objects.boxes[objects.labels == episode.target]
         path = self.scanpath()
@@ -176,7 +176,7 @@ class CellGazes(Gazes):
         """The looks of the first episode, which are kept for pictures."""
         episode = self.episodes[0]
         grid, classes = self.scenery.grid(episode.scene), self.scenery.classes
-        searching = isinstance(episode, Episode)
+        searching = isinstance(episode, Trial)
         # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
         beside: Observer | None = Semantic(len(classes)) if searching else None
         with torch.inference_mode():
@@ -185,8 +185,8 @@ class CellGazes(Gazes):
     @torch.inference_mode()
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
         scenes = [episode.scene for episode in episodes]
-        self.targets[rows] = torch.tensor([episode.cue if isinstance(episode, Episode) else 0 for episode in episodes])
-        searching = isinstance(episodes[0], Episode)
+        self.targets[rows] = torch.tensor([episode.cue if isinstance(episode, Trial) else 0 for episode in episodes])
+        searching = isinstance(episodes[0], Trial)
         self.looks.enter(rows, scenes, self.targets[rows] if searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])

@@ -114,34 +114,6 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any]):
         """Store the looks of an episode that is not over."""
         self.gazes.close()
 
-    @property
-    def belief_space(self) -> spaces.Box:
-        """Space of `planes`."""
-        return self.gazes.belief_space
-
-    def planes(self) -> NDArray[np.float32]:
-        """The belief as planes over the scene.
-
-        Returns:
-            `(C, Y, X)`, float32 in [0, 1]. Where actions are cells: the probability of the target (in an exploration of
-            each class, background first), the cells that were fixated, and the cell of the gaze. Where they are
-            windows: the probability that closer looks find an object, and how closely each place was looked at.
-        """
-        planes: NDArray[np.float32] = self.gazes.planes(_ROW)[0]
-        return planes
-
-    def glimpse(self, side: int) -> NDArray[np.uint8]:
-        """The foveated image, or the image of the window, that the eye sees.
-
-        Args:
-            side: width and height in pixels.
-
-        Returns:
-            `(side, side, 3)`, RGB, uint8.
-        """
-        image: NDArray[np.uint8] = self.gazes.glimpses(_ROW, side)[0]
-        return image
-
     def _observed(self) -> tuple[Arrays, Arrays]:
         return _first(self.gazes.observe(_ROW)), _first(self.gazes.infos(_ROW))
 
@@ -157,8 +129,8 @@ class GazeEnv(EpisodeEnv):
         scenery: scenes, looks and belief (`open_scenery`), which several environments may share; None opens one.
         price: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or for a complete map.
-        belief: whether observations contain the belief (`planes`).
-        glimpse: side in pixels of the foveated image that observations contain (`glimpse`); None leaves it out.
+        belief: whether observations contain the belief, as planes `(C, Y, X)` in [0, 1].
+        glimpse: side in pixels of the foveated image that observations contain; None leaves it out.
         render_mode: `rgb_array` or None.
         options: options of `open_scenery`, where no scenery is given.
 
@@ -258,9 +230,9 @@ class ZoomEnv(EpisodeEnv):
         scenery: pictures and looks (`open_zoom_scenery`), which several environments may share; None opens one.
         price: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or all objects.
-        belief: whether observations contain the belief (`planes`).
+        belief: whether observations contain the belief, as planes `(C, Y, X)` in [0, 1].
         grid: number of columns and rows of the belief's planes.
-        glimpse: side in pixels of the window's image that observations contain (`glimpse`); None leaves it out.
+        glimpse: side in pixels of the window's image that observations contain; None leaves it out.
         render_mode: `rgb_array` or None.
         options: options of `open_zoom_scenery`, where no scenery is given.
 

@@ -33,7 +33,7 @@ def register() -> None:
     """
     for task, name in IDS.items():
         if name not in gymnasium.registry:
-            one, many = f"{__name__}:make", f"{__name__}:make_vector"
+            one, many = f"{__name__}:make", f"{__name__}:_make_vector"
             gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})
 
 

@@ -20,7 +20,6 @@ from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, check_whole
 from semfov.gaze.policies import Task
 from semfov.metrics.exploration import answers_of
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import (
     BeliefConfig,
     DataConfig,
@@ -30,9 +29,9 @@ from semfov.runs.config import (
     RunConfig,
     SensorConfig,
 )
-from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise
+from semfov.runs.exploration_protocol import explorations_of
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.search_protocol import Episode, episodes_of, tie_noise
+from semfov.runs.search_protocol import Trial, episodes_of
 from semfov.sensor.named import SensorName
 
 Source = Scenes | str | Path | None
@@ -158,38 +157,13 @@ class Scenery:
 
     def _open(self, scene: int) -> StoredLooks:
         """Stored looks from every cell of a scene."""
-        cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
+        cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
 
     def _answers(self, scene: int) -> Tensor:
         """Correct classes of each cell of a scene, `(X·Y, K+1)`."""
         return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
-
-    def noise(self, episode: Episode | Exploration) -> Tensor:
-        """Random numbers that break the ties of an episode, the same as in `eval.search` and `eval.explore`.
-
-        Args:
-            episode: the episode.
-
-        Returns:
-            `(shifts+1, X·Y)`, in [0, 1).
-        """
-        cells = self.shape[0] * self.shape[1]
-        if isinstance(episode, Episode):
-            return tie_noise(self._data, episode, cells, self.protocol)
-        return explore_noise(self._data, episode, cells, self.protocol)
-
-    def candidate(self, scene: int) -> Candidate:
-        """The policy, with the tables that it needs for a scene.
-
-        Args:
-            scene: index of the scene.
-
-        Returns:
-            The policy.
-        """
-        return self._looking.candidate(self.policy, scene)
 
     def annotation(self, scene: int) -> Annotation:
         """Objects of a scene.
@@ -262,7 +236,7 @@ def open_scenery(
         weights: file with the detector's weights.
         sensor: name of the foveal sensor (`semfov.sensor.SENSORS`).
         policy: preset or settings of `eval.search` or `eval.explore`. It determines the belief that the environment
-            keeps, and it is the policy of `PolicyAgent`.
+            keeps.
         grid: number of columns and rows of the cells.
         shifts: largest number of gaze shifts of an episode (None: 30 in a search, 20 in an exploration).
         starts: number of starts for each scene and target, from which episodes are drawn.

@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
 
+from semfov.agents.windows import WindowEpisode
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes, Score
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
-from semfov.paths import ZoomPath
 from semfov.viz.animation import render
-from semfov.viz.zoom import plot_zoom_path
+from semfov.viz.scanpath import plot_scanpath
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.episode import look_by_look
 from semfov.zoom.glances import Glance, Window, on_lattice, overview
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import merge
 
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 
@@ -31,7 +29,7 @@ _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 class _WindowEpisode(NamedTuple):
     """A search in a large picture, or its exploration.
 
-    >>> WindowEpisode(scene=3, target=16).target
+    >>> _WindowEpisode(scene=3, target=16).target
     16
     """
 
@@ -44,17 +42,28 @@ class WindowGaze(Gazes):
 
     coordinates = 3
     scenery: ZoomScenery
+    looking: WindowEpisode
 
     def __init__(self, scenery: ZoomScenery, task: str, *, grid: tuple[int, int] = (10, 10), **options: Any) -> None:
         self.task, self.shape = task, (grid[1], grid[0])
         super().__init__(scenery, **options)
-        self.looks: list[Glance] = []
         self.done: set[Window] = set()
 
     @property
     def action_space(self) -> spaces.Box:
         """Place and magnification, each from 0 to 1."""
         return spaces.Box(0, 1, (3,), np.float32)
+
+    @property
+    def looks(self) -> list[Glance]:
+        """The looks of the episode, in their order."""
+        return self.looking.glances
+
+    @property
+    def belief(self) -> ZoomBelief:
+        """The belief after the last look."""
+        assert self.looking.belief is not None
+        return self.looking.belief
 
     @property
     def belief_space(self) -> spaces.Box:
@@ -89,7 +98,7 @@ class WindowGaze(Gazes):
 
     def close(self) -> None:
         """Store the looks of an episode that is not over."""
-        if self.looks:
+        if self.done:
             self.glances.save()
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
@@ -130,28 +139,19 @@ class WindowGaze(Gazes):
 
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the windows that were looked at, and of the objects that were found."""
-        episode = self.episodes[0]
-        target = episode.target or None
-        path = ZoomPath(
-            lattice=self.glances.lattice,
-            classes=self.scenery.classes,
-            target=target,
-            glances=tuple(self.looks),
-            values=(float("inf"),) * len(self.looks),
-            candidates=merge(self.looks, target),
-        )
-        image = self.scenery.image(episode.scene)[None]
+        image = self.scenery.image(self.episodes[0].scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
         size = [max(1, round(n * share)) for n in image.shape[-2:]]
-        return render([plot_zoom_path(path, interpolate(image, size, mode="bilinear", antialias=True)[0])])[0]
+        small = interpolate(image, size, mode="bilinear", antialias=True)[0]
+        return render([plot_scanpath(self.looking.record(), small)])[0]
 
     def _enter(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         (episode,) = episodes
         self.targets[rows] = episode.target
         self.glances = self.scenery.glances(episode.scene)
-        self.belief = ZoomBelief(self.glances.lattice, self.scenery.evidence, episode.target)
-        self.looks, self.done = [], set()
-        self._turns = look_by_look(self.glances, lambda looks, windows: [(self.window, 0.0)], self.belief)
+        self.looking = WindowEpisode(self.scenery.classes, self.scenery.evidence, episode.target or None)
+        self.looking.open(self.glances, told=True)
+        self.done = set()
         self._see(overview(self.glances.lattice))
         self._result = self._rate()
 
@@ -162,14 +162,14 @@ class WindowGaze(Gazes):
 
     def _see(self, window: Window) -> None:
         self.window = window
-        if window in self.done:
-            return
-        self.looks.append(next(self._turns).glance)
-        self.done.add(window)
+        if window not in self.done:
+            self.looking.look(window=window)
+            self.done.add(window)
 
     def _rate(self) -> Tensor:
         scene, target = self.episodes[0]
-        result = self.scenery.found(self.looks, scene, target) if target else self.scenery.share(self.looks, scene)
+        looks = self.looks
+        result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
         return torch.tensor([result], dtype=torch.float64)
 
     def _view(self, row: int) -> Tensor:
@@ -181,7 +181,7 @@ class WindowGaze(Gazes):
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
     """The window of the lattice that is nearest to an action.
 
-    >>> window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
+    >>> _window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
     (12, 8, 20, 16)
     """
     level = round(float(action[2]) * (lattice.levels - 1))

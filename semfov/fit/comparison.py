@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -31,11 +30,8 @@ _Ways = Mapping[str, Strategy]
 """Strategies for a task, by their names in reports."""
 
 
-class Rule(Protocol):
-    """A rule that decides after each step which searches end."""
-
-    def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
-        """Return the number of each search's outcome (`semfov.decision.OUTCOMES`), 0 for searches that continue."""
+Rule = Callable[..., Tensor]
+"""Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +58,10 @@ def search_curves(
     run: Looking, scenes: Sequence[int], ways: _Ways, protocol: ProtocolConfig, max_area: float
 ) -> dict[str, FloatArray]:
     """Measure the cumulative performance of search strategies on every photograph with a target; → `(P, shifts+1)`."""
-    columns, rows = run.config.belief.columns, run.config.belief.rows
     curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
     for index in track(scenes, "searching", "scene"):
         targets = legal_targets(run.scenes.annotation(index), max_area)
-        episodes = episodes_of(run.scenes, index, columns, rows, protocol, targets)
+        episodes = episodes_of(run.scenes, index, *run.config.cells, protocol, targets)
         if not episodes:
             continue
         grid = run.grid(index)
@@ -77,7 +72,7 @@ def search_curves(
                 outcomes = run_episodes(
                     episodes, Candidate(strategy), looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
-            shifts = np.array([outcome.found_at for outcome in outcomes])
+            shifts = np.array([found_at for _, found_at in outcomes])
             curves[name].append(cumulative_performance(shifts, protocol.shifts))
     return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
 
@@ -112,9 +107,9 @@ def explore_curves(
                     shifts=protocol.shifts,
                     batch=protocol.batch,
                 )
-            rates = [success_rate(each.right, cells) for each in progress]
+            rates = [success_rate(counts["right"], cells) for _, counts in progress]
             curves["objects"][name].append(np.mean(rates, axis=0))
-            rates = [success_rate(each.right_everywhere, len(grid)) for each in progress]
+            rates = [success_rate(counts["right_everywhere"], len(grid)) for _, counts in progress]
             curves["all"][name].append(np.mean(rates, axis=0))
     return {
         what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}
@@ -122,15 +117,8 @@ def explore_curves(
     }
 
 
-@dataclass(frozen=True)
-class _DecisionRates:
-    """The decisions of searches for present and for absent classes."""
-
-    found: float
-    false_alarms: float
-    undecided: float
-    looks: float
-    searches: int
+_DecisionRates = tuple[float, float, float, float, int]
+"""Shares of searches that find a present class, find an absent one, and decide nothing; mean looks; searches."""
 
 
 def decisions(
@@ -150,12 +138,13 @@ def decisions(
             continue
         detections = run.detections(index)
         for search in searches:
-            looks = StoredLooks(detections, grid, torch.tensor([search.target]))
-            there = bool((annotation.labels == search.target).any())
+            target = search.target
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            there = bool((annotation.labels == target).any())
             for name, (strategy, rule) in ways.items():
                 ends = partial(rule, target=search.target, grid=grid)
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
+                    steps = search_steps(looks, strategy, target, search.start, search.noise, ends)
                     outcome = OUTCOMES[int(ends(steps[-1]))]
                 results[name].append((there, outcome, len(steps)))
     return {name: _rates(each) for name, each in results.items()}
@@ -171,7 +160,7 @@ def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
         chosen = [each[1] == outcome for each in searches if each[0] in which]
         return sum(chosen) / len(chosen) if chosen else math.nan
 
-    return _DecisionRates(
+    return (
         share("found", [True]),
         share("found", [False]),
         share("undecided", [True, False]),

@@ -1,8 +1,11 @@
 """Fit all models that the agent needs to a detector of the user."""
 
+from __future__ import annotations
+
+import json
 import logging
 import time
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,16 +13,22 @@ from typing import Any
 import torch
 
 from semfov.agent import ActivePerception
-from semfov.errors import InputError
+from semfov.errors import DataError, InputError
 from semfov.fit.detector_report import class_counts, detector_report, next_commands
-from semfov.fit.detector_settings import FitDetectorConfig
-from semfov.fit.parts.folder import FolderFit
-from semfov.io.files import write_text
-from semfov.io.manifest import PARTS, Manifest, place_of
-from semfov.runs.config import DataConfig, DetectorConfig
-from semfov.runs.looking import Looking, looking_of
+from semfov.fit.evidence import EvidenceFit
+from semfov.fit.map import MapFit
+from semfov.fit.observation import ObservationFit
+from semfov.fit.parts.base import PartFit, PartInputs, PartResult
+from semfov.fit.parts.windows import WindowsFit
+from semfov.fit.settings import FitDetectorConfig
+from semfov.fit.tempering import TemperingFit
+from semfov.fit.verification import VerificationFit
+from semfov.io.files import sha256, write_text
+from semfov.io.manifest import PARTS, Manifest, Part, place_of
+from semfov.runs.config import WHERE, DataConfig, DetectorConfig
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
-from semfov.runs.scene_run import finish
+from semfov.runs.scene_run import digest_of, finish
 from semfov.runs.settings import plain
 from semfov.runs.setup import detector_options
 from semfov.runs.workers import available_cores
@@ -101,24 +110,34 @@ def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = config.named()
     started = time.monotonic()
-    run = looking_of(replace(config, out=config.out / "progress"))
-    folder = FolderFit(config, run)
-    config = folder.config
-    missing = class_counts(run, range(len(run.scenes)))
-    _tell(missing)
-    with WholeBar("fitting", {"looking": {"looking": _seconds_of_looks(run)}, **folder.stages}) as whole:
+    run = Looking(replace(config, out=config.out / "progress"))
+    folder = _FolderFit(config, run)
+    config, results = folder.inputs.config, folder.inputs.results
+    counts = class_counts(run, range(len(run.scenes)))
+    missing = [name for name, count in counts.items() if not count]
+    if missing:
+        some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
+        _log.warning(
+            "%d of the detector's %d classes have no box in the photographs (%s): the fitted models can only apply to "
+            "them what they learn from the other classes",
+            len(missing),
+            len(counts),
+            some,
+        )
+    stages = {name: each.tasks for name, each in folder.fits.items()}
+    with WholeBar("fitting", {"looking": {"looking": _seconds_of_looks(run)}, **stages}) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
         for part in PARTS:
             with whole.stage(part):
                 folder.fit(part)
-    path = _manifest_of(config, run, folder).write(config.out)
-    text = detector_report(config, run, folder.results, time.monotonic() - started)
+    path = _manifest_of(folder).write(config.out)
+    text = detector_report(config, run, results, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
-    figures = [figure for fitted in folder.results.values() for figure in fitted.figures]
-    models = [fitted.part.file for fitted in folder.results.values() if fitted.part.file]
+    figures = [figure for fitted in results.values() for figure in fitted.figures]
+    models = [fitted.part.file for fitted in results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
     print(f"\nnext:\n{next_commands(config, run)}")
 
@@ -139,22 +158,9 @@ def _seconds_of_looks(run: Looking) -> float:
     return (time.monotonic() - before) * len(grid) * len(left) / workers
 
 
-def _tell(counts: dict[str, int]) -> None:
-    """Warn about classes without any object in the photographs."""
-    missing = [name for name, count in counts.items() if not count]
-    if missing:
-        some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
-        _log.warning(
-            "%d of the detector's %d classes have no box in the photographs (%s): the fitted models can only apply to "
-            "them what they learn from the other classes",
-            len(missing),
-            len(counts),
-            some,
-        )
-
-
-def _manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> Manifest:
+def _manifest_of(folder: _FolderFit) -> Manifest:
     """Build the manifest of the model folder."""
+    config, run = folder.inputs.config, folder.inputs.run
     detector = run.eye.detector
     options = plain(detector_options(config.detector))
     weights = options.pop("weights", None)
@@ -171,7 +177,7 @@ def _manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> 
         },
         sensor=config.sensor.record(),
         grid=(config.columns, config.rows),
-        parts={name: fitted.part for name, fitted in folder.results.items()},
+        parts={name: fitted.part for name, fitted in folder.inputs.results.items()},
         training={
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),
@@ -179,3 +185,50 @@ def _manifest_of(config: FitDetectorConfig, run: Looking, folder: FolderFit) -> 
             "settings": {name: getattr(config, name) for name in _SETTINGS},
         },
     )
+
+
+_FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit, WindowsFit)
+"""The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
+
+
+class _FolderFit:
+    """Fit all parts of a model folder in order; those that an earlier run finished are read from the folder."""
+
+    def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
+        self.inputs = PartInputs(config, run)
+        self.fits = {each.name: each(self.inputs) for each in _FITS}
+
+    def fit(self, name: str) -> PartResult:
+        """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""
+        results = self.inputs.results
+        before: list[Any] = [fitted.part.sha256 for fitted in results.values()]
+        before += [plain(asdict(each.part)) for each in results.values() if each.part.settings]
+        own = plain(asdict(self.fits[name].settings))
+        settings = [name, {each: own[each] for each in own.keys() - {*WHERE}}, self.inputs.config.judged, before]
+        key = digest_of([self.inputs.run.key, settings])
+        result = self._read_result(name, key)
+        if result is None:
+            try:
+                result = self.fits[name].fit()
+            except (DataError, InputError) as error:
+                result = PartResult(
+                    Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
+                )
+            write_text(self._record(name), json.dumps({"key": key, **asdict(result)}))
+        results[name] = result
+        return result
+
+    def _record(self, name: str) -> Path:
+        return self.inputs.config.out / "progress" / f"{name}.json"
+
+    def _read_result(self, name: str, key: str) -> PartResult | None:
+        out = self.inputs.config.out
+        try:
+            record = json.loads(self._record(name).read_text(encoding="utf-8"))
+            part = Part(**record["part"])
+            whole = record["key"] == key
+            whole = whole and (part.file is None or sha256(out / part.file) == part.sha256)
+            whole = whole and all((out / figure).is_file() for figure in record["figures"])
+        except Exception:  # a damaged record is no problem, as the part can be fitted again
+            return None
+        return PartResult(part, record["report"], record["figures"]) if whole else None

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from semfov.fit.comparison import Difference
-from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.parts.base import PartResult
+from semfov.fit.settings import FitDetectorConfig
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.looking import Looking

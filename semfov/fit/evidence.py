@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -144,7 +144,7 @@ def _fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds."""
     examples = _make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
-    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     judged, model.thresholds = _judge_evidence(config, model, examples[held_out], grid)
@@ -167,7 +167,7 @@ def _train_evidence(
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
-        for step in searches(model, chosen, grid, config.looks, astray, generator):
+        for step in _searches(model, chosen, grid, config.looks, astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + evidence_objective(config, step, chosen.goal)
         return loss
@@ -176,7 +176,7 @@ def _train_evidence(
     return model.eval()
 
 
-def searches(
+def _searches(
     model: TargetEvidence, examples: _TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
     """Search every example; see `example_episodes`."""
@@ -232,7 +232,7 @@ def _judge_evidence(
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*_JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []
-    for step in searches(model, examples, grid, looks, 0.0, generator):
+    for step in _searches(model, examples, grid, looks, 0.0, generator):
         assert isinstance(step.belief, TargetBelief)
         present.append(step.belief.present)
         anywhere.append(step.belief.anywhere)
@@ -258,23 +258,8 @@ def _judge_evidence(
     return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 
-class Bounds(Protocol):
-    """Limits on wrong decisions, by which thresholds are chosen (see `FitSearchConfig`)."""
-
-    @property
-    def false_alarms(self) -> float:
-        """Maximum share of absent targets that may be reported as found."""
-        ...
-
-    @property
-    def surest(self) -> float:
-        """Upper limit of the probability from which on a target counts as found."""
-        ...
-
-    @property
-    def lost(self) -> float:
-        """Maximum share of the targets that may be missed because the search gives up."""
-        ...
+Bounds = Any
+"""Limits on wrong decisions: settings with the `false_alarms`, `surest` and `lost` of `FitSearchConfig`."""
 
 
 def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
@@ -364,14 +349,7 @@ class EvidenceFit(PartFit):
     @property
     def settings(self) -> FitSearchConfig:
         """The settings of the training."""
-        own = self.config
-        return FitSearchConfig(
-            **self.inputs.common,
-            holdout=self.inputs.holdout,
-            absent=self.inputs.absent,
-            max_target_area=own.max_target_area,
-            steps=own.steps or 500,
-        )
+        return self.inputs.settings(FitSearchConfig, absent=self.inputs.absent)
 
     @property
     def tasks(self) -> dict[str, float]:
@@ -385,23 +363,20 @@ class EvidenceFit(PartFit):
             "deciding": judged,
         }
 
-    def choose_thresholds(self, model: TargetEvidence) -> Thresholds:
-        """Choose the thresholds of decisions on the held-out photographs."""
-        config, inputs = self.settings, self.inputs
-        grid = Grid(config.columns, config.rows, (config.columns, config.rows))
-        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
-        each = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
-        area, scenes = config.max_target_area, inputs.held_out
+    def _wide_thresholds(self, model: TargetEvidence) -> Thresholds:
+        """Choose the thresholds on the held-out photographs, with many absent classes for a precise share of alarms."""
+        config, scenes = self.settings, self.inputs.held_out
+        each, area = max(config.classes, min(20, _ABSENT // len(scenes))), config.max_target_area
         wide = _make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
         expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
-        surest = SUREST_OF_FEW if expected < 10 else SUREST
-        return _judge_evidence(replace(config, surest=surest), model, wide, grid)[1]
+        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
+        return _judge_evidence(bounds, model, wide, Grid(*config.cells, config.cells))[1]
 
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
         config, run, inputs = self.settings, self.run, self.inputs
         fit = _fit_evidence(config, run)
-        fit.model.thresholds = thresholds = self.choose_thresholds(fit.model)
+        fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {
             "fitted": learned,
@@ -427,10 +402,7 @@ class EvidenceFit(PartFit):
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
         outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
-        outcomes += [
-            [name, percent_of(d.found), percent_of(d.false_alarms), percent_of(d.undecided), f"{d.looks:.1f}"]
-            for name, d in decided.items()
-        ]
+        outcomes += [[name, *map(percent_of, shares), f"{looks:.1f}"] for name, (*shares, looks, _) in decided.items()]
         report = "\n".join(
             [
                 section(
@@ -440,7 +412,7 @@ class EvidenceFit(PartFit):
                     rows,
                 ),
                 section(
-                    f"Decisions of {decided['fitted'].searches} searches for present and for absent classes. A target "
+                    f"Decisions of {decided['fitted'][-1]} searches for present and for absent classes. A target "
                     f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
                     f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
                     "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "

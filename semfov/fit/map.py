@@ -130,13 +130,13 @@ def _fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model."""
     examples = _make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
-    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         model = MapEvidence(components=len(run.scenes.classes) + 1, metadata=metadata)
     with torch.no_grad():
-        model.prior.copy_(frequencies(run, config.holdout))
+        model.prior.copy_(_frequencies(run, config.holdout))
     _train_map(config, model, examples[~held_out], grid)
     _train_gain(config, model, examples[~held_out], grid)
     judged = _judge_map(config, model.eval(), examples[held_out], grid)
@@ -144,7 +144,7 @@ def _fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     return Fit(model, judged, *counts, _map_report(judged, *counts))
 
 
-def frequencies(run: Looking, holdout: int) -> Tensor:
+def _frequencies(run: Looking, holdout: int) -> Tensor:
     """Count how often a cell contains each class in the training photographs; → `(K+1,)`."""
     components, cells = len(run.scenes.classes) + 1, 0
     count = torch.zeros(components)
@@ -164,7 +164,7 @@ def _train_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
-        for step in explorations(model, chosen, grid, max(counted), config.astray, generator):
+        for step in _explorations(model, chosen, grid, max(counted), config.astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + map_objective(step, chosen)
         return loss
@@ -172,7 +172,7 @@ def _train_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
     descend(model.parameters(), loss_of, config.steps, config.rate)
 
 
-def explorations(
+def _explorations(
     model: MapEvidence, examples: _MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
     """Explore every example; see `example_episodes`."""
@@ -206,12 +206,12 @@ def _train_gain(config: FitMapConfig, model: MapEvidence, examples: _MapExamples
         before: Step | None = None
         loss = chosen.score.new_zeros(())
         with torch.no_grad():
-            steps = list(explorations(model, chosen, grid, config.looks, config.astray, generator))
+            steps = list(_explorations(model, chosen, grid, config.looks, config.astray, generator))
         for step in steps:
             if before is not None:
                 belief = before.belief
                 assert isinstance(belief, MapBelief)
-                brought = right(step, chosen.answers) - right(before, chosen.answers)
+                brought = _right(step, chosen.answers) - _right(before, chosen.answers)
                 distance = chosen.distance[torch.arange(len(chosen)), step.cell][:, None]
                 expected = model.gain(belief.probabilities, belief.closest, belief.looks, distance)[:, 0]
                 loss = loss + (expected - brought).square().mean() * 100
@@ -222,7 +222,7 @@ def _train_gain(config: FitMapConfig, model: MapEvidence, examples: _MapExamples
     descend(model.worth.parameters(), loss_of, config.gain_steps, config.rate, clip=None, title=title)
 
 
-def right(step: Step, answers: Tensor) -> Tensor:
+def _right(step: Step, answers: Tensor) -> Tensor:
     """Return 1 for cells whose most probable answer is right and 0 for the others, `(B, X·Y)`."""
     belief = step.belief
     assert isinstance(belief, MapBelief)
@@ -238,10 +238,10 @@ def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
     answers = examples.answers
     some = ~answers[..., 0]
     before: tuple[Tensor, Tensor] | None = None
-    for step in explorations(model, examples, grid, max(_JUDGED), 0.0, generator):
+    for step in _explorations(model, examples, grid, max(_JUDGED), 0.0, generator):
         belief = step.belief
         assert isinstance(belief, MapBelief)
-        p, now = belief.probabilities, right(step, answers)
+        p, now = belief.probabilities, _right(step, answers)
         named = answers[..., 1:].gather(-1, p[..., 1:].argmax(-1, keepdim=True))[..., 0]
         gained = (0.0, 0.0)
         if before is not None:
@@ -313,8 +313,7 @@ class MapFit(PartFit):
     def settings(self) -> FitMapConfig:
         """The settings of the training."""
         steps = self.config.map_steps or 1000
-        holdout, gain_steps = self.inputs.holdout, max(1, steps // 5)
-        return FitMapConfig(**self.inputs.common, holdout=holdout, steps=steps, gain_steps=gain_steps)
+        return self.inputs.settings(FitMapConfig, steps=steps, gain_steps=max(1, steps // 5))
 
     @property
     def tasks(self) -> dict[str, float]:

@@ -8,15 +8,15 @@ import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.eye import Eye
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
 from semfov.fit.outputs import model_path, split
@@ -29,14 +29,14 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.samples import CellsOfLook, Sampler, Samples, SampleSettings, collect_samples, whole_photograph
+from semfov.runs.looking import Looking
+from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import csv_text, table
 from semfov.runs.zoom_samples import MosaicSampler
 from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
-from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class FitObservationConfig(FitConfig):
 def fit_fom(config: FitObservationConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
-    sampler = collect_samples(SampleSettings.of(config), folder, config.where, "looking", kind)
+    sampler = collect_samples(config, folder, "looking", kind)
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
@@ -124,15 +124,8 @@ def fit_fom(config: FitObservationConfig) -> None:
         print(f"  {file}")
 
 
-class _Looker(Protocol):
-    """The source of the detections: a `Sampler`, or a run with looks from every cell."""
-
-    @property
-    def eye(self) -> Eye | WindowEye:
-        """The eye that looked."""
-        ...
-
-    scenes: Scenes
+_Looker = Sampler | Looking
+"""The source of the detections: random looks, or looks from every cell."""
 
 
 def _fit_model(
@@ -244,7 +237,10 @@ def _write_report(
     write_text(config.out / "config.yaml", config.yaml())
     write_text(config.out / "manifest.json", json.dumps(_fit_manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
-    write_text(config.out / "counts.csv", _counts_csv(model))
+    classes = ("background", *model.classes)
+    counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
+    head = ["class", *(f"level {n}" for n in range(len(model.edges) + 1))]
+    write_text(config.out / "counts.csv", csv_text([head, *counts]))
     figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
     names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
@@ -321,13 +317,6 @@ def _figures_by_level(
     return rows
 
 
-def _counts_csv(model: FovealObservationModel) -> str:
-    """Write the number of detections of each true class at each level in the fit as CSV."""
-    names = ("background", *model.classes)
-    rows = ([name, *counts] for name, counts in zip(names, model.metadata["counts"], strict=True))
-    return csv_text([["class", *(f"level {n}" for n in range(len(model.edges) + 1))], *rows])
-
-
 def _fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
     """Record the command, the commit, the versions and the model that the measures come from."""
     metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
@@ -348,8 +337,7 @@ class ObservationFit(PartFit):
     @property
     def settings(self) -> FitObservationConfig:
         """The settings of the observation model."""
-        common = {name: each for name, each in self.inputs.common.items() if name not in ("columns", "rows")}
-        return FitObservationConfig(**common, holdout=self.inputs.holdout, fixations=self.config.fixations)
+        return self.inputs.settings(FitObservationConfig)
 
     @property
     def tasks(self) -> dict[str, float]:
@@ -363,7 +351,7 @@ class ObservationFit(PartFit):
         judged = samples[held_out]
         model = _fit_model(config, run, _statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
-        cells = whole_photograph(self.config.columns, self.config.rows)
+        cells = partial(all_cells, cells=self.config.cells)
         misses = _count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()

@@ -14,10 +14,10 @@ from semfov.fit.settings import FitOnLooksConfig
 from semfov.io.files import inside, write_text
 from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
-from semfov.runs.looking import Looking, looking_of
+from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 
-Model = TypeVar("Model", bound=Pretrained)
+_Model = TypeVar("_Model", bound=Pretrained)
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
@@ -37,11 +37,7 @@ def model_path(config: Any, detector: str) -> Path:
 
 def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
     """Print the report, write it with the settings and the measures to `config.out`, and list the written files."""
-    files = {
-        "report.md": report,
-        "config.yaml": config.yaml(),
-        figures[0]: figures[1],
-    }
+    files = {"report.md": report, "config.yaml": config.yaml(), figures[0]: figures[1]}
     print(report)
     for name, text in files.items():
         write_text(inside(config.out, name), text)
@@ -50,10 +46,10 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
 
 
 @dataclass(frozen=True)
-class Fit(Generic[Model]):
+class Fit(Generic[_Model]):
     """The result of a fit."""
 
-    model: Model
+    model: _Model
     judged: list[dict[str, float]]
     trained: int
     held_out: int
@@ -73,7 +69,7 @@ def split(scene: Tensor, holdout: int) -> Tensor:
 
 def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
     """Look from every cell, fit, and write the model, the report, the settings and the measures."""
-    run = looking_of(config)
+    run = Looking(config)
     finish(run, "looking")
     fitted = fit(config, run)
     path = model_path(config, run.eye.detector.name)

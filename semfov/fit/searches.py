@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar, Generic
 
@@ -77,13 +77,6 @@ class TargetSearch(ABC, Generic[LookType]):
         """Whether the place is right at which a search without closer looks finds the target after a look."""
 
 
-@dataclass(frozen=True)
-class _SearchTarget(DrawnSearch):
-    """A class to search for in a photograph."""
-
-    spare: bool = False
-
-
 class SearchedPhotograph:
     """A photograph with the classes to search for, and all looks at it so far."""
 
@@ -94,7 +87,7 @@ class SearchedPhotograph:
         index: int,
         number: int,
         grid: Grid,
-        targets: tuple[_SearchTarget, ...],
+        targets: tuple[DrawnSearch, ...],
         store: DetectionStore | None = None,
         everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
@@ -154,9 +147,7 @@ def open_photographs(
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
         wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
-        search_targets = tuple(
-            _SearchTarget(**vars(search), spare=number >= len(targets)) for number, search in enumerate(wide)
-        )
+        search_targets = tuple(replace(search, spare=number >= len(targets)) for number, search in enumerate(wide))
         if targets:
             photographs.append(
                 SearchedPhotograph(eye, scenes, index, len(photographs), grid, search_targets, store, everywhere)
@@ -166,7 +157,7 @@ def open_photographs(
 
 def _search_photograph(
     photograph: SearchedPhotograph,
-    target: _SearchTarget,
+    target: DrawnSearch,
     observer: Observer,
     looks: int,
 ) -> Iterator[Step]:
@@ -182,7 +173,7 @@ class _PhotographSearch(TargetSearch[Step]):
     after = (1, 3, 5, 8, 12)
 
     def __init__(
-        self, photograph: SearchedPhotograph, target: _SearchTarget, evidence: TargetEvidence, looks: int
+        self, photograph: SearchedPhotograph, target: DrawnSearch, evidence: TargetEvidence, looks: int
     ) -> None:
         super().__init__(photograph.number, target.target, present=target.present, spare=target.spare)
         self.photograph, self.goal = photograph, target.goal

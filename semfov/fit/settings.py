@@ -1,28 +1,27 @@
-"""The settings that fits have in common."""
+"""Settings of fits: those that several have in common, and those for fitting all models to a detector."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
-from semfov.runs.settings import Count, Positive, Range, Seed, Share, Side, SingleName
+from semfov.errors import InputError
+from semfov.runs.config import DataConfig, DetectorConfig, EyeConfig
+from semfov.runs.settings import Count, Positive, Range, Seed, Share, Side, SingleName, Whole
 
 
 @dataclass(frozen=True)
-class FitConfig(WorkConfig):
+class FitConfig(EyeConfig):
     """Base of the settings of fits to a detector's looks at annotated photographs.
 
     Args:
         data: photographs to learn from (by default all of them, however many objects they have).
         detector: the detector that processes the foveated views.
-        sensor: the foveal sensor.
         seed: seed of all random choices.
         name: name of the model (None: the detector's name).
         out: folder for the model and the report.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     seed: Seed = 0
     name: SingleName | None = None
 
@@ -55,3 +54,84 @@ class FitOnLooksConfig(FitConfig):
     batch: Count = 48
     rate: Positive = 5e-3
     out: Path = Path("runs/fit")
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        return self.columns, self.rows
+
+
+_MANY = 100
+"""With at least this many photographs, one in five is held out and training takes all its steps."""
+
+
+@dataclass(frozen=True)
+class FitDetectorConfig(FitConfig):
+    """Fit all models that the agent needs to your own detector.
+
+    Args:
+        model: the detector: a name or a file, as for `semfov.load_detector`.
+        data: photographs with boxes to learn from. All of them are used unless `data.limit` or `data.ids` selects some.
+        detector: options of the detector; `model` gives its name.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        holdout: one in every n photographs is held out for the evaluation and for choosing thresholds (None: one in 5,
+            or one in 3 if there are fewer than 100 photographs).
+        judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores,
+            and to which the verification is fitted.
+        fixations: looks at each photograph to fit the observation model to.
+        steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
+        map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
+        windows: also fit the evidence for pictures larger than the detector's input, if there are enough photographs.
+        window_steps: training steps of that evidence.
+        thin: the report lists classes with fewer objects than this in the training photographs.
+        out: folder to write the models to.
+        cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
+    """
+
+    unused = ("name",)
+    model: Path | None = None
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    columns: Side = 10
+    rows: Side = 10
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] | None = None
+    judged: Count = 100
+    fixations: Count = 8
+    steps: Count | None = None
+    map_steps: Count | None = None
+    windows: bool = True
+    window_steps: Count = 400
+    thin: Whole = 20
+    out: Path = Path("mymodels")
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        return self.columns, self.rows
+
+    def named(self) -> "FitDetectorConfig":
+        """These settings with `model` as the detector's name, and with targets of all sizes in the photographs."""
+        default = DetectorConfig().name
+        if self.model is None:
+            raise InputError("model: expected the name or the file of a detector, got none")
+        if self.detector.name not in (default, str(self.model)):
+            raise InputError(
+                f"detector.name: expected nothing, as model already names the detector ({str(self.model)!r}), got "
+                f"{self.detector.name!r}"
+            )
+        # Photographs without the target are needed as negative examples.
+        data = replace(self.data, max_target_area=None)
+        return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
+
+    def sized(self, photographs: int) -> "FitDetectorConfig":
+        """Return these settings, with each None replaced by a default that suits the number of photographs."""
+        few = photographs < _MANY
+        share = min(photographs / _MANY, 1)
+        return replace(
+            self,
+            holdout=self.holdout or (3 if few else 5),
+            steps=self.steps or max(250, round(500 * share)),
+            map_steps=self.map_steps or max(300, round(1000 * share)),
+        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, cast
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
+from semfov.eye import Eye
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, percent_of, section
 from semfov.fit.outputs import write_outputs
@@ -23,7 +24,7 @@ from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.progress import track
-from semfov.runs.samples import Sampler, Samples, SampleSettings, collect_samples
+from semfov.runs.samples import Sampler, Samples, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
@@ -71,16 +72,15 @@ class FitTemperingConfig(FitConfig):
 def fit_tempering(config: FitTemperingConfig) -> None:
     """Collect looks, try every exponent, and write the report."""
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
-    settings = SampleSettings.of(config)
-    sampler = collect_samples(settings, (config.cache or config.out) / "samples", config.where, "looking")
+    sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
     samples = sampler.all()
-    model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
-    hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
+    model = make_observation(None, cast(Eye, sampler.eye)) if config.calibrated else None
+    hits = {tempering: _measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = _tempering_report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
-def measure(
+def _measure(
     config: FitTemperingConfig,
     sampler: Sampler,
     samples: Samples,
@@ -178,13 +178,7 @@ class TemperingFit(PartFit):
     @property
     def settings(self) -> FitTemperingConfig:
         """The settings of the choice."""
-        return FitTemperingConfig(
-            **self.inputs.common,
-            holdout=self.inputs.holdout,
-            fixations=self.config.fixations,
-            min_objects=1,
-            max_target_area=self.config.max_target_area,
-        )
+        return self.inputs.settings(FitTemperingConfig, min_objects=1)
 
     @property
     def tasks(self) -> dict[str, float]:

@@ -432,8 +432,7 @@ class VerificationFit(PartFit):
     @property
     def settings(self) -> FitVerificationConfig:
         """The settings of the fit."""
-        area = self.config.max_target_area
-        return FitVerificationConfig(**self.inputs.common, absent=self.inputs.absent, max_target_area=area)
+        return self.inputs.settings(FitVerificationConfig, absent=self.inputs.absent)
 
     @property
     def tasks(self) -> dict[str, float]:

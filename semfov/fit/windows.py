@@ -17,6 +17,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Crowded, Scenes
 from semfov.errors import check
 from semfov.fit.outputs import training_of, write_outputs
+from semfov.fit.photographs import fit_photographs
 from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_choice import choose_foresight, choose_patience, open_all
@@ -40,8 +41,8 @@ from semfov.io.files import inside
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count, Range, Share
-from semfov.runs.setup import make_detector, prepare_worker, split_photographs
+from semfov.runs.settings import Count, Range, Share, Whole
+from semfov.runs.setup import make_detector, make_scenes, prepare_worker, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.window_looking import TileSize
 from semfov.runs.workers import run_tasks
@@ -50,7 +51,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
 
-_RefitPart = Literal["presence", "decision", "survey", "verification", "certainty"]
+_RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "photograph"]
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,15 @@ class FitZoomConfig(FitConfig):
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because the search gives up.
         place: least probability that the target is at a place, for a closer look there when no other look follows.
+        photographs: number of photographs that are looked at by themselves, to fit the evidence for photographs; 0
+            leaves it out.
+        worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
         refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
             further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
             closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
-            closer looks find, and `certainty`, the probability that an object is there. The verification has to
+            closer looks find, `certainty`, the probability that an object is there, and `photograph`, the evidence for
+            photographs. The verification has to
             follow new decisions; without it they are made without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
@@ -116,6 +121,8 @@ class FitZoomConfig(FitConfig):
     surest: Share = 0.9
     lost: Share = 0.02
     place: Share = 0.2
+    photographs: Whole = 320
+    worth: Share = 0.1
     evidence: Path | None = None
     refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800
@@ -257,6 +264,9 @@ def fit_zoom(config: FitZoomConfig) -> None:
         lines += fit_closer_looks(config, model, eye, pictures, store)
     if "certainty" in refit:
         lines += fit_counts(config, model, eye, pictures, store)
+    if "photograph" in refit and config.photographs:
+        scenes = make_scenes(config.data, eye.detector.classes)
+        lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config)]
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(lines), ("figures.json", figures), path)

@@ -79,23 +79,22 @@ def _mosaic_explorations(
         looks.save()
 
 
-def _fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> Certainty:
-    """Fit the probability of objects by maximum likelihood, with Newton's method in float64.
+def logistic_regression(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> list[float]:
+    """Fit a logistic regression by maximum likelihood, with Newton's method in float64: the offset, then the weights.
 
-    A weak prior (half an object for and against without any facts, and small weights) keeps the result finite where all
-    objects are right or all wrong.
+    A weak prior (half a case for and against without any facts, and small weights) keeps the result finite where all
+    cases are right or all wrong.
 
     >>> torch.manual_seed(0)
     <torch._C.Generator object at ...>
-    >>> facts, truth = torch.randn(20_000, len(FACTS)), Certainty(-1.0, (0.5,) * len(FACTS))
-    >>> fitted = fit_certainty(facts, torch.rand(20_000) < truth.probability(facts))
-    >>> round(fitted.offset, 1), {round(weight, 1) for weight in fitted.weights}
-    (-1.0, {0.5})
+    >>> facts, weights = torch.randn(20_000, 3), torch.full((3,), 0.5)
+    >>> fitted = logistic_regression(facts, torch.rand(20_000) < (facts @ weights - 1).sigmoid())
+    >>> [round(number, 1) for number in fitted]
+    [-1.0, 0.5, 0.5, 0.5]
 
-    Shapes: facts `(n, 14)`, right `(n,)`.
+    Shapes: facts `(n, m)`, right `(n,)`.
     """
-    none = torch.zeros(2, len(FACTS), dtype=torch.float64)
-    inputs = torch.cat([facts.double(), none])
+    inputs = torch.cat([facts.double(), facts.new_zeros(2, facts.shape[1], dtype=torch.float64)])
     inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
     there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
     weight = torch.ones(len(inputs), dtype=torch.float64)
@@ -111,7 +110,12 @@ def _fit_certainty(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: i
         coefficients = coefficients + step
         if float(step.abs().max()) < 1e-9:
             break
-    offset, *weights = coefficients.tolist()
+    return coefficients.tolist()
+
+
+def fit_certainty(facts: Tensor, right: Tensor) -> Certainty:
+    """Fit the probability of objects; it expects none that no look has shown. Shapes: facts `(n, 14)`, right `(n,)`."""
+    offset, *weights = logistic_regression(facts, right)
     return Certainty(offset, tuple(weights))
 
 
@@ -162,7 +166,7 @@ def certainty_again(
         ]
         for some in (fitted, judged)
     )
-    regression = _fit_certainty(
+    regression = fit_certainty(
         torch.cat([each.facts for each in training]), torch.cat([each.right for each in training])
     )
     model.certainty = _fit_unseen(regression, training)

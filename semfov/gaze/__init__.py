@@ -2,19 +2,12 @@
 
 from semfov.gaze import acquisition, policies, saliency
 from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax, select_fixation, soft_fixation
-from semfov.gaze.habits import GazeHabits, Habitual
-from semfov.gaze.ivsn import IVSN
 from semfov.gaze.policies import Policy
-from semfov.gaze.templates import ClassTemplates
 
 __all__ = [
-    "IVSN",
     "Choice",
-    "ClassTemplates",
-    "GazeHabits",
     "Given",
     "Greedy",
-    "Habitual",
     "Policy",
     "Relaxed",
     "Softmax",

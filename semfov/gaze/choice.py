@@ -29,10 +29,7 @@ class Choice(ABC):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Choose the next fixation of each episode.
-
-        Shapes: episodes `(A,)`, values `(A, X·Y)`, visited `(A, X·Y)`, centres `(X·Y, 2)` → `(A, 2)`.
-        """
+        """Choose the next fixation `(A, 2)` of each episode from values `(A, X·Y)`, and its cell `(A,)`."""
 
 
 class Greedy(Choice):
@@ -243,11 +240,7 @@ def soft_fixation(
 
 
 def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
-    """The first cell of an episode, and the generator that breaks its ties.
-
-    >>> first_cell(3, 0, 100)[0]
-    3
-    """
+    """The first cell of an episode, and the generator that breaks its ties."""
     check_whole(seed, "seed", 0, 2**63 - 1)
     generator = torch.Generator().manual_seed(int(seed))
     if start is None:

@@ -8,8 +8,9 @@ from torch import Tensor
 from semfov.belief.belief import Belief, pick
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer, own
-from semfov.belief.observers.learned_map import LearnedMap, MapLook
-from semfov.belief.observers.target import Target, TargetLook
+from semfov.belief.observers.gathering import EvidenceLook
+from semfov.belief.observers.learned_map import LearnedMap
+from semfov.belief.observers.target import Target
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views
@@ -20,7 +21,7 @@ class _SceneLook(Look):
     """The evidence of a look about the cells of a view; gaze `(1,)`."""
 
     pose: int
-    inner: Look
+    inner: EvidenceLook
     gaze: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> "_SceneLook":
@@ -137,9 +138,9 @@ class SceneObserver(Observer):
         before = belief.views[pose]
         view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, look.inner)
         probabilities = views.spread(self._probabilities(view), pose).mT
-        cells = views.visible[pose].cells
+        cells = views.visible[pose]
         nearest = torch.minimum(
-            self._distance(pose, look),
+            views.distances[pose][int(look.inner.fixated)],
             torch.where(belief.owner[0, cells] == pose, belief.closest[0, cells], torch.inf),
         )
         mine = (nearest <= belief.closest[0, cells]) | (belief.owner[0, cells] == pose)
@@ -150,23 +151,16 @@ class SceneObserver(Observer):
         after = (*belief.views[:pose], view, *belief.views[pose + 1 :])
         return SceneBelief(values, closest, owner, examined, belief.looks + 1, after)
 
-    def _distance(self, pose: int, look: _SceneLook) -> Tensor:
-        """Distances from the gaze to the cells that its view shows, `(V,)`."""
-        inner = look.inner
-        assert isinstance(inner, TargetLook | MapLook)
-        return self.views.distances[pose][int(inner.fixated)]
-
     def _probabilities(self, view: Belief) -> Tensor:
         """Belief about the cells of a view, `(C, cells)`."""
         if isinstance(self.inner, Target):
             return torch.cat([view.probability(0), view.chance(0)])
         return view.class_probabilities()[0].mT
 
-    def _unseen(self, look: Look, like: Tensor) -> Tensor:
+    def _unseen(self, look: EvidenceLook, like: Tensor) -> Tensor:
         """Values `(1, S, C)` of cells that were never seen."""
-        if isinstance(look, TargetLook) and self.prior is not None:
+        if isinstance(self.inner, Target) and self.prior is not None:
             return torch.full_like(like, self.prior)
-        assert isinstance(look, TargetLook | MapLook)
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
         blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
         probabilities = self._probabilities(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))

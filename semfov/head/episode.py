@@ -1,5 +1,6 @@
 """Episodes of an eye in a head: the loop of active perception over all poses and fixations."""
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -9,14 +10,13 @@ from torch import Tensor
 
 from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
+from semfov.episode import Looks, Sight, Stopwatch, rollout
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.head.belief import SceneBelief, SceneObserver
 from semfov.head.gain import OUT
 from semfov.head.views import Views
-from semfov.head.world import World
 
 Detect = Callable[[int], Detections]
 """Maps an action to its detections, a batch of one with boxes in pixels of the view."""
@@ -44,7 +44,7 @@ def live(eye: Eye, views: Views) -> Detect:
 
     The view of the last pose is kept for the next look at a picture; a camera takes a new frame for each look. If a
     frame was taken from a pose beside the one that was asked for, the eye fixates the same point of the scene, and the
-    boxes are moved to where the view from the right pose would show them.
+    boxes are moved to the smallest ones around them in the view from the right pose.
     """
     world = views.world
     opened: tuple[int, View] | None = None
@@ -60,24 +60,11 @@ def live(eye: Eye, views: Views) -> Detect:
         if at is pose:
             return eye.look(opened[1], views.view_grid.centres[cell][None]).to(pose.device)
         detections = eye.look(opened[1], world.to_view(views.gaze[action][None], at)[0]).to(pose.device)
-        return replace(detections, boxes=_boxes_from(world, detections.boxes, at, pose))
+        corners = detections.boxes[..., [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2) - 0.5
+        moved = world.to_view(world.to_scene(corners, at), pose)[0].view(*detections.boxes.shape[:-1], 4, 2) + 0.5
+        return replace(detections, boxes=torch.cat([moved.amin(-2), moved.amax(-2)], -1))
 
     return detect
-
-
-def _boxes_from(world: World, boxes: Tensor, at: Tensor, pose: Tensor) -> Tensor:
-    """Smallest boxes in the view from one pose around boxes in the view from another pose nearby.
-
-    >>> from semfov.head import Panorama
-    >>> world, box = Panorama((360, 180), (100, 100)), torch.tensor([[40.0, 40, 60, 60]])
-    >>> boxes_from(world, box, torch.tensor([10.0, 0, 60]), torch.tensor([0.0, 0, 60])).round()
-    tensor([[55., 40., 76., 60.]])
-
-    Shapes: boxes `(..., 4)`, at `(3,)`, pose `(3,)` → `(..., 4)`.
-    """
-    corners = boxes[..., [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2) - 0.5
-    moved = world.to_view(world.to_scene(corners, at), pose)[0].view(*boxes.shape[:-1], 4, 2) + 0.5
-    return torch.cat([moved.amin(-2), moved.amax(-2)], -1)
 
 
 @dataclass(frozen=True)
@@ -108,13 +95,10 @@ def look_around(
     """Run an episode and yield its looks one by one; the caller may stop at any time."""
     speeds = views.world.speeds
     numbers = [seed] if isinstance(seed, int) else [*seed]
-    generator = torch.Generator().manual_seed(_hash_of(numbers))
+    digest = hashlib.sha256(repr(numbers).encode()).digest()
+    generator = torch.Generator().manual_seed(int.from_bytes(digest[:8], "big") >> 1)
     looks = _HeadLooks(views, detect, target)
     spent, ahead, gain = speeds.look, 0.0, math.inf
-
-    def ends(step: Step) -> Tensor:
-        return torch.tensor([spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)])
-
     steps = rollout(
         looks,
         observer,
@@ -122,7 +106,7 @@ def look_around(
         torch.tensor([start]),
         Greedy(drawn_by(generator, len(views.grid), looks.like)),
         most=passes,
-        ends=ends,
+        ends=lambda _: torch.tensor([spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)]),
     )
     for step in steps:
         action = int(step.cell)
@@ -130,10 +114,3 @@ def look_around(
         ahead, gain = float(views.durations(action, speeds)[step.next_cell]), float(step.values[0, step.next_cell])
         assert isinstance(step.belief, SceneBelief)
         yield HeadStep(action, spent, step.belief, step.detections, chosen, ahead)
-
-
-def _hash_of(numbers: Sequence[int]) -> int:
-    """Combine several numbers into one seed of 63 bits."""
-    import hashlib
-
-    return int.from_bytes(hashlib.sha256(repr([*numbers]).encode()).digest()[:8], "big") >> 1

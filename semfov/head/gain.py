@@ -35,16 +35,11 @@ class LookGain(nn.Module, ABC):
     def __init__(self, views: Views) -> None:
         super().__init__()
         self.views = views
+        self._acuity = [views.acuity(distance) for distance in views.distances]
 
     @abstractmethod
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)` of all actions from the given poses; the values of other actions have no meaning.
-
-        Args:
-            belief: after the last look.
-            here: number of the present pose.
-            poses: numbers of the poses for which gains are needed.
-        """
+        """Gains `(A,)` of all actions from the given poses; the values of other actions have no meaning."""
 
 
 class SearchGain(LookGain):
@@ -73,7 +68,6 @@ class SearchGain(LookGain):
     def __init__(self, views: Views, foresight: float = FORESIGHT) -> None:
         super().__init__(views)
         self.foresight = foresight
-        self._acuity = [views.acuity(distance) for distance in views.distances]
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
         """Gains `(A,)`, in probabilities of a find."""
@@ -84,7 +78,7 @@ class SearchGain(LookGain):
         here_found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
         gains = torch.zeros_like(here_found)
         for pose in poses:
-            cells = views.visible[pose].cells
+            cells = views.visible[pose]
             aside = (self._acuity[pose] - sharpness[cells]).clamp(min=0) @ weighted[cells]
             rows = slice(pose * views.cells, (pose + 1) * views.cells)
             gains[rows] = here_found[rows] + self.foresight * aside
@@ -117,7 +111,6 @@ class ExploreGain(LookGain):
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
         self.model, self.unseen = model, unseen
-        self._acuity = [views.acuity(distance) for distance in views.distances]
         third = torch.tensor([CELL_POINTS // 5, CELL_POINTS // 2, CELL_POINTS - 1 - CELL_POINTS // 5])
         self._landings = (third[:, None] * CELL_POINTS + third).flatten()
 
@@ -129,7 +122,7 @@ class ExploreGain(LookGain):
         worth = torch.where(has_view, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
-            cells = views.visible[pose].cells
+            cells = views.visible[pose]
             rows = torch.arange(views.cells) if pose == here else self._landings
             total = self._acuity[pose][rows] @ worth[cells]
             some = has_view[cells]

@@ -106,13 +106,13 @@ class Panoramas:
         for latitude, number in self.rings:
             turn = float(generator.uniform(0, 360))
             places += [((turn + 360 * n / number) % 360 - 180, latitude) for n in range(number)]
-        return [self._patch(scene, *place) for scene, place in zip(order, places, strict=True)]
-
-    def _patch(self, scene: int, yaw: float, pitch: float) -> _Patch:
-        (wide, high), (width, height) = _SLOT, self.scenes.annotation(scene).size
-        scale = min(wide / width, high / height)
-        x, y = (wide - width * scale) / 2, (high - height * scale) / 2
-        return _Patch(scene, (yaw, pitch, self.slot), (x, y, wide - x, high - y))
+        patches = []
+        for scene, (yaw, pitch) in zip(order, places, strict=True):
+            (wide, high), (width, height) = _SLOT, self.scenes.annotation(scene).size
+            scale = min(wide / width, high / height)
+            x, y = (wide - width * scale) / 2, (high - height * scale) / 2
+            patches.append(_Patch(scene, (yaw, pitch, self.slot), (x, y, wide - x, high - y)))
+        return patches
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a panorama."""
@@ -156,19 +156,14 @@ class Panoramas:
         Returns:
             One region for each object.
         """
-        patches = self.patches(index)
-        photograph_boxes = [self.scenes.annotation(patch.index).boxes for patch in patches]
-        pairs = list(zip(patches, photograph_boxes, strict=True))
-        poses = [torch.tensor([patch.pose]).expand(len(own), 3) for patch, own in pairs]
-        boxes = [self._moved(own, patch) for patch, own in pairs]
+        poses, boxes = [], []
+        for patch in self.patches(index):
+            annotation, (x1, y1, x2, y2) = self.scenes.annotation(patch.index), patch.box
+            width, height = annotation.size
+            scale = annotation.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
+            boxes.append(annotation.boxes * scale + annotation.boxes.new_tensor([x1, y1] * 2))
+            poses.append(torch.tensor([patch.pose]).expand(len(annotation.boxes), 3))
         return Regions(Camera(torch.cat(poses), _SLOT), torch.cat(boxes))
-
-    def _moved(self, boxes: Tensor, patch: _Patch) -> Tensor:
-        """Boxes of a photograph `(M, 4)` in pixels of its slot."""
-        x1, y1, x2, y2 = patch.box
-        width, height = self.scenes.annotation(patch.index).size
-        scale = boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
-        return boxes * scale + boxes.new_tensor([x1, y1] * 2)
 
     def annotation(self, index: int) -> Annotation:
         """The objects of a panorama, without composing its pixels.

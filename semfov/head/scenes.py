@@ -67,18 +67,6 @@ class Panorama(Sphere):
         self.reach = reach
         self._source = None if pixels is None else go_around(even_rows(pixels)[None])[0]
 
-    def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
-        """Render the view in a direction.
-
-        Args:
-            direction: pan and tilt in degrees, to the right and up.
-            field: field of view across, in degrees.
-
-        Returns:
-            `(3, h, w)`, RGB in [0, 1].
-        """
-        return self.view(torch.tensor([*direction, field]))[0]
-
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Render the view of the camera."""
         if self._source is None:
@@ -193,18 +181,6 @@ class Flat(World):
         self.scene = Grid(max(1, round(2 * across / cell)), max(1, round(2 * up / cell)), self.picture)
         self.centres = self.scene.centres
         self.area = torch.ones(len(self.scene))
-
-    def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
-        """Show the window in a direction.
-
-        Args:
-            direction: degrees to the right of and above the middle of the picture.
-            field: width of the window in degrees.
-
-        Returns:
-            `(3, h, w)`, RGB in [0, 1].
-        """
-        return self.view(torch.tensor([*direction, field]))[0]
 
     def _box(self, pose: Tensor) -> tuple[int, int, int, int]:
         """The window of a pose in whole pixels."""

@@ -1,7 +1,6 @@
 """All poses of a head and all fixations of its eye, numbered as the actions of an episode."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -15,14 +14,6 @@ from semfov.head.world import World, check_fields
 
 CELL_POINTS = 10
 """Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
-
-
-@dataclass(frozen=True)
-class _VisibleCells:
-    """Cells of the scene that a view shows; cells `(V,)`, points `(V, 2)`."""
-
-    cells: Tensor
-    points: Tensor
 
 
 class Views:
@@ -44,7 +35,8 @@ class Views:
         view_grid: the cells of one view.
         gaze: `(A, D)`, point of the scene that each action fixates.
         gaze_cell: `(A,)`, cell of the scene that contains this point.
-        visible: for each pose, the cells of the scene that its view shows.
+        visible: for each pose, `(V,)`, the cells of the scene that its view shows.
+        points: for each pose, `(V, 2)`, the pixels of its view that show the middles of these cells.
 
     Raises:
         InputError: `fields` is empty or not ascending, or `fovea` is not positive.
@@ -73,15 +65,16 @@ class Views:
         self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.cell_of(self.gaze)
-        self.visible = [self._visible(pose) for pose in self.poses]
+        self.visible: list[Tensor] = []
+        self.points: list[Tensor] = []
+        for pose in self.poses:
+            points, inside = world.to_view(world.centres, pose)
+            self.visible.append(inside.nonzero()[:, 0])
+            self.points.append(points[inside])
 
     def __len__(self) -> int:
         """Number of poses."""
         return len(self.poses)
-
-    def _visible(self, pose: Tensor) -> _VisibleCells:
-        points, inside = self.world.to_view(self.world.centres, pose)
-        return _VisibleCells(inside.nonzero()[:, 0], points[inside])
 
     @property
     def cells(self) -> int:
@@ -100,7 +93,7 @@ class Views:
     def reachable(self) -> Tensor:
         """Cells of the scene that at least one view shows, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
-        reachable[torch.cat([each.cells for each in self.visible])] = True
+        reachable[torch.cat(self.visible)] = True
         return reachable
 
     def places(self, pose: int) -> Tensor:
@@ -112,7 +105,7 @@ class Views:
         Returns:
             `(V, 2)`, from -1 to 1 over the view.
         """
-        return 2 * (self.visible[pose].points + 0.5) / self.view_grid.extent - 1
+        return 2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
         """Interpolate values of a view's cells at the scene's cells that the view shows.
@@ -138,9 +131,9 @@ class Views:
         """
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []
-        for pose, visible in zip(self.poses, self.visible, strict=True):
+        for pose, points in zip(self.poses, self.points, strict=True):
             ratio = float(pose[2]) / self.fields[0]
-            result.append(ratio * (self.fovea + torch.cdist(centres, visible.points) / side) - self.fovea)
+            result.append(ratio * (self.fovea + torch.cdist(centres, points) / side) - self.fovea)
         return result
 
     def acuity(self, distance: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
@@ -32,11 +33,7 @@ class Places(Protocol):
 
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
-    """Raise `InputError` unless fields of view are ascending angles below 180 degrees.
-
-    >>> check_fields([30, 60])
-    (30.0, 60.0)
-    """
+    """Raise `InputError` unless fields of view are ascending angles below 180 degrees."""
     fits = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
     fits = fits and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
     check(fits, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
@@ -86,6 +83,18 @@ class World(ABC):
             `(3, h, w)`, RGB in [0, 1]; and the pose `(3,)` from which it was taken, `pose` itself where the head is
             exact.
         """
+
+    def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
+        """Render the view in a direction.
+
+        Args:
+            direction: pan and tilt in degrees, to the right and up.
+            field: field of view across, in degrees.
+
+        Returns:
+            `(3, h, w)`, RGB in [0, 1].
+        """
+        return self.view(torch.tensor([*direction, field]))[0]
 
     @abstractmethod
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:

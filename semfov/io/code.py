@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import subprocess
 import sys
-import sysconfig
 import uuid
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import cache
+from importlib import metadata
 from importlib.util import find_spec
+from inspect import getmodulename
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 _PACKAGE = "semfov"
 _THIS_PROCESS = uuid.uuid4().hex
-_LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib"))
+_LIBRARIES = {"site-packages", "dist-packages"}
 
 
 @cache
@@ -42,9 +47,9 @@ def class_digest(kind: type) -> str:
     """Compute a digest of the code of a user's class: its file, its bases' files, and the user's modules they import.
 
     Installed libraries do not count, and this package does not either: it has `package_digest`. A class that was typed
-    into an interpreter has no file, so its digest is valid in this process only.
+    into an interpreter has no file, so its digest is valid in this process only. Nothing is imported.
     """
-    modules = [base.__module__ for base in kind.__mro__ if not _of_others(base.__module__) or base is kind]
+    modules = [str(base.__module__) for base in kind.__mro__ if not _of_others(base.__module__) or base is kind]
     if any(_file(module) is None for module in modules):
         return f"{kind.__qualname__}, process {_THIS_PROCESS}"
     own = {module.partition(".")[0] for module in modules} - {_PACKAGE}
@@ -72,17 +77,32 @@ def _digest(files: Iterable[Path]) -> str:
 
 
 def _code(file: Path) -> str:
-    """sha256 of a file's syntax tree without docstrings."""
-    source = file.read_bytes()
+    """sha256 of a file's syntax tree without docstrings; of its bytes where Python cannot parse it."""
+    source = _source(file)
+    tree = _tree(source)
+    if tree is not None:
+        for node in ast.walk(tree):
+            body = getattr(node, "body", None)
+            if isinstance(body, list):
+                node.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
+        with suppress(RecursionError):
+            source = ast.dump(tree).encode()
+    return hashlib.sha256(source).hexdigest()
+
+
+def _source(file: Path) -> bytes:
+    """The content of a file; nothing where it cannot be read."""
     try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError):
-        return hashlib.sha256(source).hexdigest()
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+        return file.read_bytes()
+    except OSError:
+        return b""
+
+
+def _tree(source: bytes) -> ast.Module | None:
+    try:
+        return ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
 
 
 def _is_text(line: ast.AST) -> bool:
@@ -92,7 +112,7 @@ def _is_text(line: ast.AST) -> bool:
 def _imports(name: str, file: Path) -> Iterator[str]:
     """Dotted names of all imports in a module, at any depth; `from a import b` gives both `a` and `a.b`."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in ast.walk(_tree(_source(file)) or ast.Module([], [])):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -104,25 +124,68 @@ def _imports(name: str, file: Path) -> Iterator[str]:
 
 def _file(name: str) -> Path | None:
     """The source file of a module; None where the module does not exist or has no source."""
-    module = sys.modules.get(name)
-    origin = getattr(module, "__file__", None)
-    if module is None:
-        try:
+    origin = _found(name)[0]
+    with suppress(OSError, ValueError):
+        path = Path(origin) if isinstance(origin, str) else None
+        return path if path is not None and path.suffix == ".py" and path.is_file() else None
+    return None
+
+
+def _found(name: str) -> tuple[str | None, Iterable[str]]:
+    """The source of a module and the folders of its submodules; neither it nor its parents are imported."""
+    parent, _, last = name.rpartition(".")
+    try:
+        if name in sys.modules:
+            # Not by `getattr`, which makes a module that loads lazily load.
+            known = object.__getattribute__(sys.modules[name], "__dict__")
+            return known.get("__file__"), known.get("__path__") or ()
+        if not parent:
             spec = find_spec(name)
-        except (ImportError, ValueError):
-            return None
-        origin = None if spec is None else spec.origin
-    path = None if origin is None else Path(origin)
-    return path if path is not None and path.suffix == ".py" and path.is_file() else None
+            return (None, ()) if spec is None else (spec.origin, spec.submodule_search_locations or ())
+        folders = [Path(folder) / last for folder in _found(parent)[1]]
+        sources = [file for each in folders for file in (each / "__init__.py", each.with_name(f"{last}.py"))]
+        return next((str(file) for file in sources if file.is_file()), None), [str(folder) for folder in folders]
+    except Exception:  # finders and loaded modules are others' code, and may raise anything
+        return None, ()
 
 
 def _of_others(name: str) -> bool:
-    """Whether a module belongs to Python, to an installed library or to this package."""
+    """Whether a module belongs to Python, to a library or to this package: not to the user.
+
+    A library is in a folder of libraries, of this environment or of another, or where the metadata of its distribution
+    say that it is.
+    """
     top = name.partition(".")[0]
     if top == _PACKAGE or top in sys.stdlib_module_names:
         return True
     file = _file(top) or _file(name)
-    return file is not None and any(file.resolve().is_relative_to(folder) for folder in _LIBRARIES)
+    if file is None:
+        return False
+    with suppress(Exception):  # paths and damaged metadata may raise anything
+        whole = file.resolve()
+        if not _LIBRARIES.isdisjoint(file.parts + whole.parts):
+            return True
+        return any(map(whole.is_relative_to, _distributed(tuple(sys.path)).get(top, ())))
+    return False
+
+
+@cache
+def _distributed(path: tuple[str, ...]) -> dict[str, set[Path]]:
+    """The folders of distributions' modules, by the topmost module, where they are not in a folder of libraries."""
+    found: dict[str, set[Path]] = {}
+    for each in metadata.distributions(path=list(path)):
+        with suppress(Exception):
+            folder = Path(str(each.locate_file("")))
+            origin = json.loads(each.read_text("direct_url.json") or "{}")
+            if origin.get("dir_info", {}).get("editable"):
+                folder = Path(url2pathname(urlsplit(origin["url"]).path))
+            elif not _LIBRARIES.isdisjoint(folder.parts):
+                continue
+            tops = {file.parts[0] for file in each.files or ()}
+            names = {*(each.read_text("top_level.txt") or "").split(), each.name.replace("-", "_")}
+            for name in names | {getmodulename(top) or top for top in tops}:
+                found.setdefault(name, set()).add(folder.resolve())
+    return found
 
 
 def commit() -> str | None:

@@ -130,13 +130,9 @@ def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], exempt: set[str]
     return [
         f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
         for key in sorted((fitted.keys() | used.keys()) - exempt)
-        if _plain(fitted.get(key)) != _plain(used.get(key))
+        # As JSON, where lists and tuples look the same.
+        if json.dumps(fitted.get(key), sort_keys=True) != json.dumps(used.get(key), sort_keys=True)
     ]
-
-
-def _plain(value: Any) -> str:
-    """A value as JSON, where lists and tuples look the same."""
-    return json.dumps(value, sort_keys=True)
 
 
 def _describe(detector: Mapping[str, Any]) -> str:

@@ -19,10 +19,7 @@ _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
 PARTS = ("observation", "tempering", "evidence", "verification", "map", "windows")
-"""Parts that a folder may hold, in the order in which they are fitted.
-
-Folders of earlier versions have no `verification` or no `windows`.
-"""
+"""Parts that a folder may hold, in the order in which they are fitted."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 
@@ -122,7 +119,12 @@ class Manifest:
         parts = {name: Part(**part) for name, part in record["parts"].items()}
         for part in parts.values():
             if part.file is not None:
-                _check_file(inside(Path(folder), part.file), part.sha256)
+                file = inside(Path(folder), part.file)
+                check_regular(file)
+                if not file.is_file():
+                    raise DataError(f"{file}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
+                if sha256(file) != part.sha256:
+                    raise DataError(f"{file}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
         columns, rows = record["grid"]
         settings = {name: record[name] for name in ("detector", "sensor", "training")}
         return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **settings)
@@ -145,14 +147,6 @@ def find_file(place: Mapping[str, str], folder: str | PathLike[str]) -> Path | N
     """The file at a place from `place_of`, for the folder's present location; None where the file is missing."""
     paths = Path(folder) / place["relative"], Path(place["absolute"])
     return next((path for path in paths if path.is_file()), None)
-
-
-def _check_file(path: Path, digest: str | None) -> None:
-    check_regular(path)
-    if not path.is_file():
-        raise DataError(f"{path}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
-    if sha256(path) != digest:
-        raise DataError(f"{path}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -137,7 +137,7 @@ def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000,
 def _error_of(bins: Tensor) -> Tensor:
     """Expected calibration error from the sums of `reliability`.
 
-    >>> error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
+    >>> _error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
     tensor(0.1500)
 
     Shapes: bins `(3, bins)`.

@@ -1,7 +1,6 @@
 """Fit the Dirichlets of an observation model from statistics by class and level."""
 
 import warnings
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,23 +16,10 @@ _MAX_PRECISION = 1e6
 _UNIFORM = 1.0
 
 
-@dataclass(frozen=True)
-class _FittedTables:
-    """Everything that an observation model takes from the statistics of a training set.
-
-    Shapes: alpha `(K+1, N, K+1)`, log_prior `(K+1, N)`, expected `(K+1, N, K+1)`.
-    """
-
-    alpha: Tensor
-    log_prior: Tensor
-    expected: Tensor
-    record: dict[str, Any]
-
-
 def fit_tables(
     statistics: DirichletStatistics, *, method: Method, shrinkage: float, minimum: int, enough: int | None
-) -> _FittedTables:
-    """Fit all tables of an observation model, and warn of levels that fell back; arguments as for `_fit_table`."""
+) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    """Fit α, `ln π`, the expected scores and their record; warn of levels that fell back."""
     alpha, fallback = _fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
     if fallback:
         text = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
@@ -49,7 +35,7 @@ def fit_tables(
         "minimum": minimum,
         "enough": enough,
     }
-    return _FittedTables(alpha, prior, expected, record)
+    return alpha, prior, expected, record
 
 
 def _fit_table(
@@ -60,36 +46,21 @@ def _fit_table(
     minimum: int = 100,
     enough: int | None = None,
 ) -> tuple[Tensor, dict[int, int]]:
-    r"""Maximum a posteriori α for every class and level.
+    r"""Maximum a posteriori α `(K+1, N, K+1)` for every class and level, and the levels that fell back.
 
-    The mean log scores of a table cell (one class at one level) are shrunk towards those of its class over all
-    levels. The latter are shrunk, with a weight of one sample, towards those of Dir(1, ..., 1)
-    (`semfov.dirichlet.shrink`):
+    The mean log scores of a table cell (one class at one level) are shrunk towards those of its class over all levels.
+    The latter are shrunk, with a weight of one sample, towards those of Dir(1, ..., 1) (`semfov.dirichlet.shrink`):
 
     .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
               g_k = \frac{n_k \bar g_k + \psi(1) - \psi(K+1)}{n_k + 1}
 
     A class without samples gets the uniform density, and a cell without samples gets the density of its class. A level
-    with fewer than `minimum` objects takes the parameters of its inner neighbour.
+    with fewer than `minimum` objects takes the parameters of its inner neighbour. Level 0 has none: it is recorded as
+    falling back on itself, and keeps its shrunk estimate.
 
     Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say how they treat
     cells with few samples or none. Cells with `enough` detections get the maximum of the likelihood; the treatment of
     the others is our choice.
-
-    Args:
-        statistics: of shape `(K+1, N)`, background first.
-        method: a method of `semfov.dirichlet.mle`.
-        shrinkage: pseudo-counts w.
-        minimum: least number of objects in a level, background not counted.
-        enough: a cell with at least this many detections is fitted by maximum likelihood alone; None shrinks all
-            cells.
-
-    Returns:
-        α, `(K+1, N, K+1)` in float64, and the levels that fell back, each with the level whose parameters it took.
-        Level 0 has no inner neighbour: it is recorded as falling back on itself, and keeps its shrunk estimate.
-
-    Raises:
-        InputError: the statistics are not a table, or a setting is out of range.
     """
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
     classes = statistics.sum(1)
@@ -120,22 +91,9 @@ def _expected_table(statistics: DirichletStatistics, fallback: dict[int, int], s
 
 
 def _estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
-    r"""Logarithms of the class frequencies at each level, shrunk towards those over all levels.
+    r"""Logarithms of the class frequencies at each level, shrunk towards those over all levels; `(K+1, N)`.
 
     .. math:: \pi_{k,d} = \frac{n_{k,d} + w \pi_k}{n_d + w}, \qquad \pi_k = \frac{n_k + 1}{n + K + 1}
-
-    Args:
-        count: `(K+1, N)`, detections n of each class at each level, background first.
-        shrinkage: pseudo-counts w, positive.
-
-    Returns:
-        `(K+1, N)` in float64, `ln π`.
-
-    Raises:
-        InputError: `shrinkage` is not positive.
-
-    >>> estimate_prior(torch.tensor([[8], [0]]), 10.0).exp().flatten()
-    tensor([0.9444, 0.0556], dtype=torch.float64)
     """
     check(shrinkage > 0, "shrinkage", "a positive number of pseudo-counts", shrinkage)
     count = count.to(torch.float64)

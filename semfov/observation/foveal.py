@@ -14,9 +14,8 @@ from semfov.errors import InputError, check, check_finite, check_shape, check_te
 from semfov.io import compatibility
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
-from semfov.observation.dirichlet import floor
+from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.fitting import fit_tables
-from semfov.observation.log_linear import LinearCache, at_level, linear_map
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
 
@@ -136,7 +135,7 @@ class FovealObservationModel(Pretrained):
                 table = alpha.new_zeros(size)
             self.register_buffer(name, table)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        self._cache = LinearCache()
+        self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -201,7 +200,11 @@ class FovealObservationModel(Pretrained):
         )
         weight, constant = self._linear()
         log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
-        return at_level(log_scores, self.level(distance), weight, constant).to(scores.dtype)
+        # One product for all levels and a selection cost less than gathering a matrix for each detection.
+        every = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
+        level = self.level(distance)
+        index = level[..., None, None].expand(*level.shape, 1, components)
+        return every.gather(-2, index).squeeze(-2).to(scores.dtype)
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
         """Calibrated scores: the posterior probability of every class.
@@ -277,7 +280,7 @@ class FovealObservationModel(Pretrained):
     ) -> Self:
         """Set α to its maximum a posteriori estimate, given the statistics of a training set.
 
-        `semfov.observation.fitting.fit_table` explains the estimate and how it differs from that of the paper. A level
+        `semfov.observation.fitting.fit_tables` explains the estimate and how it differs from that of the paper. A level
         with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning reports it, and
         `metadata["fallback"]` records it.
 
@@ -306,12 +309,14 @@ class FovealObservationModel(Pretrained):
         check(got == required, "statistics", f"shape and epsilon {required}", got)
         check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
-        tables = fit_tables(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
-        self.log_alpha.copy_(tables.alpha.log())
-        self.log_prior.copy_(tables.log_prior if prior else torch.tensor(0.0))
+        alpha, log_prior, mean, record = fit_tables(
+            statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough
+        )
+        self.log_alpha.copy_(alpha.log())
+        self.log_prior.copy_(log_prior if prior else torch.tensor(0.0))
         self.tempering.fill_(tempering)
-        self.expected = tables.expected.to(self.log_alpha) if expected == "empirical" else None
-        self.metadata |= {**tables.record, "expected": expected, **metadata}
+        self.expected = mean.to(self.log_alpha) if expected == "empirical" else None
+        self.metadata |= {**record, "expected": expected, **metadata}
         return self
 
     def check_compatible(
@@ -389,7 +394,7 @@ class FovealObservationModel(Pretrained):
         Returns:
             This model.
         """
-        self._cache = LinearCache()
+        self._cache = None
         return super().train(mode)
 
     def extra_repr(self) -> str:
@@ -401,12 +406,17 @@ class FovealObservationModel(Pretrained):
         return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
 
     def _linear(self) -> tuple[Tensor, Tensor]:
-        """Weights and constants of the log likelihoods (`linear_map`), cached in `eval` mode and without gradients."""
+        """Weights and constants of the log likelihoods (`_linear_map`), cached in `eval` mode and without gradients."""
         parameter = self.log_alpha
         learning = self.training or (torch.is_grad_enabled() and parameter.requires_grad)
         if learning or torch.compiler.is_compiling() or parameter.is_inference():
-            return linear_map(self.alpha)
-        return self._cache(parameter)
+            return _linear_map(self.alpha)
+        key = (parameter, parameter._version, parameter.data_ptr())
+        kept = self._cache
+        if kept is None or kept[0] is not parameter or kept[1:3] != key[1:]:
+            with torch.inference_mode(False), torch.no_grad():
+                kept = self._cache = (*key, *_linear_map(parameter.exp()))
+        return kept[3:]
 
 
 class FoldedObservationModel(FovealObservationModel):
@@ -439,10 +449,18 @@ class FoldedObservationModel(FovealObservationModel):
             metadata=model.metadata,
         )
         with torch.no_grad():
-            weight, constant = linear_map(model.alpha)
+            weight, constant = _linear_map(model.alpha)
         self.register_buffer("weight", weight)
         self.register_buffer("constant", constant)
         self.requires_grad_(False).eval()
 
     def _linear(self) -> tuple[Tensor, Tensor]:
         return self.weight, self.constant
+
+
+def _linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights `(N (K+1), K+1)` and constants of the log likelihoods as a linear map of log scores, level by level."""
+    by_level = alpha.transpose(0, 1)
+    # ln Γ of large parameters is much larger than the differences between likelihoods: compute it in float64.
+    constant = -log_normaliser(by_level.to(torch.float64)).to(alpha.dtype)
+    return (by_level - 1).flatten(0, 1), constant.flatten()

@@ -8,13 +8,7 @@ from semfov.errors import check_shape
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """Intersection over union of every pair of boxes; 0 for boxes without area.
-
-    >>> box_iou(torch.tensor([[0.0, 0, 2, 2]]), torch.tensor([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
-    tensor([[0.3333, 0.0000]])
-
-    Shapes: boxes `(M, 4)`, others `(N, 4)` → `(M, N)`.
-    """
+    """Intersection over union of every pair of boxes, `(M, N)`; 0 for boxes without area."""
     check_shape(boxes, "boxes", None, 4)
     check_shape(others, "others", None, 4)
     boxes, others = (as_positions(each) for each in (boxes, others))

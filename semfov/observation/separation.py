@@ -1,26 +1,14 @@
 """Visibility: how well a target can be told from background at each level of distance, as d' of signal detection."""
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
 from semfov.errors import InputError, check_shape
 from semfov.observation.dirichlet import kl_divergence
+from semfov.observation.foveal import FovealObservationModel
 
 
-class ScoringModel(Protocol):
-    """The part of an observation model that `visibility` uses (see `semfov.FovealObservationModel`)."""
-
-    miss_rate: Tensor | None
-
-    @property
-    def alpha(self) -> Tensor:
-        """Dirichlet parameters, `(K+1, N, K+1)`, of the scores of each class at each level, background first."""
-        ...
-
-
-def visibility(model: ScoringModel) -> Tensor:
+def visibility(model: FovealObservationModel) -> Tensor:
     r"""Detectability index d' of every class against background, at every level of distance.
 
     The signal in a cell is the log likelihood ratio of target and background given the detection there, R = ln Dir(S |
@@ -72,14 +60,7 @@ def visibility(model: ScoringModel) -> Tensor:
 
 
 def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha).
-
-    >>> mean, variance = log_ratio_moments(*torch.tensor([[2.0, 2.0], [2.0, 1.0], [1.0, 2.0]]))
-    >>> mean, variance
-    (tensor(0.), tensor(1.2899))
-
-    Shapes: alpha `(..., K)`, target `(..., K)`, background `(..., K)`.
-    """
+    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha)."""
     check_shape(target, "target", alpha.shape[-1])
     check_shape(background, "background", alpha.shape[-1])
     # ln p/q under r is KL(r || q) - KL(r || p).

@@ -222,15 +222,10 @@ class DirichletStatistics:
 
 
 def _quantise(scores: Tensor, epsilon: float) -> Tensor:
-    """Round `ln s`, `s` and `s²` of scores to integers in units of 2^-32.
+    """Round `ln s`, `s` and `s²` of scores `(M, K)` to integers `(3, M, K)` in units of 2^-32.
 
     The sum that scales the scores is computed over integers, too: the last bit of a sum of floats can depend on the
     layout of the batch.
-
-    >>> quantise(torch.tensor([[0.5, 0.5]]), 1e-6)[1] / 2**32
-    tensor([[0.5000, 0.5000]])
-
-    Shapes: scores `(M, K)` → `(3, M, K)`.
     """
     raised = scores.to(torch.float64).clamp(min=epsilon).contiguous()
     total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)

@@ -9,24 +9,26 @@ from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from functools import cached_property
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
+import torch
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
+from semfov.data.large import LargePicture
 from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import InputError, check
 from semfov.paths.conversion import Conversion
-from semfov.paths.drawing import drawing_of
-from semfov.paths.endings import FIXATIONS, Ending, sentence
+from semfov.paths.endings import FIXATIONS, Ending
 from semfov.paths.files import Format
-from semfov.paths.merging import ConfirmedPlace, confirm, places_confirmed
+from semfov.paths.look import LookView, RecordedLook, read_region, whole_pixels
+from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -38,38 +40,12 @@ _COLUMNS = ["object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2",
 _NAMED = 5  # largest number of objects that the text form names
 
 
-@dataclass(frozen=True)
-class RecordedLook:
-    """One look of a record, in pixels of the picture.
-
-    Attributes:
-        number: number of the look, from 0.
-        fixation: `(x, y)`, the fixated point.
-        region: `(x1, y1, x2, y2)`, the part of the picture that the look shows.
-        detections: its detections, a batch of one.
-        seconds: time that it took; None if it is not known.
-        value: value for which it was chosen; None if it was not chosen by a value.
-
-    Example::
-
-        for look in agent.search("kitchen.jpg", "cup"):
-            print(look.number, look.fixation, look.seconds)
-    """
-
-    number: int
-    fixation: tuple[float, float]
-    region: tuple[float, float, float, float]
-    detections: Detections
-    seconds: float | None = None
-    value: float | None = None
-
-
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Record(Conversion):
-    """Base of all records: what was looked for, what was found, and what was decided, in words and as tables.
+    """Base of all records: its looks, what was looked for, what was found, and what was decided.
 
-    Iterating over a record gives its looks one by one (`RecordedLook`). Its objects are one set: those that `describe`
-    counts, `plot` draws and `objects` returns.
+    A record is the list of its looks (`looks`, or by iteration) and what its kind adds. Its objects are one set: those
+    that `describe` counts, `plot` draws and `objects` returns. All points and boxes are in pixels of the picture.
 
     Attributes:
         classes: names of the classes, background first.
@@ -96,7 +72,66 @@ class Record(Conversion):
     photograph: Tensor | None = None
     source: str | None = None
 
+    how: ClassVar[Literal["fovea", "windows", "head"]]
+    """Kind of look: of a fovea, at windows, or of a head that turns."""
+
     _format: ClassVar[Format]
+
+    @property
+    @abstractmethod
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
+
+    @abstractmethod
+    def _looks(self) -> Iterator[RecordedLook]:
+        """The looks in their order, made anew."""
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Describe the outcome in one line."""
+
+    @cached_property
+    def looks(self) -> tuple[RecordedLook, ...]:
+        """The looks in their order."""
+        return tuple(self._looks())
+
+    def __iter__(self) -> Iterator[RecordedLook]:
+        """The looks in their order."""
+        return iter(self.looks)
+
+    def __len__(self) -> int:
+        """Number of looks, the first included."""
+        return len(self.looks)
+
+    @property
+    def passes(self) -> int:
+        """Number of passes of the detector, closer looks included."""
+        return len(self) + sum(look.number is None for look in self.closer_looks)
+
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
+        """The closer looks."""
+        return ()
+
+    @property
+    def target_name(self) -> str | None:
+        """Name of the class that was searched for; None for all classes."""
+        return None if self.target is None else self.classes[self.target]
+
+    @property
+    def measure(self) -> str:
+        """What `least` is compared with, in a word: `score`, or `probability`."""
+        return "score"
+
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
+        return "probability"
+
+    @property
+    def image(self) -> Tensor | None:
+        """The reduced picture, `(3, h, w)` in [0, 1]; None if it was not kept."""
+        return None if self.photograph is None else self.photograph.float() / 255
 
     def is_whole(self, region: Sequence[float]) -> bool:
         """Whether a region is the whole picture, up to a pixel.
@@ -110,44 +145,18 @@ class Record(Conversion):
         (x1, y1, x2, y2), (width, height) = region, self.size
         return x2 - x1 > width - 1 and y2 - y1 > height - 1
 
-    @property
-    def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
-        return "probability"
-
-    @property
-    def target_name(self) -> str | None:
-        """Name of the class that was searched for; None for all classes."""
-        return None if self.target is None else self.classes[self.target]
-
-    @property
-    def measure(self) -> str:
-        """What `least` is compared with, in a word: `score`, or `probability`."""
-        return "score"
-
-    @property
-    @abstractmethod
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the picture in pixels."""
-
-    @property
-    def image(self) -> Tensor | None:
-        """The reduced picture, `(3, h, w)` in [0, 1]; None if it was not kept."""
-        return None if self.photograph is None else self.photograph.float() / 255
-
-    @property
-    @abstractmethod
-    def passes(self) -> int:
-        """Number of passes of the detector, closer looks included."""
-
-    @abstractmethod
-    def __iter__(self) -> Iterator[RecordedLook]:
-        """The looks in their order."""
-
     @cached_property
     def candidates(self) -> Objects:
-        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels."""
-        raise NotImplementedError
+        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
+
+        Of several boxes of one object, the box of the nearest fixation is kept, or that of a closer look. The score of
+        a closer look is the probability that the target is there.
+        """
+        looks = [look.detections for look in self]
+        distances = [
+            distances_to(look.detections.boxes[0], torch.tensor(look.fixation, dtype=torch.float64)) for look in self
+        ]
+        return merge_fixations(looks, distances, self.closer_looks)
 
     @property
     def objects(self) -> Objects:
@@ -169,43 +178,40 @@ class Record(Conversion):
         return self.decision is not None or len(self.closer_looks) > 0
 
     @property
+    def refuted(self) -> list[CloseUp]:
+        """The closer looks that did not confirm that the target is there."""
+        boxes = [box for box, *_ in self._confirmed_places]
+        return [look for look in self.closer_looks if not any(look.box.equal(box) for box in boxes)]
+
+    @property
     def expected(self) -> dict[str, float]:
         """Expected number of objects by the name of their class; without a model of it, the number of `objects`."""
         counts = Counter(self.objects.labels.tolist())
-        labels = self._sought() or tuple(counts)
+        labels = self._sought or tuple(counts)
         return {self.classes[label]: float(counts[label]) for label in labels}
 
+    @property
     def _sought(self) -> tuple[int, ...]:
         """Classes that were searched for; none stands for all."""
         return self.targets or (() if self.target is None else (self.target,))
 
+    @property
+    def _confirmed_places(self) -> list[tuple[Tensor, int, float, int]]:
+        """Box, class, probability and look of the places that closer looks and the decision confirmed."""
+        decision, closer = self.decision, self.closer_looks
+        box = decision.box if decision is not None and decision.outcome == "found" else None
+        others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
+        places = [(look.box, look.target, look.place, number_of(look)) for look in others]
+        if box is not None and decision is not None and self.target is not None:
+            number = next((number_of(look) for look in closer if look.box.equal(box)), len(self) - 1)
+            probability = decision.probability if decision.place is None else decision.place
+            places.append((box, self.target, probability, number))
+        return places
+
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        return confirm(self.candidates.of(self._sought()), self._confirmations(), self.least)
-
-    @property
-    def refuted(self) -> list[CloseUp]:
-        """The closer looks that did not confirm that the target is there."""
-        boxes = [place.box for place in self._confirmations()]
-        return [look for look in self.closer_looks if not any(look.box.equal(box) for box in boxes)]
-
-    def _confirmations(self) -> list[ConfirmedPlace]:
-        """Places that closer looks and the decision confirmed."""
-        return places_confirmed(self._decision_in_picture(), self.target, self.closer_looks, self._last())
-
-    def _last(self) -> int:
-        """Number of the last look."""
-        return 0
-
-    @property
-    def closer_looks(self) -> Sequence[CloseUp]:
-        """The closer looks."""
-        return ()
-
-    def _decision_in_picture(self) -> Decision | None:
-        """The decision, with its box in pixels of the picture."""
-        return self.decision
+        return confirm(self.candidates.of(self._sought), self._confirmed_places, self.least)
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say from which score on.
@@ -214,28 +220,16 @@ class Record(Conversion):
             A phrase such as `2 × person from score 0.3`.
         """
         labels = self.objects.labels
-        names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought()]
+        names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought]
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
         return f"{', '.join(names) or every} from {self.measure} {self.least:g}"
-
-    @abstractmethod
-    def describe(self) -> str:
-        """Describe the outcome in one line."""
 
     def summary(self) -> str:
         """Describe the outcome, and explain why it ended if it did."""
         return self.describe()
 
     def __repr__(self) -> str:
-        """The summary, and lines about the looks."""
-        return "\n".join([f"{type(self).__name__}: {self.summary()}", *(f"  {line}" for line in self._lines())])
-
-    def _lines(self) -> list[str]:
-        """Lines of the text form after the summary."""
-        return [self._listed()]
-
-    def _listed(self) -> str:
-        """The most confident objects in words."""
+        """The summary, the looks, and the most confident objects."""
         objects, sure = self.objects, self.confirmed.tolist()
         named = [
             f"{self.classes[label]} {score:.2f}{' (confirmed)' if confirmed else ''}"
@@ -244,15 +238,79 @@ class Record(Conversion):
             )
         ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
-        return f"objects from {self.measure} {self.least:g}: {', '.join([*named, *more]) or 'none'}"
+        found = f"objects from {self.measure} {self.least:g}: {', '.join([*named, *more]) or 'none'}"
+        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])
+
+    def _lines(self) -> list[str]:
+        """Lines of the text form on the looks."""
+        return []
+
+    def outline(self, look: RecordedLook) -> Tensor | None:
+        """The border of what a look shows.
+
+        Args:
+            look: the look.
+
+        Returns:
+            `(P, 2)`, points in picture pixels, the first one again at the end; None for the whole picture.
+        """
+        x1, y1, x2, y2 = look.region
+        corners = [(x1, y1), (x2, y1), (x2, y2), (x1, y2), (x1, y1)]
+        return None if self.is_whole(look.region) else torch.tensor(corners)
+
+    @property
+    def around(self) -> float | None:
+        """Width in pixels after which the picture repeats, as a panorama does; None for other pictures."""
+        return None
+
+    def belief_map(self, number: int) -> tuple[Grid, Tensor] | None:
+        """The belief after a look.
+
+        Args:
+            number: number of the look.
+
+        Returns:
+            The cells, and the probability `(cells,)` that each of them holds the target, or any object; None for
+            windows.
+        """
+        return None
+
+    def look_views(self, source: LargePicture) -> Iterator[LookView]:
+        """What the looks showed, as sharp as the detector saw it.
+
+        Args:
+            source: the opened picture, in any size.
+
+        Yields:
+            Pixels, boxes and gaze of each look.
+        """
+        for look in self:
+            x1, y1, x2, y2 = whole_pixels(look.region, self.size)
+            across = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
+            boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
+            (x, y), pixels = look.fixation, read_region(source, (x1, y1, x2, y2), self.size, across)
+            yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
+
+    @property
+    def values_in_words(self) -> str:
+        """What the values of the looks are; empty where their columns tell it."""
+        return ""
+
+    def sensor_in_words(self) -> str | None:
+        """Describe through what was looked.
+
+        Returns:
+            The description; None if it is not known.
+        """
+        return None
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the looks and the objects on the picture.
 
         Args:
             ax: axes to draw in; None makes a new figure.
-            options: options of the function that draws this kind of records, such as `image`, the picture, which must
-                be given where the record does not keep it.
+            options: those of `semfov.viz.plot_scanpath`, such as `image`, the picture, which must be given where the
+                record does not keep it.
 
         Returns:
             The figure.
@@ -260,17 +318,17 @@ class Record(Conversion):
         Raises:
             InputError: the picture was not kept, and none is given.
         """
-        figure: Figure = drawing_of("plot", type(self))(self, ax=ax, **options)
-        return figure
+        from semfov.viz.scanpath import plot_scanpath
+
+        return plot_scanpath(self, ax=ax, **options)
 
     def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
         """Make a film of the looks, one frame for each.
 
         Args:
             path: GIF file to write; None returns the film for a notebook.
-            options: options of the function that draws this kind of records: `seconds`, the duration of a frame;
-                `hold`, the additional duration of the last frame; and `image`, the picture, which must be given where
-                the record does not keep it.
+            options: those of `semfov.viz.animate`: `seconds`, the duration of a frame; `hold`, the additional duration
+                of the last frame; and `image`, the picture, which must be given where the record does not keep it.
 
         Returns:
             The path, or an object that a notebook shows as an animation.
@@ -279,7 +337,9 @@ class Record(Conversion):
             InputError: the picture was not kept, and none is given.
             DataError: the file cannot be written.
         """
-        return drawing_of("animate", type(self))(self, path, **options)
+        from semfov.viz.animation import animate
+
+        return animate(self, path, **options)
 
     def report(self, path: str | PathLike[str], **options: Any) -> Path:
         """Write an HTML page of the looks and the objects, a single file that loads nothing from elsewhere.
@@ -287,7 +347,7 @@ class Record(Conversion):
         Args:
             path: the file.
             options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
-                record keeps. `name`, the name of the picture on the page.
+                record keeps. `name`, the name of the picture on the page. `boxes`, `(M, 4)`, true boxes of the target.
 
         Returns:
             The path.
@@ -296,47 +356,73 @@ class Record(Conversion):
             InputError: the picture was not kept, and none is given.
             DataError: the file cannot be written.
         """
-        written: Path = drawing_of("report", type(self))(self, path, **options)
-        return written
+        from semfov.report.page import write_page
+
+        return write_page(Path(path), f"semfov: {self.describe()}", [self.page_data(**options)])
+
+    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
+        """Collect the data of the record for a page (`semfov.report.zoom_data`, for a scanpath `episode_data`).
+
+        Args:
+            picture: the picture in full size; None takes the one that the record keeps.
+            name: name of the picture; None takes that of its file, or its size.
+            options: further arguments of the function.
+
+        Returns:
+            The data, for `semfov.report.write_page`.
+
+        Raises:
+            InputError: the picture is not that of the record, or was not kept.
+        """
+        from semfov.report.zoom import zoom_data
+
+        return zoom_data(self, picture, name=name or self._picture_name, **options)
+
+    @property
+    def _picture_name(self) -> str:
+        """Name of the picture on a page: that of its file, or its size."""
+        width, height = self.size
+        return Path(self.source).name if self.source else f"{width} × {height} px"
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
-        return str(drawing_of("notebook", type(self))(self))
+        from semfov.report.notebook import record_html
 
-    @abstractmethod
+        return record_html(self)
+
     def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values.
+        """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
+
+        `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
+        the picture that it shows, in picture pixels. `detections` is the number of detections, `seen` the class of the
+        most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on the clock of
+        the episode. `value` is that for which the look was chosen. `closer` is the probability that the target is
+        there, by a closer look that this is, or that follows it. `brought` is the number of objects that it shows most
+        sharply. The columns that the kind adds come last.
 
         Returns:
             One dictionary for each look.
         """
-
-    def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as a table of plain values, one row for each object, most confident first.
-
-        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
-        number of the look that shows it most sharply.
-
-        Returns:
-            One dictionary for each object.
-        """
-        objects = self.objects
-        columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
-        return [
-            {
-                "object": number,
-                "class": self.classes[label],
-                "score": score,
-                "confirmed": sure,
-                "x": (box[0] + box[2]) / 2,
-                "y": (box[1] + box[3]) / 2,
-                **dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
-                "look": look,
-            }
-            for number, (label, score, sure, look, box) in enumerate(
-                zip(*(column.tolist() for column in columns), strict=True)
+        closer = {number_of(look): look.place for look in self.closer_looks}
+        brought = Counter(self.objects.passes.tolist())
+        rows = []
+        for look in self:
+            count = int(look.detections.count.sum())
+            rows.append(
+                {
+                    "look": look.number,
+                    **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
+                    "detections": count,
+                    "seen": self.classes[int(look.detections.labels.flatten()[0])] if count else None,
+                    "score": float(look.detections.confidence.flatten()[0]) if count else None,
+                    "seconds": look.seconds,
+                    "value": look.value,
+                    "closer": closer.get(look.number),
+                    "brought": brought[look.number],
+                    **look.more,
+                }
             )
-        ]
+        return rows
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the record to a safetensors file, atomically.
@@ -407,15 +493,6 @@ class Record(Conversion):
         rows, columns = (self.rows(), None) if table == "looks" else (self.object_rows(), _COLUMNS)
         return pandas.DataFrame(rows, columns=columns)
 
-    def _detected(self, look: Detections) -> dict[str, Any]:
-        """Columns of a table on the detections of a look: their number, and the most confident one."""
-        count = int(look.count.sum())
-        return {
-            "detections": count,
-            "seen": self.classes[int(look.labels.flatten()[0])] if count else None,
-            "score": float(look.confidence.flatten()[0]) if count else None,
-        }
-
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class GazeRecord(Record):
@@ -431,7 +508,7 @@ class GazeRecord(Record):
         found: whether a search found its target.
         closer: closer looks of a search, in order.
         ending: reason for the end; None if it is not known.
-        seconds: times of the looks; empty if they are not known.
+        seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
 
     Example::
 
@@ -446,64 +523,11 @@ class GazeRecord(Record):
     ending: Ending | None = None
     seconds: tuple[Any, ...] = ()
 
-    how: ClassVar[Literal["fovea", "windows", "head"]]
-    """Kind of look: of a fovea, at windows, or of a head that turns."""
-
     _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
     def __len__(self) -> int:
         """Number of looks, the first included."""
         return len(self.detections)
-
-    def __iter__(self) -> Iterator[RecordedLook]:
-        """The looks in their order."""
-        for number, (x, y) in enumerate(self._gaze()[0].tolist()):
-            yield RecordedLook(
-                number,
-                (x, y),
-                self.region(number),
-                self._in_picture(number),
-                self._duration(number),
-                self._value(number),
-            )
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the picture in pixels."""
-        return self._gaze()[1]
-
-    @property
-    def passes(self) -> int:
-        """Number of passes of the detector, closer looks included."""
-        return len(self.detections) + len(self.closer)
-
-    def region(self, number: int) -> tuple[float, float, float, float]:
-        """Part of the picture that a look showed.
-
-        Args:
-            number: number of the look, from 0.
-
-        Returns:
-            `(x1, y1, x2, y2)` in picture pixels.
-        """
-        width, height = self.size
-        return 0.0, 0.0, float(width), float(height)
-
-    def _in_picture(self, number: int) -> Detections:
-        """Detections of a look, with boxes in pixels of the picture."""
-        return self.detections[number]
-
-    def _duration(self, number: int) -> float | None:
-        """Time that a look took."""
-        return float(self.seconds[number]) if self.seconds else None
-
-    def _value(self, number: int) -> float | None:
-        """Value for which a look was chosen."""
-        return None
-
-    def _last(self) -> int:
-        """Number of the last look."""
-        return len(self) - 1
 
     @property
     def closer_looks(self) -> Sequence[CloseUp]:
@@ -516,11 +540,17 @@ class GazeRecord(Record):
         Returns:
             The sentence; empty if the reason is not known.
         """
+        sentences, looks = self._sentences, self.passes
         if self.closer and self.found:
-            return self._sentences["closer found"]
-        outcome = None if self.decision is None else self.decision.outcome
-        looks = self.passes if self.ending == "passes" else len(self)
-        return sentence(self._sentences, self.ending, outcome, looks, closer=bool(self.closer))
+            return sentences["closer found"]
+        if self.ending == "decision" and self.decision is not None:
+            outcome = self.decision.outcome
+            return sentences.get(f"closer {outcome}" if self.closer else outcome, sentences[outcome])
+        if self.ending == "shifts":
+            return f"All {len(self) - 1} gaze shifts were made."
+        if self.ending == "passes":
+            return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
+        return sentences.get(self.ending or "", "")
 
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
@@ -536,15 +566,9 @@ class GazeRecord(Record):
         Returns:
             The fixations, with the target of a search and whether it was found.
         """
-        points, size = self._gaze()
-        return Fixations(
-            picture,
-            subject,
-            points.detach().double().cpu().numpy(),
-            size,
-            target=self.target_name,
-            found=None if self.target is None else self.found,
-        )
+        points = torch.tensor([look.fixation for look in self], dtype=torch.float64).view(-1, 2).numpy()
+        found = None if self.target is None else self.found
+        return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
 
     def compare(
         self, people: Fixations | Sequence[Fixations] | str | PathLike[str]
@@ -557,33 +581,6 @@ class GazeRecord(Record):
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.
         """
-        scores: Mapping[str, tuple[float, float]] = drawing_of("compare", type(self))(self, people)
-        return scores
+        from semfov.metrics.scanpath.beside import compare_scanpath
 
-    @abstractmethod
-    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
-        """Fixated points `(n, 2)` in pixels of the picture, and its `(width, height)`."""
-
-
-def detections_in_words(detections: Detections, classes: Sequence[str], most: int = 3, score: float = 0.0) -> str:
-    """Name the most confident detections of a look.
-
-    Args:
-        detections: detections of one image, the most confident first.
-        classes: names of the classes, background first.
-        most: largest number of detections that are named.
-        score: least confidence of the detections that count.
-
-    Returns:
-        The text.
-
-    >>> import torch
-    >>> cups = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.1, 0.9], [0.4, 0.6]]]), torch.ones(1, 2).bool())
-    >>> detections_in_words(cups, ("background", "cup"), most=1), detections_in_words(cups, ("", "cup"), score=0.95)
-    ('cup 0.90 and 1 more', 'nothing')
-    """
-    columns = (detections.labels, detections.confidence, detections.mask)
-    looks = zip(*(column.flatten().tolist() for column in columns), strict=True)
-    sure = [f"{classes[label]} {confidence:.2f}" for label, confidence, real in looks if real and confidence >= score]
-    more = f" and {len(sure) - most} more" if len(sure) > most else ""
-    return ", ".join(sure[:most]) + more or "nothing"
+        return compare_scanpath(self, people)

@@ -26,7 +26,7 @@ _PIXELS = "pixels of the picture: x to the right, y down"
 
 
 class Conversion(ABC):
-    """Conversion of objects with names of classes to the formats of other libraries, and of maps."""
+    """Conversion of objects with names of classes to a table, and to the formats of other libraries and of maps."""
 
     classes: tuple[str, ...]
     source: str | None
@@ -41,9 +41,32 @@ class Conversion(ABC):
     def confirmed(self) -> Tensor:
         """Which of them were confirmed."""
 
-    @abstractmethod
     def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as a table."""
+        """The objects as a table of plain values, one row for each object, most confident first.
+
+        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
+        number of the look that shows it most sharply.
+
+        Returns:
+            One dictionary for each object.
+        """
+        objects = self.objects
+        columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
+        return [
+            {
+                "object": number,
+                "class": self.classes[label],
+                "score": score,
+                "confirmed": sure,
+                "x": (box[0] + box[2]) / 2,
+                "y": (box[1] + box[3]) / 2,
+                **dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
+                "look": look,
+            }
+            for number, (label, score, sure, look, box) in enumerate(
+                zip(*(column.tolist() for column in columns), strict=True)
+            )
+        ]
 
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
-
-from semfov.decision import Outcome
 
 Ending = Literal[
     "box", "decision", "detection", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
@@ -14,9 +11,6 @@ Ending = Literal[
 showed the target at the gaze in a search whose belief has no thresholds, no look was worth it, all gaze shifts were
 made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
 machine was over, the time of the scene was over, or the caller stopped it."""
-
-RENAMED: Mapping[str, Ending] = {"price": "worth"}
-"""Endings that files of earlier versions call by another name."""
 
 FIXATIONS = {
     "box": "The gaze is on a box of the target.",
@@ -48,20 +42,3 @@ WINDOWS = {
     "closer undecided": "No closer look was sure enough, but the target is probably there.",
 }
 """Sentences for looks at windows, by the ending, or by the outcome of the decision that ended the search."""
-
-
-def sentence(
-    sentences: Mapping[str, str], ending: Ending | None, outcome: Outcome | None, looks: int, *, closer: bool
-) -> str:
-    """Explain in one sentence why a search or an exploration ended.
-
-    >>> sentence(FIXATIONS, "shifts", None, 8, closer=False), sentence(WINDOWS, "decision", "absent", 3, closer=True)
-    ('All 7 gaze shifts were made.', 'No closer look was sure enough, and the target is probably absent.')
-    """
-    if ending == "decision" and outcome is not None:
-        return sentences.get(f"closer {outcome}", sentences[outcome]) if closer else sentences[outcome]
-    if ending == "shifts":
-        return f"All {looks - 1} gaze shifts were made."
-    if ending == "passes":
-        return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
-    return sentences.get(ending or "", "")

@@ -2,41 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from os import PathLike
-from typing import Any, Self, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST
 from semfov.errors import DataError, InputError, check
-from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Size, Text
+from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
 from semfov.io.storage import read, write_file
-from semfov.paths.endings import RENAMED, Ending
+from semfov.paths.endings import Ending
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
 
 WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
+SIDE = Number(low=1, high=10_000, whole=True)
 
-_DECISION = {
-    "outcome": Text(get_args(Outcome)),
-    "probability": Number(),
+_DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
+_CLOSER = {
+    "fixation": Maybe(WHOLE),
+    "number": Maybe(WHOLE),
+    "target": WHOLE,
     "cell": Maybe(WHOLE),
-    "place": Maybe(CHANCE),
+    "place": CHANCE,
+    "presence": CHANCE,
 }
-_CLOSER = {"fixation": WHOLE, "target": WHOLE, "cell": WHOLE, "number": WHOLE, "place": CHANCE, "presence": CHANCE}
 _DETECTIONS = {
     "boxes": Field(("M", 4), mixed=True),
     "scores": Field(("M", "C"), mixed=True),
     "mask": Field(("M",), dtype=torch.bool),
 }
-
-_BOXES: dict[str, tuple[Size, ...]] = {"box": (4,), "closer_boxes": ("Q", 4)}
-_PHOTOGRAPH = Field((3, "h", "w"), dtype=torch.uint8, optional=True)
+_OPTIONAL = {
+    "box": Field((4,), mixed=True, optional=True),
+    "closer_boxes": Field(("Q", 4), mixed=True, optional=True),
+    "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
+}
+_SHARED = {
+    "version": Text(),
+    "classes": Array(Text(), "C", least=2),
+    "lengths": Array(WHOLE, "n", least=1),
+    "target": Maybe(WHOLE),
+    "targets": Array(WHOLE),
+    "found": Flag(),
+    "least": CHANCE,
+    "source": Maybe(Text()),
+    "ending": Maybe(Text(get_args(Ending))),
+    "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
+    "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
+}
+_PLAIN = "target", "found", "least", "source", "ending"
 
 
 def pair(of: Json) -> Pair:
@@ -44,43 +62,24 @@ def pair(of: Json) -> Pair:
     return Pair((of, of))
 
 
-@dataclass(frozen=True)
+def grid_values(grid: Grid) -> dict[str, Any]:
+    """The JSON values of a grid."""
+    size = grid.size.tolist() if isinstance(grid.size, Tensor) else list(grid.size)
+    return {"grid": [grid.columns, grid.rows], "size": size}
+
+
+def grid_from(record: Mapping[str, Any]) -> Grid:
+    """The grid with these JSON values."""
+    columns, rows = record["grid"]
+    return Grid(columns, rows, tuple(record["size"]))
+
+
 class Format:
-    """Format of the files of one kind of records."""
+    """Format of the files of one kind of records: what they have beside the attributes of the base."""
 
-    kind: str
-    schema: Schema
-    closer: tuple[str, ...]
-
-    @classmethod
-    def of(
-        cls,
-        kind: str,
-        tensors: Mapping[str, Field],
-        record: Mapping[str, Json],
-        *,
-        endings: Sequence[Ending],
-        closer: Sequence[str],
-    ) -> Self:
-        """Make the format of a kind from what its records have beside the attributes of the base."""
-        shared: dict[str, Json] = {
-            "version": Text(),
-            "classes": Array(Text(), "C", least=2),
-            "lengths": Array(WHOLE, "n", least=1),
-            "target": Maybe(WHOLE),
-            "found": Flag(),
-            # Files of earlier versions have neither `place` nor `closer`.
-            "decision": Maybe(Object(_DECISION, None, ("outcome", "probability", "cell"))),
-            "closer": Maybe(Array(Object({name: _CLOSER[name] for name in closer}, None, tuple(closer)))),
-            # Nor these.
-            "targets": Maybe(Array(WHOLE)),
-            "least": Maybe(CHANCE),
-            "source": Maybe(Text()),
-            "ending": Maybe(Text((*endings, *(old for old, new in RENAMED.items() if new in endings)))),
-        }
-        boxes = {name: Field(shape, mixed=True, optional=True) for name, shape in _BOXES.items()}
-        boxes["photograph"] = _PHOTOGRAPH
-        return cls(kind, Schema({**tensors, **_DETECTIONS, **boxes}, shared | dict(record)), tuple(closer))
+    def __init__(self, kind: str, tensors: Mapping[str, Field], record: Mapping[str, Json]) -> None:
+        self.kind = kind
+        self.schema = Schema({**tensors, **_DETECTIONS, **_OPTIONAL}, {**_SHARED, **record})
 
     def write(
         self,
@@ -99,16 +98,14 @@ class Format:
             "version": __version__,
             "classes": list(fields["classes"]),
             "lengths": [look.mask.shape[-1] for look in looks],
-            **{name: fields[name] for name in ("target", "found", "ending", "least", "source")},
+            **{name: fields[name] for name in _PLAIN},
             "targets": list(fields["targets"]),
-            "decision": None,
-            "closer": [{name: getattr(look, name) for name in self.closer} for look in fields["closer"]],
+            "decision": decision and {name: getattr(decision, name) for name in _DECISION},
+            "closer": [{name: getattr(look, name) for name in _CLOSER} for look in fields["closer"]],
             **record,
         }
-        if decision is not None:
-            values["decision"] = {name: getattr(decision, name) for name in _DECISION}
-            if decision.box is not None:
-                whole["box"] = decision.box
+        if decision is not None and decision.box is not None:
+            whole["box"] = decision.box
         if fields["photograph"] is not None:
             whole["photograph"] = fields["photograph"]
         if fields["closer"]:
@@ -116,49 +113,41 @@ class Format:
         write_file(path, whole, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-        """Read a file that `write_file` wrote, and check it."""
+        """Read and check a file that `write` wrote: its tensors, its JSON values, and the attributes of the base."""
         tensors, record = read(path, self.kind)
         record.pop("kind")
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
-        return tensors, record, self._restored(tensors, record)
+        return tensors, record, _restored(tensors, record)
 
     def refused(self, path: str | PathLike[str], error: InputError) -> DataError:
         """The error that reports a file with wrong content."""
         return DataError(f"{path}: expected a complete {self.kind}, got: {' '.join(str(error).split())}")
 
-    def _restored(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:
-        """Make the attributes of the base, and check that they fit each other."""
-        classes, target, lengths = tuple(record["classes"]), record.get("target"), record["lengths"]
-        check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
-        check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
-        targets, least = tuple(record.get("targets") or ()), record.get("least")
-        check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
-        photograph = tensors.get("photograph")
-        sides = (1,) if photograph is None else photograph.shape[1:]
-        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
-        looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
-        decision, closer = record.get("decision"), record.get("closer") or []
-        boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
-        check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
-        for look in closer:
-            number = look.get("fixation", look.get("number"))
-            fits = number < len(lengths) and 1 <= look["target"] < len(classes)
-            check(fits, "closer", f"a look below {len(lengths)} and the index of a class", look)
-        return {
-            "classes": classes,
-            "target": target,
-            "targets": targets,
-            "least": LEAST if least is None else least,
-            "source": record.get("source"),
-            "photograph": photograph,
-            "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
-            "found": record["found"],
-            "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
-            "closer": tuple(
-                CloseUp(**{"fixation": None, "cell": None} | look, box=box)
-                for look, box in zip(closer, boxes, strict=True)
-            ),
-            "ending": RENAMED.get(str(record.get("ending")), record.get("ending")),
-        }
+
+def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the attributes of the base, and check that they fit each other."""
+    classes, target, lengths, targets = record["classes"], record.get("target"), record["lengths"], record["targets"]
+    check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
+    check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
+    check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
+    photograph = tensors.get("photograph")
+    sides = (1,) if photograph is None else photograph.shape[1:]
+    check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
+    looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
+    decision, closer, boxes = record.get("decision"), record["closer"], tensors.get("closer_boxes", torch.zeros(0, 4))
+    check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
+    for look in closer:
+        last = max(look["fixation"] or 0, look["number"] or 0)
+        fits = last < len(lengths) and 1 <= look["target"] < len(classes)
+        check(fits, "closer", f"a look below {len(lengths)} and the index of a class", look)
+    return {
+        **{name: record.get(name) for name in _PLAIN},
+        "classes": tuple(classes),
+        "targets": tuple(targets),
+        "photograph": photograph,
+        "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
+        "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
+        "closer": tuple(CloseUp(**look, box=box) for look, box in zip(closer, boxes, strict=True)),
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.decision import Decision
-from semfov.detection.detections import Detections
+from semfov.belief.grid import Grid
+from semfov.data.large import LargePicture
 from semfov.detection.objects import Objects
+from semfov.detection.placement import resize
 from semfov.errors import InputError, check
 from semfov.head.camera import CameraScene
 from semfov.head.scenes import Flat, Panorama
@@ -24,7 +25,9 @@ from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.files import POSITIVE, Format, pair
+from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
+from semfov.paths.stimulus import LONGEST
 
 _BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
@@ -45,12 +48,11 @@ _WORLD = {
     "tilt": pair(Number(-90, 90)),
 }
 
-_FORMAT = Format.of(
+_FORMAT = Format(
     "head path",
     {
         "actions": Field(("n",), dtype=torch.int64, low=0),
         "maps": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3),
-        # Files of earlier versions have no values.
         "values": Field(("n",), mixed=True, finite=False, optional=True),
     },
     {
@@ -59,8 +61,6 @@ _FORMAT = Format.of(
         "fovea": POSITIVE,
         "seconds": Array(Number(low=0), "n"),
     },
-    endings=("decision", "worth", "passes", "seconds", "duration", "cells", "stopped"),
-    closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of paths of eye and head."""
 
@@ -80,8 +80,7 @@ class HeadPath(GazeRecord):
         maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
             exploration.
         values: expected gain per second for which each look was chosen, infinite for the first; empty if not known.
-        found: whether the last look found the target; the `cell` of the decision is then one of the scene, and its
-            `box` is in pixels of the last view.
+        found: whether the last look found the target; the `cell` of the decision is then one of the scene.
 
     Example::
 
@@ -115,29 +114,23 @@ class HeadPath(GazeRecord):
         """
         distances, cut = [], []
         width, height = self.views.world.size
-        for number, (action, detections) in enumerate(zip(self.actions, self.detections, strict=True)):
+        for number, detections in enumerate(self.detections):
             boxes, field = detections.boxes[0], float(self.pose(number)[2])
-            point = self.views.view_grid.centres[action % self.views.cells]
-            distances.append(distances_to(boxes, point) * field / width)
+            distances.append(distances_to(boxes, self._eye(number)) * field / width)
             border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
             cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
-        looks = [self._in_picture(number) for number in range(len(self))]
-        around = float(self.size[0]) if self.views.world.closed else None
-        return merge_fixations(looks, distances, self.closer, cut=cut, around=around)
+        return merge_fixations([look.detections for look in self], distances, self.closer, cut=cut, around=self.around)
 
-    def region(self, number: int) -> tuple[float, float, float, float]:
-        """Part of the picture that a look showed: the smallest box around it.
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture of the scene in pixels."""
+        width, height = (int(side) for side in self.views.world.scene.extent)
+        return width, height
 
-        Args:
-            number: number of the look, from 0.
-
-        Returns:
-            `(x1, y1, x2, y2)` in picture pixels; beyond the right border where it crosses the seam of a panorama.
-        """
-        width, height = self.views.world.size
-        frame = torch.tensor([[0.0, 0.0, width, height]])
-        x1, y1, x2, y2 = self.views.world.boxes(frame, self.pose(number))[0].tolist()
-        return x1, y1, x2, y2
+    @property
+    def around(self) -> float | None:
+        """Width in pixels of a panorama, after which it repeats; None for other scenes."""
+        return float(self.size[0]) if self.views.world.closed else None
 
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.
@@ -200,59 +193,69 @@ class HeadPath(GazeRecord):
             what = f"{self.target_name}: {self.decision.outcome} ({self.decision.probability:.2f})"
         return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
-    def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values, one row for each look.
+    def _eye(self, look: int) -> Tensor:
+        """Fixated point of a look in pixels of its view, `(2,)`."""
+        return self.views.view_grid.centres[self.actions[look] % self.views.cells]
 
-        `x` and `y` are the fixated point in pixels of the scene's picture. `pan` and `tilt` are the direction of the
-        head, and `field` is its field of view, in degrees.
-        `probability` is the probability of the target, or of any object in an exploration, in the fixated cell of the
-        scene, and `highest` the largest one of all cells. `detections` is the number of detections, `seen` the class of
-        the most confident one, and `score` its confidence. `seconds` is the time at the end of the look.
+    def _looks(self) -> Iterator[RecordedLook]:
+        """The looks; regions are the smallest boxes around what they show."""
+        world = self.views.world
+        frame = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
+        values = self.values or (math.inf,) * len(self.actions)
+        points = world.pixels_of(self.views.gaze[[*self.actions]]).tolist()
+        for number, (action, (x, y), value) in enumerate(zip(self.actions, points, values, strict=True)):
+            pose, seen = self.pose(number), self.detections[number]
+            x1, y1, x2, y2 = world.boxes(frame, pose)[0].tolist()
+            boxes = world.boxes(seen.boxes[0], pose)[None].to(seen.boxes)
+            more = {
+                "action": action,
+                **dict(zip(("pan", "tilt", "field"), pose.tolist(), strict=True)),
+                **cell_columns(world.scene, int(self.views.gaze_cell[action]), self.maps[number]),
+            }
+            chosen = value if math.isfinite(value) else None
+            region = (x1, y1, x2, y2)
+            yield RecordedLook(number, (x, y), region, replace(seen, boxes=boxes), self.seconds[number], chosen, more)
 
-        Returns:
-            One dictionary for each look.
-        """
-        rows = []
-        for number, (action, (x, y)) in enumerate(zip(self.actions, self._gaze()[0].tolist(), strict=True)):
-            cell = int(self.views.gaze_cell[action])
-            rows.append(
-                {
-                    "look": number,
-                    "action": action,
-                    "x": x,
-                    "y": y,
-                    **dict(zip(("pan", "tilt", "field"), self.pose(number).tolist(), strict=True)),
-                    "cell": cell,
-                    "probability": float(self.maps[number, cell]),
-                    "highest": float(self.maps[number].max()),
-                    "highest_cell": int(self.maps[number].argmax()),
-                    **self._detected(self.detections[number]),
-                    "seconds": self.seconds[number],
-                }
-            )
-        return rows
+    def outline(self, look: RecordedLook) -> Tensor:
+        """Border of the view of a look, `(P, 2)`; it goes on beyond the picture where it crosses its seam."""
+        world = self.views.world
+        view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
+        places: Any = world.places(view, self.pose(look.number))
+        if not hasattr(places, "outlines"):
+            x1, y1, x2, y2 = places.boxes[0].tolist()
+            return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
+        x, y = (world.pixels_of(places.outlines()[0]) + 0.5).unbind(-1)
+        if self.around is not None:
+            step = (x.diff() + self.around / 2) % self.around - self.around / 2
+            x = torch.cat([x[:1], x[:1] + step.cumsum(0)])
+        return torch.stack([x, y], -1)
 
-    def _in_picture(self, number: int) -> Detections:
-        detections = self.detections[number]
-        boxes = self.views.world.boxes(detections.boxes[0], self.pose(number))
-        return replace(detections, boxes=boxes[None].to(detections.boxes))
+    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+        """Probability of the target, or of any object, in each cell of the scene after a look."""
+        return self.views.world.scene, self.maps[number]
 
-    def _duration(self, number: int) -> float | None:
-        return self.seconds[number] - (self.seconds[number - 1] if number else 0.0)
+    def look_views(self, source: LargePicture) -> Iterator[LookView]:
+        """The views of the head, rendered from a picture of the scene in any size."""
+        world, (width, height) = self.views.world, self.size
+        image = read_region(source, (0, 0, width, height), self.size, 2 * LONGEST)
+        # Poses in a panorama are angles, which do not depend on the size of the picture.
+        scene = Panorama(image[..., : image.shape[-1] // 2 * 2], world.size, reach=90) if world.closed else None
+        across, down = image.shape[-1] / width, image.shape[-2] / height
+        for look in self:
+            if scene is not None:
+                pixels = scene.view(self.pose(look.number))[0]
+            else:
+                x1, y1, x2, y2 = (side * by for side, by in zip(look.region, (across, down) * 2, strict=True))
+                left, top, right, bottom = whole_pixels((x1, y1, x2, y2), (image.shape[-1], image.shape[-2]))
+                pixels = resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)
+            x, y = self._eye(look.number).tolist()
+            yield LookView(pixels, world.size, self.detections[look.number].boxes[0], (x, y))
 
-    def _value(self, number: int) -> float | None:
-        value = self.values[number] if self.values else math.inf
-        return value if math.isfinite(value) else None  # the first look has none
-
-    def _decision_in_picture(self) -> Decision | None:
-        decision = self.decision
-        if decision is None or decision.box is None:
-            return decision
-        return replace(decision, box=self.views.world.boxes(decision.box[None], self.pose(-1))[0])
-
-    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
-        width, height = (int(side) for side in self.views.world.scene.extent)
-        return self.views.world.pixels_of(self.views.gaze[[*self.actions]]), (width, height)
+    def sensor_in_words(self) -> str:
+        """Describe the views of the head."""
+        wide, high = self.views.world.size
+        fields = ", ".join(f"{field:g}" for field in self.views.fields)
+        return f"views of {wide} × {high} px with fields of view of {fields} degrees"
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         views = self.views

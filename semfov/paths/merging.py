@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from semfov.decision import SAME, CloseUp, Decision
+from semfov.decision import SAME, CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
 from semfov.observation.matching import box_iou
 
-_CONFIRMED = 0.5
+CONFIRMED = 0.5
 """Probability from which on a closer look confirms that the target is there."""
-
-
-class ConfirmedPlace(NamedTuple):
-    """A place that was confirmed; box `(4,)`."""
-
-    box: Tensor
-    label: int
-    probability: float
-    look: int
 
 
 def merge_fixations(
@@ -60,7 +50,7 @@ def merge_fixations(
         boxes.append(look.box[None].detach().float().cpu())
         scores.append(torch.tensor([look.place]))
         labels.append(torch.tensor([look.target]))
-        numbers.append(torch.tensor([_number_of(look)]))
+        numbers.append(torch.tensor([number_of(look)]))
         sharpness.append(torch.tensor([1.0]))
         broken.append(torch.tensor([False]))
     if not boxes:
@@ -82,38 +72,26 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
     return torch.linalg.vector_norm(beside, dim=-1)
 
 
-def _number_of(look: CloseUp) -> int:
+def number_of(look: CloseUp) -> int:
     """Number of the look that a closer look is, or after which it was made."""
     return (look.fixation if look.number is None else look.number) or 0
 
 
-def places_confirmed(
-    decision: Decision | None, target: int | None, closer: Sequence[CloseUp], last: int
-) -> list[ConfirmedPlace]:
-    """The places that closer looks confirmed, and the one that the decision found."""
-    box = decision.box if decision is not None and decision.outcome == "found" else None
-    others = [look for look in closer if look.place >= _CONFIRMED and (box is None or not look.box.equal(box))]
-    places = [ConfirmedPlace(look.box, look.target, look.place, _number_of(look)) for look in others]
-    if box is not None and decision is not None and target is not None:
-        last = next((_number_of(look) for look in closer if look.box.equal(box)), last)
-        probability = decision.probability if decision.place is None else decision.place
-        places.append(ConfirmedPlace(box, target, probability, last))
-    return places
-
-
-def confirm(candidates: Objects, places: Sequence[ConfirmedPlace], least: float) -> tuple[Objects, Tensor]:
+def confirm(
+    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], least: float
+) -> tuple[Objects, Tensor]:
     """The candidates that count as objects: those with a high score, and those that were confirmed; → `(M,)`."""
     boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
     sure = torch.zeros(len(candidates), dtype=torch.bool)
-    for place in places:
-        box, probability = place.box[None].to(boxes), scores.new_tensor([place.probability])
-        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != place.label, 0)
+    for place, label, chance, look in places:
+        box, probability = place[None].to(boxes), scores.new_tensor([chance])
+        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
         same = overlap.argmax()[None] if len(overlap) else overlap.long()
         if not bool((overlap[same] >= SAME).any()):
             same = torch.tensor([len(boxes)])
             boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
-            labels = torch.cat([labels, labels.new_tensor([place.label])])
-            looks = torch.cat([looks, looks.new_tensor([place.look])])
+            labels = torch.cat([labels, labels.new_tensor([label])])
+            looks = torch.cat([looks, looks.new_tensor([look])])
             sure = torch.cat([sure, torch.tensor([False])])
         scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
         sure[same] = True

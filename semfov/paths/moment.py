@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,18 +14,15 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Field, Number, Object
-from semfov.paths.base import Record, RecordedLook
-from semfov.paths.files import POSITIVE, WHOLE, Format, pair
-from semfov.paths.merging import distances_to, merge_fixations
-from semfov.paths.windows import CLOSER_VALUES, TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
+from semfov.paths.base import Record
+from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.look import Box, RecordedLook, cell_columns
+from semfov.paths.windows import TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
 from semfov.zoom.glances import Window
 
-_SIDE = Number(low=1, high=10_000, whole=True)
-
-_FOVEA = Format.of(
+_FOVEA = Format(
     "moment",
     {
         "fixation": Field((2,), mixed=True),
@@ -35,21 +31,17 @@ _FOVEA = Format.of(
     },
     {
         "number": WHOLE,
-        "grid": pair(_SIDE),
+        "grid": pair(SIDE),
         "size": pair(POSITIVE),
         "cell": WHOLE,
         "next_cell": WHOLE,
         "seconds": Object({}, Number(low=0)),
     },
-    endings=(),
-    closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of moments of a fovea."""
 
-_WINDOWS = Format.of(
-    "window moment", TENSORS, {**VALUES, "number": WHOLE, "next_window": WINDOW}, endings=(), closer=CLOSER_VALUES
-)
-"""Format of the files of moments of windows."""
+_PLAIN = "number", "cell", "next_cell", "seconds"
+_TENSORS = "fixation", "probability", "visited"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -70,14 +62,24 @@ class Moment(Record):
     number: int
 
     @property
-    @abstractmethod
     def seen(self) -> Detections:
         """Detections of the look at this frame, a batch of one."""
+        return self.looks[-1].detections
+
+    @property
+    @abstractmethod
+    def examined(self) -> CloseUp | None:
+        """The closer look, if this frame was spent on one; otherwise None."""
 
     @property
     @abstractmethod
     def next_point(self) -> tuple[float, float]:
         """`(x, y)` in pixels, the point that the next look is at."""
+
+    @property
+    def next_region(self) -> Box | None:
+        """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
+        return None
 
     def _decided(self) -> str | None:
         """The decision in words; None without one."""
@@ -124,12 +126,18 @@ class FoveaMoment(Moment):
     closer: CloseUp | None = None
     belief: Belief | None = field(default=None, compare=False)
 
+    how = "fovea"
     _format = _FOVEA
 
     @property
-    def seen(self) -> Detections:
-        """Detections of the look at this frame, a batch of one."""
-        return self.detections
+    def examined(self) -> CloseUp | None:
+        """The closer look, if this frame was spent on one; otherwise None."""
+        return self.closer
+
+    @property
+    def closer_looks(self) -> Sequence[CloseUp]:
+        """The closer look of the frame, if it is one."""
+        return () if self.closer is None else (self.closer,)
 
     @property
     def next_point(self) -> tuple[float, float]:
@@ -148,18 +156,16 @@ class FoveaMoment(Moment):
         """One pass of the detector."""
         return 1
 
-    def __iter__(self) -> Iterator[RecordedLook]:
+    def _looks(self) -> Iterator[RecordedLook]:
         """The look at the frame, with the whole frame as its region."""
         (x, y), (width, height) = self.fixation.tolist(), self.size
-        yield RecordedLook(
-            0, (x, y), (0.0, 0.0, float(width), float(height)), self.detections, sum(self.seconds.values())
-        )
+        more = {"frame": self.number, **cell_columns(self.grid, self.cell, self.probability)}
+        region = (0.0, 0.0, float(width), float(height))
+        yield RecordedLook(0, (x, y), region, self.detections, sum(self.seconds.values()), None, more)
 
-    @cached_property
-    def candidates(self) -> Objects:
-        """Objects of the frame, of all scores from 0.05 on, with boxes in pixels of the frame."""
-        distances = distances_to(self.detections.boxes[0], self.fixation)
-        return merge_fixations([self.detections], [distances], self.closer_looks)
+    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+        """The probability of the target, or of any object, in each cell."""
+        return self.grid, self.probability
 
     def describe(self) -> str:
         """Describe belief and decision at the frame in a few words."""
@@ -170,40 +176,7 @@ class FoveaMoment(Moment):
 
     def _lines(self) -> list[str]:
         row, column = divmod(self.cell, self.grid.columns)
-        return [f"frame {self.number}, at (column, row): ({column}, {row})", self._listed()]
-
-    @property
-    def closer_looks(self) -> Sequence[CloseUp]:
-        """The closer look of the frame, if it is one."""
-        return () if self.closer is None else (self.closer,)
-
-    def rows(self) -> list[dict[str, Any]]:
-        """The frame as a table of plain values.
-
-        `probability` is the probability of the target, or of any object in an exploration, in the cell, and `highest`
-        the largest one of all cells. `detections` is the number of detections, `seen` the class of the most confident
-        one, and `score` its confidence.
-
-        Returns:
-            One dictionary.
-        """
-        row, column = divmod(self.cell, self.grid.columns)
-        x, y = self.fixation.tolist()
-        return [
-            {
-                "frame": self.number,
-                "cell": self.cell,
-                "column": column,
-                "row": row,
-                "x": x,
-                "y": y,
-                "probability": float(self.probability[self.cell]),
-                "highest": float(self.probability.max()),
-                "highest_cell": int(self.probability.argmax()),
-                **self._detected(self.detections),
-                "seconds": sum(self.seconds.values()),
-            }
-        ]
+        return [f"frame {self.number}, at (column, row): ({column}, {row})"]
 
     def _base(self) -> Mapping[str, Any]:
         record = {"detections": (self.detections,), "closer": self.closer_looks, "ending": None}
@@ -211,23 +184,21 @@ class FoveaMoment(Moment):
         return {**vars(self), **record, "found": found}
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
-        record = {name: getattr(self, name) for name in ("number", "cell", "next_cell")}
-        record |= {"grid": [self.grid.columns, self.grid.rows], "size": size, "seconds": dict(self.seconds)}
-        return {name: getattr(self, name) for name in ("fixation", "probability", "visited")}, record
+        record = {name: getattr(self, name) for name in _PLAIN} | grid_values(self.grid)
+        return {name: getattr(self, name) for name in _TENSORS}, {**record, "seconds": dict(self.seconds)}
 
     @classmethod
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        grid, looks = Grid(record["grid"][0], record["grid"][1], tuple(record["size"])), shared["detections"]
+        grid, looks = grid_from(record), shared["detections"]
         check(len(looks) == 1, "lengths", "one look", len(looks))
         check(len(tensors["visited"]) == len(grid), "visited", f"{len(grid)} cells", len(tensors["visited"]))
         for name in ("cell", "next_cell"):
             check(record[name] < len(grid), name, f"a cell number below {len(grid)}", record[name])
         return {
-            **{name: tensors[name] for name in ("fixation", "probability", "visited")},
-            **{name: record[name] for name in ("number", "cell", "next_cell", "seconds")},
+            **{name: tensors[name] for name in _TENSORS},
+            **{name: record[name] for name in _PLAIN},
             "grid": grid,
             "detections": looks[0],
             "closer": next(iter(shared["closer"]), None),
@@ -254,17 +225,17 @@ class WindowMoment(ZoomPath, Moment):
 
     next_window: Window
 
-    _format = _WINDOWS
-
-    @property
-    def seen(self) -> Detections:
-        """Detections of the look at this frame, a batch of one."""
-        return self.detections[-1]
+    _format = Format("window moment", TENSORS, {**VALUES, "number": WHOLE, "next_window": WINDOW})
 
     @property
     def next_point(self) -> tuple[float, float]:
         """`(x, y)` in pixels, the centre of what the next window shows."""
         return self.next_window.centre(self.lattice)
+
+    @property
+    def next_region(self) -> Box:
+        """`(x1, y1, x2, y2)` in pixels, what the next window shows."""
+        return self.next_window.region(self.lattice)
 
     @property
     def window(self) -> Window:
@@ -282,7 +253,7 @@ class WindowMoment(ZoomPath, Moment):
         return self._decided() or self.objects_in_words()
 
     def _lines(self) -> list[str]:
-        """The frame, the windows and the objects."""
+        """The frame and the windows."""
         return [f"frame {self.number}", *super()._lines()]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -13,13 +14,15 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
-from semfov.detection.objects import LEAST, Objects
+from semfov.data.inputs import as_image
+from semfov.data.large import LargePicture
+from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
-from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
+from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
 from semfov.paths.base import GazeRecord
-from semfov.paths.files import POSITIVE, WHOLE, Format, pair
-from semfov.paths.merging import distances_to, merge_fixations
+from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
 
 _SENSOR = {
@@ -39,9 +42,10 @@ _SETTINGS = Object(
     ("sensor", "detector"),
 )
 _PLACEMENT = {"size": pair(POSITIVE), "scale": pair(POSITIVE), "offset": pair(WHOLE)}
-_OPTIONAL = ("posterior", "presence")
+_TENSORS = "cells", "fixations", "probabilities", "values"
+_OPTIONAL = "posterior", "presence"
 
-_FORMAT = Format.of(
+_FORMAT = Format(
     "scanpath",
     {
         "cells": Field(("n",), dtype=torch.int64, low=0),
@@ -53,14 +57,12 @@ _FORMAT = Format.of(
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
     {
-        "grid": Pair((Number(low=1, high=10_000, whole=True), Number(low=1, high=10_000, whole=True))),
+        "grid": pair(SIDE),
         "size": pair(POSITIVE),
         "seconds": Array(Object(dict.fromkeys(STAGES, Number(low=0)), Number(low=0))),
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
         "settings": Maybe(_SETTINGS),
     },
-    endings=("box", "decision", "detection", "worth", "shifts", "cells", "passes", "seconds", "stopped"),
-    closer=("fixation", "target", "cell", "place", "presence"),
 )
 """Format of the files of scanpaths."""
 
@@ -84,7 +86,7 @@ class Scanpath(GazeRecord):
         posterior: `(n, X·Y)`, probability of the target in each cell after each look, by the belief of the search; None
             for exploration.
         presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
-        seconds: time of each look by stage (`semfov.episode.STAGES`).
+        seconds: time of each look by stage (`semfov.episode.STAGES`); the clock of the episode is their sum so far.
         stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.
 
     Example::
@@ -112,6 +114,12 @@ class Scanpath(GazeRecord):
         return len(self.cells)
 
     @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the photograph in pixels."""
+        width, height = (int(side) for side in self.grid.extent)
+        return width, height
+
+    @property
     def shifts(self) -> int:
         """Number of gaze shifts (saccades): fixations after the start."""
         return len(self) - 1
@@ -120,17 +128,6 @@ class Scanpath(GazeRecord):
     def image(self) -> Tensor | None:
         """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
         return super().image if self.stimulus is None else self.stimulus.image
-
-    @cached_property
-    def candidates(self) -> Objects:
-        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
-
-        Of several boxes of one object, the box of the nearest fixation is kept, or that of a closer look. The score of
-        a closer look is the probability that the target is there.
-        """
-        points = self.fixations
-        distances = [distances_to(look.boxes[0], point) for look, point in zip(self.detections, points, strict=True)]
-        return merge_fixations(self.detections, distances, self.closer)
 
     @property
     def decided_by(self) -> str:
@@ -179,73 +176,71 @@ class Scanpath(GazeRecord):
             return f"“{name}” found after {shifts} ({sure})"
         return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"
 
-    def _lines(self) -> list[str]:
-        """The fixated cells and the objects."""
-        grid, cells = self.grid, [self._place(cell) for cell in self.cells.tolist()]
-        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
-        width, height = grid.extent.tolist()
-        of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
-        return [
-            f"at (column, row): {' '.join(path)} of {of}",
-            self._listed(),
-        ]
-
-    def _place(self, cell: int) -> str:
-        row, column = divmod(cell, self.grid.columns)
-        return f"({column}, {row})"
-
-    def rows(self) -> list[dict[str, Any]]:
-        """The episode as a table of plain values, one row for each fixation.
-
-        `probability` is the probability of the target in the fixated cell, `highest` the largest one of all cells, and
-        `presence` the probability that the image holds the target; all are None for exploration. `detections` is the
-        number of detections, `seen` the class of the most confident one, and `score` its confidence.
-
-        Returns:
-            One dictionary for each fixation.
-        """
+    def _looks(self) -> Iterator[RecordedLook]:
         belief = self.posterior
         if belief is None and self.target is not None:
             belief = self.probabilities[..., self.target]
-        rows = []
-        for number, (cell, (x, y)) in enumerate(zip(self.cells.tolist(), self.fixations.tolist(), strict=True)):
-            row, column = divmod(cell, self.grid.columns)
-            rows.append(
-                {
-                    "fixation": number,
-                    "cell": cell,
-                    "column": column,
-                    "row": row,
-                    "x": x,
-                    "y": y,
-                    "probability": None if belief is None else float(belief[number, cell]),
-                    "highest": None if belief is None else float(belief[number].max()),
-                    "highest_cell": None if belief is None else int(belief[number].argmax()),
-                    "presence": None if self.presence is None else float(self.presence[number]),
-                    **self._detected(self.detections[number]),
-                    "seconds": self._duration(number),
-                }
+        width, height = self.size
+        times = [sum(each.values()) for each in self.seconds]
+        clock: list[float | None] = [*accumulate(times)] if times else [None] * len(self)
+        columns = zip(self.cells.tolist(), self.fixations.tolist(), self.detections, clock, strict=True)
+        for number, (cell, (x, y), detections, seconds) in enumerate(columns):
+            value = float(self.values[number - 1, cell]) if number else math.inf
+            more = cell_columns(self.grid, cell, None if belief is None else belief[number])
+            more["presence"] = None if self.presence is None else float(self.presence[number])
+            yield RecordedLook(
+                number,
+                (x, y),
+                (0.0, 0.0, float(width), float(height)),
+                detections,
+                seconds,
+                value if math.isfinite(value) else None,
+                more,
             )
-        return rows
 
-    def _duration(self, number: int) -> float | None:
-        return sum(self.seconds[number].values()) if self.seconds else None
+    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+        """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
+        if self.target is None:
+            return self.grid, self.probabilities[number, :, 1:].amax(-1)
+        return self.grid, (self.probabilities[..., self.target] if self.posterior is None else self.posterior)[number]
 
-    def _value(self, number: int) -> float | None:
-        value = float(self.values[number - 1, self.cells[number]]) if number else float("inf")
-        return value if abs(value) < float("inf") else None
+    def look_views(self, source: LargePicture) -> Iterator[LookView]:
+        """The foveated views, or where the stimulus was not kept, the picture."""
+        if self.stimulus is None:
+            yield from super().look_views(source)
+            return
+        for look, view in zip(self, self.views(), strict=True):
+            yield LookView(view, self.size, look.detections.boxes[0], look.fixation)
 
-    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
-        width, height = (int(side) for side in self.grid.extent)
-        return self.fixations, (width, height)
+    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
+        """Data of the scanpath for a page (`semfov.report.episode_data`)."""
+        from semfov.report.episode import episode_data
+
+        image = self.image if picture is None else as_image(picture)
+        views = None if self.stimulus is None else self.views()
+        if self.stimulus is not None:
+            options.pop("settings", None)
+        return episode_data(self, image, views, name=name or self._picture_name, **options)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the page in a frame."""
+        from semfov.report.notebook import scanpath_html
+
+        return scanpath_html(self)
+
+    def _lines(self) -> list[str]:
+        """The fixated cells."""
+        grid = self.grid
+        cells = [f"({cell % grid.columns}, {cell // grid.columns})" for cell in self.cells.tolist()]
+        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
+        width, height = grid.extent.tolist()
+        of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
+        return [f"at (column, row): {' '.join(path)} of {of}"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        tensors = {name: getattr(self, name) for name in ("cells", "fixations", "probabilities", "values")}
-        tensors |= {name: getattr(self, name) for name in _OPTIONAL if getattr(self, name) is not None}
-        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
+        tensors = {name: getattr(self, name) for name in (*_TENSORS, *_OPTIONAL) if getattr(self, name) is not None}
         record: dict[str, Any] = {
-            "grid": [self.grid.columns, self.grid.rows],
-            "size": size,
+            **grid_values(self.grid),
             "seconds": [dict(each) for each in self.seconds],
             "placement": None,
             "settings": None,
@@ -260,8 +255,7 @@ class Scanpath(GazeRecord):
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        columns, rows = record["grid"]
-        grid, cells, seconds = Grid(columns, rows, tuple(record["size"])), tensors["cells"], record["seconds"]
+        grid, cells, seconds = grid_from(record), tensors["cells"], record["seconds"]
         check(tensors["values"].shape[-1] == len(grid), "values", f"one for each of {len(grid)} cells",
               tensors["values"].shape[-1])  # fmt: skip
         check(int(cells.max()) < len(grid), "cells", f"cell numbers below {len(grid)}", int(cells.max()))
@@ -270,12 +264,11 @@ class Scanpath(GazeRecord):
         cell = None if decision is None else decision.cell
         check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         for look in shared["closer"]:
-            check(look.cell < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
+            check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
         stimulus = Stimulus.restored(tensors, record)
         return {
             "grid": grid,
-            **{name: tensors[name] for name in ("cells", "fixations", "probabilities", "values")},
-            **{name: tensors.get(name) for name in _OPTIONAL},
+            **{name: tensors.get(name) for name in (*_TENSORS, *_OPTIONAL)},
             "seconds": tuple(seconds),
             "stimulus": stimulus,
             "photograph": shared["photograph"] if stimulus is None else None,

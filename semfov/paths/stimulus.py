@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -119,9 +119,6 @@ class Stimulus:
             InputError: the shape is wrong; or the stimulus comes from a file, and its sensor is not one of the library.
         """
         check_shape(fixations, "fixations", None, 2)
-        return list(self._views(fixations))
-
-    def _views(self, fixations: Tensor) -> Iterator[Tensor]:
         settings = self.settings["sensor"]
         sensor = sensor_of(settings) if self.sensor is None else self.sensor
         left, top = self.placement.offset
@@ -131,9 +128,10 @@ class Stimulus:
             canvas = (self.canvas[None].double() / 255).to(sensor.like)
             state = sensor.open(canvas, canvas.new_tensor(self.placement.scale) * larger)
             # One at a time: all views of a large canvas at once would take gigabytes.
-            for point in self.placement.points_to_canvas(fixations.to(canvas)):
-                view = sensor.picture(state, point[None])[0]
-                yield view[:, top : top + height, left : left + width].float().cpu().clone()
+            return [
+                sensor.picture(state, point[None])[0, :, top : top + height, left : left + width].float().cpu().clone()
+                for point in self.placement.points_to_canvas(fixations.to(canvas))
+            ]
 
 
 def sensor_in_words(sensor: Mapping[str, Any]) -> str:
@@ -168,23 +166,13 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     >>> reduced_copy(torch.rand(3, 960, 2560)).shape
     torch.Size([3, 480, 1280])
     """
-    if isinstance(picture, Tensor):
-        return in_bytes(_reduced(picture))
-    width, height = picture.size
+    width, height = (picture.shape[-1], picture.shape[-2]) if isinstance(picture, Tensor) else picture.size
     scale = min(1.0, LONGEST / max(width, height))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
+    wide, high = max(1, round(width * scale)), max(1, round(height * scale))
+    if isinstance(picture, Tensor):
+        return in_bytes(picture if scale == 1 else resize(picture[None], (wide, high))[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
-    return resized(pixels, size)[0].contiguous()
-
-
-def _reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
-    """Reduce an image `(3, h, w)` so that its longer side is at most `longest` pixels."""
-    check(longest >= 1, "longest", "at least 1 pixel", longest)
-    scale = longest / max(image.shape[-2:])
-    if scale >= 1:
-        return image
-    width, height = (max(1, round(n * scale)) for n in (image.shape[-1], image.shape[-2]))
-    return resize(image[None], (width, height))[0]
+    return resized(pixels, (high, wide))[0].contiguous()
 
 
 def in_bytes(image: Tensor) -> Tensor:

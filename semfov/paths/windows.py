@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import POSITIVE, WHOLE, Format, pair
+from semfov.paths.look import RecordedLook
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 
@@ -49,23 +51,24 @@ TENSORS = {
 VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
     "windows": Array(WINDOW, "n"),
-    # Files of earlier versions have scores that are no probabilities, and some have a certainty.
     "unseen": Maybe(pair(Number(low=0))),
-    "certainty": Maybe(pair(Number())),
+    "seconds": Array(Number(low=0)),
 }
 """JSON values of the files of looks at windows."""
 
-CLOSER_VALUES = "number", "target", "place", "presence"
-"""What these files keep of closer looks, beside their boxes."""
 
-_FORMAT = Format.of(
-    "zoom path",
-    TENSORS,
-    VALUES,
-    endings=("decision", "detection", "worth", "passes", "windows", "seconds", "stopped"),
-    closer=CLOSER_VALUES,
+_NUMBER = (
+    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
+    "looks would then show. "
 )
-"""Format of the files of paths through large pictures."""
+"""What values of windows mean where objects are counted (`semfov.zoom.policy.best_find`)."""
+
+_PROBABILITY = (
+    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
+    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
+    "is the probability, before it, that the target is at the place. "
+)
+"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -87,7 +90,7 @@ class ZoomPath(GazeRecord):
             no probabilities.
         detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
-        closer: closer looks of a search, in their order; they are among the `glances`.
+        closer: closer looks of a search, in their order; they are among the `glances`, each with its `number`.
 
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
@@ -107,13 +110,13 @@ class ZoomPath(GazeRecord):
     found: bool = field(init=False)
 
     how = "windows"
-    _format = _FORMAT
+    _format = Format("zoom path", TENSORS, VALUES)
     _sentences = WINDOWS
 
     def __post_init__(self) -> None:
         """Derive what the looks and the decision tell."""
         object.__setattr__(self, "detections", tuple(glance.detections for glance in self.glances))
-        some = bool(self._sought()) and len(self.objects) > 0
+        some = bool(self._sought) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
 
@@ -144,7 +147,7 @@ class ZoomPath(GazeRecord):
         sums, spreads = torch.zeros(2, len(self.classes), dtype=torch.float64)
         sums.index_add_(0, labels, chances)
         spreads.index_add_(0, labels, chances * (1 - chances))
-        sought = list(self._sought() or sums.nonzero()[:, 0].tolist())
+        sought = list(self._sought or sums.nonzero()[:, 0].tolist())
         if not sought:
             return {}
         share = (sums[sought] + 1e-9) / (sums[sought] + 1e-9).sum()
@@ -155,9 +158,9 @@ class ZoomPath(GazeRecord):
         }
 
     @property
-    def passes(self) -> int:
-        """Number of passes of the detector, closer looks included."""
-        return len(self.glances)
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
+        return self.lattice.size
 
     @property
     def decided_by(self) -> str:
@@ -178,80 +181,55 @@ class ZoomPath(GazeRecord):
         return "score" if self.unseen is None else "probability"
 
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many are expected.
+        """Count the objects, by class where classes were searched for, and say how many this detector can show.
 
-        That is the number of all objects; where fewer are expected than are counted, it is the number of those counted
-        that are right.
+        Where fewer are expected than are counted, it is said how many of those counted are right. Without a class to
+        search for there is no such number, since the small rests of all classes add up to many. Where no object was
+        found, the detector hardly reacts to what is there, and no number is given either.
 
         Returns:
-            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 in all)`, or `9 × person from probability
-            0.5 (about 8 ± 1 of them right)`.
+            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 that this detector can show)`, or `9 ×
+            person from probability 0.5 (about 8 ± 1 of them right)`.
         """
         text = super().objects_in_words()
-        if self.unseen is None:
+        if self.unseen is None or not self._sought:
             return text
+        if not len(self.objects):
+            return f"{text} (the detector hardly reacts, so no number is given)"
         mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
-        of = "in all"
+        of = "that this detector can show"
         if round(mean) < len(self.objects):
             chances = self.objects.scores.double()
             mean, variance, of = float(chances.sum()), float((chances * (1 - chances)).sum()), "of them right"
         return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of})"
 
-    def region(self, number: int) -> tuple[float, float, float, float]:
-        """Part of the picture that a look showed.
+    def _looks(self) -> Iterator[RecordedLook]:
+        clock = self.seconds or (None,) * len(self.glances)
+        for number, (glance, seconds, value) in enumerate(zip(self.glances, clock, self.values, strict=True)):
+            window, chosen = glance.window, value if math.isfinite(value) else None
+            more = {"magnification": window.fixation[2], "level": window.level}
+            point, region = window.centre(self.lattice), window.region(self.lattice)
+            yield RecordedLook(number, point, region, glance.detections, seconds, chosen, more)
 
-        Args:
-            number: number of the look, from 0; the overview is 0.
+    @property
+    def values_in_words(self) -> str:
+        """What the values of looks are (`semfov.zoom.policy`)."""
+        return _NUMBER if self.decision is None else _PROBABILITY
 
-        Returns:
-            `(x1, y1, x2, y2)` in picture pixels.
-        """
-        return self.glances[number].window.region(self.lattice)
+    def sensor_in_words(self) -> str:
+        """Describe the windows of the lattice."""
+        wide, high = self.lattice.canvas
+        magnifications = ", ".join(f"{m:.2g}" for m in self.lattice.magnifications)
+        several = "s" if self.lattice.levels > 1 else ""
+        return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
     def _lines(self) -> list[str]:
-        """The windows and the objects."""
-        looks = [f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}" for row in self.rows()]
+        """The windows."""
+        points = [(*look.fixation, look.more["magnification"]) for look in self]
+        looks = [f"({x:.0f}, {y:.0f}) × {magnification:.2f}" for x, y, magnification in points]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
-        width, height = self.lattice.size
-        return [
-            f"at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
-            self._listed(),
-        ]
-
-    def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values, one row for each look.
-
-        `value` is the value for which the look was chosen, None for the overview, and `closer` the probability that the
-        target is at the place of a closer look. `detections` is the number of detections, `seen` the class of the most
-        confident one, and `score` its confidence.
-
-        Returns:
-            One dictionary for each look.
-        """
-        closer = {look.number: look.place for look in self.closer}
-        rows = []
-        for number, glance in enumerate(self.glances):
-            x, y = glance.window.centre(self.lattice)
-            rows.append(
-                {
-                    "look": number,
-                    "x": x,
-                    "y": y,
-                    "magnification": glance.window.fixation[2],
-                    "level": glance.window.level,
-                    "value": self._value(number),
-                    "closer": closer.get(number),
-                    **self._detected(glance.detections),
-                }
-            )
-        return rows
-
-    def _value(self, number: int) -> float | None:
-        value = self.values[number]
-        return value if abs(value) < float("inf") else None
-
-    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
-        return torch.tensor([glance.window.centre(self.lattice) for glance in self.glances]), self.lattice.size
+        width, height = self.size
+        return [f"at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
@@ -261,7 +239,7 @@ class ZoomPath(GazeRecord):
         windows = [window_values(glance.window) for glance in self.glances]
         unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
-        return tensors, {"lattice": lattice, "windows": windows, "unseen": unseen}
+        return tensors, {"lattice": lattice, "windows": windows, "unseen": unseen, "seconds": list(self.seconds)}
 
     @classmethod
     def _fields(
@@ -270,15 +248,8 @@ class ZoomPath(GazeRecord):
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
         objects = Objects(*(tensors[f"object_{name}"] for name in _OBJECTS))
         unseen = record.get("unseen") and tuple(record["unseen"])
-        least: dict[str, float] = {}
-        if record.get("certainty"):
-            # A file of an earlier version: probabilities followed from the scores alone.
-            offset, slope = record["certainty"]
-            logits = torch.cat([objects.scores, objects.scores.new_tensor([shared["least"]])]).logit(1e-4)
-            *chances, limit = (offset + slope * logits).sigmoid().tolist()
-            objects, unseen = replace(objects, scores=objects.scores.new_tensor(chances)), (0.0, 0.0)
-            least = {"least": limit}
         looks, classes = shared["detections"], shared["classes"]
+        check(len(record["seconds"]) in (0, len(looks)), "seconds", f"{len(looks)} times, or none", record["seconds"])
         for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
             fits = not len(values) or int(values.max()) < most
             check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
@@ -293,7 +264,7 @@ class ZoomPath(GazeRecord):
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,
             "unseen": unseen,
-            **least,
+            "seconds": tuple(record["seconds"]),
         }
 
 

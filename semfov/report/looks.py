@@ -42,6 +42,7 @@ def _picture(data: Data) -> str:
     """The picture with numbered windows and objects."""
     width, height = data["size"]
     unit = max(width, height) / 640
+    truth = "".join(_rect(box, "truth") for box in data["truth"])
     windows = [(number, look) for number, look in enumerate(data["looks"]) if not look["whole"]]
     sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     tags = place_labels([tuple(look["box"]) for _, look in windows], sizes, (width, height))
@@ -59,7 +60,7 @@ def _picture(data: Data) -> str:
     label = f"The picture with {len(windows)} numbered windows and {data['count']} object{several}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
-        f'{_image(data["image"], (width, height))}{"".join(shapes)}<g class="chosen"></g></svg>'
+        f'{_image(data["image"], (width, height))}{truth}{"".join(shapes)}<g class="chosen"></g></svg>'
     )
 
 
@@ -90,6 +91,8 @@ def _look(data: Data, number: int, place: str) -> str:
     }
     if look["value"] is None and number:
         del facts["Value when it was chosen"]
+    if look["seconds"] is not None:
+        facts["End"] = f"after {look['seconds']:.2f} s"
     if look["closer"] is not None:
         facts["Closer look"] = look["closer"]
     facts_html = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())

@@ -1,28 +1,19 @@
-"""What a notebook shows of a record: the photograph with windows and objects, or the page of a scanpath in a frame.
-
-Functions that draw records are registered here.
-"""
+"""What a notebook shows of a record: the photograph with windows and objects, or the page of a scanpath in a frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
 
-from semfov.metrics.scanpath.beside import compare_scanpath
-from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Scanpath, ZoomPath
-from semfov.paths.drawing import draws
+from semfov.paths import Record, Scanpath
 from semfov.report.episode import episode_data, jpeg_uri
-from semfov.report.page import page_html, write_record, write_scanpath
-from semfov.viz.animation import animate
-from semfov.viz.head import animate_head, plot_head_path
-from semfov.viz.scanpath import plot_scanpath
+from semfov.report.page import page_html
 from semfov.viz.style import FOUND, GAZE, TARGET
-from semfov.viz.zoom import animate_looks, plot_moment, plot_zoom_path
 
 MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
 
-HEIGHT = 760
+_HEIGHT = 760
 """Height of the frame in pixels; the page scrolls in it."""
 
 _FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
@@ -32,24 +23,24 @@ _MAPS = MOST_CHARACTERS // 4
 """Largest number of bytes of the probability maps."""
 
 
-WIDTH = 640
+_WIDTH = 640
 """Width of the drawing in pixels of the screen."""
 
 _MOST = 500  # largest number of objects that are drawn; the most confident ones are
 _QUALITY = 75  # of the photograph, a JPEG
 
 
-def _record_html(record: Record) -> str:
+def record_html(record: Record) -> str:
     """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML.
 
     Objects that were confirmed are green, others orange. A grey rectangle stands for a photograph that was not kept.
     """
     width, height = record.size
-    unit = max(width, height) / WIDTH
+    unit = max(width, height) / _WIDTH
     shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
     if record.image is not None:
         size = f'width="{width}" height="{height}" preserveAspectRatio="none"'
-        shapes = [f'<image href="{jpeg_uri(record.image, WIDTH, _QUALITY)}" {size}/>']
+        shapes = [f'<image href="{jpeg_uri(record.image, _WIDTH, _QUALITY)}" {size}/>']
     for look in record:
         if record.is_whole(look.region):
             continue
@@ -64,7 +55,7 @@ def _record_html(record: Record) -> str:
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
-    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
+    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     green = ", and confirmed ones green" if record.confirmable else ""
     key = f"Objects from {record.measure} {record.least:g} are orange{green}."
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
@@ -76,53 +67,26 @@ def _rect(box: Sequence[float], colour: str, line: float, inside: str = "") -> s
     return f'<rect {side} fill="none" stroke="{colour}" stroke-width="{line:.1f}" pointer-events="all">{inside}</rect>'
 
 
-def _notebook_html(scanpath: Scanpath) -> str:
+def scanpath_html(scanpath: Scanpath) -> str:
     """The page to step through in a frame; a short text where the page would be too large.
 
     The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
     outside.
     """
-    classes = _classes_that_fit(scanpath)
-    if classes >= 1:
-        views = None if scanpath.stimulus is None else scanpath.views()
-        across, down = scanpath.grid.extent.tolist()
-        name = f"{across:.0f} × {down:.0f} px"
-        for width, quality in _FINENESS:
-            data = episode_data(
-                scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality
-            )
-            frame = framed(page_html(f"semfov: {scanpath.describe()}", [data]), scanpath.describe())
-            if len(frame.encode()) <= MOST_CHARACTERS:
-                return frame
-    words = escape(repr(scanpath))
-    return f"<pre>{words}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"
-
-
-def framed(page: str, title: str) -> str:
-    """A page in a sandboxed frame that may run scripts and nothing else."""
-    return (
-        f'<iframe title="{escape(title)}" sandbox="allow-scripts" loading="lazy" srcdoc="{escape(page)}" '
-        f'style="width:100%;height:{HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
-    )
-
-
-def _classes_that_fit(scanpath: Scanpath) -> int:
-    """Number of classes whose maps fit, beside the maps of background and entropy and the acquisition values."""
-    look = len(scanpath) * len(scanpath.grid)
-    bytes_of_map, bytes_of_values = 4 * look / 3, 8 * look
-    room = _MAPS - bytes_of_values - 2 * bytes_of_map
-    return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
-
-
-draws("notebook", Record, _record_html)
-draws("notebook", Scanpath, _notebook_html)
-draws("report", Record, write_record)
-draws("report", Scanpath, write_scanpath)
-draws("plot", Scanpath, plot_scanpath)
-draws("plot", ZoomPath, plot_zoom_path)
-draws("plot", HeadPath, plot_head_path)
-draws("plot", FoveaMoment, plot_moment)
-draws("animate", Record, animate_looks)
-draws("animate", Scanpath, animate)
-draws("animate", HeadPath, animate_head)
-draws("compare", GazeRecord, compare_scanpath)
+    # Maps of classes fit beside those of background and entropy, and the acquisition values.
+    cells = len(scanpath) * len(scanpath.grid)
+    room, bytes_of_map = _MAPS - 8 * cells, 4 * cells / 3
+    classes, words = min(len(scanpath.classes) - 1, int(room / bytes_of_map - 2)), scanpath.describe()
+    views = None if scanpath.stimulus is None or classes < 1 else scanpath.views()
+    name = "{} × {} px".format(*scanpath.size)
+    for width, quality in _FINENESS if classes >= 1 else ():
+        data = episode_data(scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality)
+        frame = (
+            f'<iframe title="{escape(words)}" sandbox="allow-scripts" loading="lazy" '
+            f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
+            f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
+        )
+        if len(frame.encode()) <= MOST_CHARACTERS:
+            return frame
+    text = escape(repr(scanpath))
+    return f"<pre>{text}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"

@@ -6,21 +6,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
-from semfov.data.inputs import ImageLike, as_image
-from semfov.data.large import LargePicture
 from semfov.errors import check
 from semfov.io.files import write_text
-from semfov.paths import Record, Scanpath
-from semfov.report.episode import Data, episode_data
+from semfov.report.episode import Data
 from semfov.report.looks import ABOUT, looks_html
-from semfov.report.zoom import zoom_data
-from semfov.viz.drawing import photograph_of
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
 if TYPE_CHECKING:
@@ -56,39 +48,6 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
     return path
 
 
-def write_record(
-    record: Record,
-    path: str | PathLike[str],
-    *,
-    picture: LargePicture | ImageLike | None = None,
-    name: str | None = None,
-) -> Path:
-    """Write the page of a record with its windows, objects and looks."""
-    data = zoom_data(record, picture, name=_name(record, name))
-    return write_page(Path(path), f"semfov: {record.describe()}", [data])
-
-
-def write_scanpath(
-    scanpath: Scanpath,
-    path: str | PathLike[str],
-    *,
-    picture: ImageLike | None = None,
-    name: str | None = None,
-    boxes: Tensor | None = None,
-) -> Path:
-    """Write the page on which a reader steps through a scanpath; boxes `(M, 4)`."""
-    image = photograph_of(scanpath, None if picture is None else as_image(picture))
-    views = None if scanpath.stimulus is None else scanpath.views()
-    data = episode_data(scanpath, image, views, name=_name(scanpath, name), boxes=boxes)
-    return write_page(Path(path), f"semfov: {scanpath.describe()}", [data])
-
-
-def _name(record: Record, name: str | None) -> str:
-    """Name of the picture of a record."""
-    width, height = record.size
-    return name or (Path(record.source).name if record.source else f"{width} × {height} px")
-
-
 def page_path(path: Path) -> Path:
     """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`.
 
@@ -122,17 +81,17 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
         "pictures": list(numbers),
         "colours": {
-            "time": _colour_steps(TIME),
-            "overlay": _colour_steps(overlay_colours()),
-            "probability": _colour_steps(PROBABILITY, _OPACITY),
-            "uncertainty": _colour_steps(UNCERTAINTY, _OPACITY),
+            "time": colour_steps(TIME),
+            "overlay": colour_steps(overlay_colours()),
+            "probability": colour_steps(PROBABILITY, _OPACITY),
+            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
     contents = {
         "title": escape(title),
         "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
         "program": (_FOLDER / "page.js").read_text(encoding="utf-8"),
-        "data": _json_script(data),
+        "data": json_script(data),
         "sections": sections,
         "about": _about_html(episodes),
         "looks": "".join(
@@ -181,7 +140,7 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
     return {**about, "article": _place(number), "looks": looks}
 
 
-def _json_script(data: Any) -> str:
+def json_script(data: Any) -> str:
     r"""JSON text that is safe inside a script element.
 
     Args:
@@ -197,7 +156,7 @@ def _json_script(data: Any) -> str:
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def _colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
+def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
     """Red, green and blue from 0 to 255 and opacity from 0 to 1 of a colour map of matplotlib, at equal steps."""
     from matplotlib import colormaps
 

@@ -6,31 +6,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 from semfov.belief import Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
-from semfov.gaze.policies.tables import salient_from
-from semfov.gaze.templates import ClassTemplates
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, SaliencyMaximum, Task, named_policy
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
-from semfov.runs.presets import TARGET_EVIDENCE, resolve, table_of
-from semfov.runs.setup import make_learned, make_observation, make_templates
+from semfov.runs.presets import TARGET_EVIDENCE, resolve
+from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)`."""
+    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)` from every cell, or `(1, X·Y)` from anywhere."""
 
     strategy: Strategy
-    table: Tensor | None = None
     saliency: Tensor | None = None
     weight: float = 1.0
 
@@ -41,10 +39,14 @@ class Candidate:
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
-        acquisition = self.strategy.policy.in_scene(target, grid, self.table, cell)
+        policy = self.strategy.policy
         if self.saliency is None:
-            return acquisition
-        return SaliencyPrior(acquisition, salient_from(self.saliency, cell), weight=self.weight)
+            alone: AcquisitionFunction = policy(target, grid)
+            return alone
+        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
+        if isinstance(policy, SaliencyMaximum):
+            return Static(salient)
+        return SaliencyPrior(policy(target, grid), salient, weight=self.weight)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,6 @@ class _Models:
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
     map: MapEvidence | None = None
-    templates: ClassTemplates | None = None
 
 
 def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
@@ -65,25 +66,22 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
     return _Models(
         make_observation(belief.model, eye) if _needs_observation(policies, belief) else None,
         make_learned(TargetEvidence, belief.target_model, eye)
-        if any(by_evidence(policy, task) for policy in policies)
+        if any(_by_evidence(policy, task) for policy in policies)
         else None,
         make_learned(MapEvidence, belief.map_model, eye)
-        if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
-        else None,
-        make_templates(config.class_templates, eye)
-        if any(table_of(policy) == "attention" for policy in policies)
+        if any(policy.scores == "learned" and not _by_evidence(policy, task) for policy in policies)
         else None,
     )
 
 
-def by_evidence(policy: PolicyConfig, task: Task) -> bool:
+def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
     """Whether a policy uses the learned target evidence."""
     return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
 
 
 def belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
-    if by_evidence(policy, task):
+    if _by_evidence(policy, task):
         return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
     return replace(policy, policy=Random.name, saliency=None, samples=None)
 
@@ -107,7 +105,7 @@ def make_strategy(
     calibrated = policy.scores == "calibrated"
     means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
     chosen = named_policy(policy.policy, task, means)
-    if by_evidence(policy, task):
+    if _by_evidence(policy, task):
         return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
@@ -125,11 +123,11 @@ def make_strategy(
     return Strategy(observer, chosen)
 
 
-def _of(own: T | None, common: T) -> T:
+def _of(own: _T | None, common: _T) -> _T:
     return common if own is None else own
 
 
-def _required(model: T | None, argument: str, expected: str) -> T:
+def _required(model: _T | None, argument: str, expected: str) -> _T:
     if model is None:
         raise InputError(f"{argument}: expected {expected}, got none")
     return model

@@ -8,15 +8,27 @@ import signal
 import sys
 import threading
 from argparse import SUPPRESS
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, get_origin
+from types import FrameType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NoReturn,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from semfov.errors import SemfovError
 from semfov.io.files import discard_unfinished
-from semfov.runs.arguments import in_one_line, setting_types, usual_form
 from semfov.runs.settings import Settings, check_settings
 
 if TYPE_CHECKING:
@@ -40,7 +52,15 @@ def make_parser(
     program: str | None = None,
 ) -> ArgumentParser:
     """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted."""
-    from jsonargparse import ArgumentParser, set_parsing_settings
+    import argparse
+
+    from jsonargparse import ArgumentParser, DefaultHelpFormatter, set_parsing_settings
+
+    class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
+        """Keep the line breaks of the description, and print the range of a number in a readable form."""
+
+        def _expand_help(self, action: argparse.Action) -> str:
+            return re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", super()._expand_help(action))
 
     class Parser(ArgumentParser):
         """A parser that reports wrong arguments in one line."""
@@ -49,16 +69,16 @@ def make_parser(
             if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells
                 super().error(message, ex)
             options = [option for option in self._option_string_actions if option.startswith("--")]
-            print(f"error: {in_one_line(message, config, options)}", file=sys.stderr)
+            print(f"error: {_in_one_line(message, config, options)}", file=sys.stderr)
             self.exit(2)
 
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
     parser = Parser(
-        prog=program, description=description, default_env=False, formatter_class=_formatter(), exit_on_error=True
+        prog=program, description=description, default_env=False, formatter_class=Formatter, exit_on_error=True
     )
     parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
     if positional is not None:
-        hint = setting_types(config)[positional[0]]
+        hint = _setting_types(config)[positional[0]]
         several = get_origin(hint) is tuple
         kind = str if several or hint is str else Path
         # Without a default of its own it leaves what a file of --config says.
@@ -67,20 +87,6 @@ def make_parser(
     skip = {*config.unused, *([] if positional is None else positional[:1])}
     parser.add_class_arguments(config, as_group=True, skip=skip)
     return parser
-
-
-def _formatter() -> Any:
-    import argparse
-
-    from jsonargparse import DefaultHelpFormatter
-
-    class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """Keep the line breaks of the description, and print the range of a number in a readable form."""
-
-        def _expand_help(self, action: argparse.Action) -> str:
-            return re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", super()._expand_help(action))
-
-    return Formatter
 
 
 def run_command(
@@ -99,7 +105,7 @@ def run_command(
         with _signals(goes_on):
             parser = make_parser(config, description, positional, program)
             command_line = sys.argv[1:] if arguments is None else arguments
-            parsed = parser.parse_args(usual_form(command_line, config, parser._option_string_actions))
+            parsed = parser.parse_args(_usual_form(command_line, config, parser._option_string_actions))
             parsed.pop("config", None)
             check_settings(config, parsed)
             settings = parser.instantiate(parsed)
@@ -183,3 +189,112 @@ def _importing(frame: FrameType | None) -> bool:
 def _leave(number: int, _: object) -> None:
     discard_unfinished()
     os._exit(128 + number)
+
+
+_FLAGS = ("true", "false", "yes", "no", "True", "False")
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
+
+
+def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[str]) -> list[str]:
+    """Bring arguments into the form that the parser understands.
+
+    Names of options may have dashes instead of underscores. A flag needs no value. A list of words needs no brackets,
+    and `none` is the empty list.
+
+    >>> from semfov.runs.settings import Settings
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Example(Settings):
+    ...     give_up: float = 0.1
+    ...     looks: bool = False
+    ...     draw: tuple[str, ...] = ()
+    >>> options = ["--give_up", "--looks", "--draw"]
+    >>> _usual_form(["--give-up", "0.2", "--looks", "--draw", "path,views"], Example, options)
+    ['--give_up', '0.2', '--looks=true', '--draw=[path,views]']
+    """
+    hints, option_names, usual = _setting_types(config), set(options), list[str]()
+    rest = list(arguments)
+    while rest:
+        word = rest.pop(0)
+        name, equals, value = word.partition("=")
+        option = "--" + name[2:].replace("-", "_")
+        if word == "--":
+            return [*usual, word, *rest]
+        if not word.startswith("--") or option not in option_names:
+            usual.append(word)
+            continue
+        hint, has_value = hints.get(option[2:]), bool(equals)
+        if hint is bool and not has_value:
+            value = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
+            has_value = True
+        elif _is_list(hint) and not has_value and rest and not rest[0].startswith("--"):
+            value, has_value = rest.pop(0), True
+        if has_value and _is_list(hint) and not value.startswith("["):
+            value = f"[{'' if value in ('none', '') else value}]"
+        usual.append(f"{option}={value}" if has_value else option)
+    return usual
+
+
+def _in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str:
+    """Say in one line what is wrong with the arguments, and suggest names."""
+    unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
+    if unknown:
+        words = unknown[1].split()
+        option = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
+        if option is None:
+            return f"unexpected argument {unknown[1]!r}; put a name with spaces in quotes"
+        plain = {each.replace("_", "-"): each for each in options}
+        near = get_close_matches(option.replace("_", "-"), plain, n=1, cutoff=0.6)
+        remedy = f"did you mean {near[0]}?" if near else "--help-all lists all options"
+        return f"unknown option {option}; {remedy}"
+    missing = re.match(r"argument (--\S+): expected one argument", message)
+    if missing:
+        return f"{missing[1].replace('_', '-')}: expected a value, got none"
+    key, got = re.search(r'Parser key "([\w.]+)"', message), re.search(r"(?:Given|Got) value: (.*)", message)
+    hint = _setting_types(config).get(key[1]) if key else None
+    expected = None if hint is None else _expected(hint)
+    if key is None or got is None or expected is None:
+        return " ".join(message.split())
+    value = got[1].strip()
+    close = get_close_matches(value, _options_of(hint), n=1, cutoff=0.5)
+    return f"{key[1]}: expected {expected}, got {value!r}" + (f"; did you mean {close[0]!r}?" if close else "")
+
+
+def _setting_types(config: type[Any]) -> dict[str, Any]:
+    """Types of settings, without None, by their dotted names."""
+    types: dict[str, Any] = {}
+    hints = get_type_hints(config, include_extras=True)
+    for field in fields(config):
+        hint = hints[field.name]
+        if get_origin(hint) in (Union, UnionType):
+            some = [each for each in get_args(hint) if each is not type(None)]
+            hint = some[0] if len(some) == 1 else hint
+        types[field.name] = hint
+        if is_dataclass(hint) and isinstance(hint, type):
+            types |= {f"{field.name}.{name}": each for name, each in _setting_types(hint).items()}
+    return types
+
+
+def _is_list(hint: Any) -> bool:
+    """Whether a type is a list of words of any length."""
+    item, *more = get_args(hint) or (None,)
+    return get_origin(hint) is tuple and more == [Ellipsis] and (item is str or get_origin(item) is Literal)
+
+
+def _options_of(hint: Any) -> list[str]:
+    """The words that a setting may be."""
+    if get_origin(hint) is Literal:
+        return [str(each) for each in get_args(hint)]
+    return [word for each in get_args(hint) for word in _options_of(each)] if _is_list(hint) else []
+
+
+def _expected(hint: Any) -> str | None:
+    """What a setting must be, in words; None for types that need more of them."""
+    words = _options_of(hint)
+    if words:
+        named = " or ".join(repr(word) for word in words)
+        return f"some of {named.replace(' or ', ', ')}" if _is_list(hint) else named
+    if get_origin(hint) is Annotated:
+        base, *ranges = get_args(hint)
+        return " ".join([_WORDS.get(base, "a name"), *map(repr, ranges)])
+    return _WORDS.get(hint)

@@ -197,8 +197,8 @@ class PolicyConfig(Settings):
     A setting that is null is taken from the `belief` settings of the run.
 
     Args:
-        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient cell)
-            and `ivsn` (uses class templates), or `target-evidence` (uses the learned evidence for the target).
+        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient
+            cell), or `target-evidence` (uses the learned evidence for the target).
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
             first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
             evidence in searches.
@@ -276,21 +276,40 @@ WHERE = ("out", "cache", "workers", "scheduler")
 
 
 @dataclass(frozen=True)
-class LookingConfig(WorkConfig):
-    """Looks at scenes from every cell of a grid.
+class EyeConfig(WorkConfig):
+    """Looks at scenes from the cells of a grid; `cells` are its columns and rows.
 
     Args:
         data: the scenes.
         sensor: the foveal sensor.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        raise NotImplementedError(f"{type(self).__name__} has no cells")
+
+
+@dataclass(frozen=True)
+class LookingConfig(EyeConfig):
+    """Looks at scenes from every cell of a grid.
+
+    Args:
         belief: the belief, a grid of class distributions; its columns and rows are the cells.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     store: bool = True
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the belief."""
+        return self.belief.columns, self.belief.rows
 
 
 @dataclass(frozen=True)
@@ -312,11 +331,6 @@ class RunConfig(LookingConfig):
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str | PolicyConfig, ...] = ("recommended",)
     models: Path | None = None
-
-    @property
-    def class_templates(self) -> str | None:
-        """Class templates of `ivsn`, by name or file; None takes those shipped for the detector."""
-        return None
 
     def complete(self, folder: ModelFolder) -> Self:
         """The settings, completed by the values that this kind of run takes from a folder of models."""

@@ -24,14 +24,8 @@ class Exploration:
     start: int
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Result of an exploration."""
-
-    cells: tuple[int, ...]
-    right: tuple[int, ...]
-    right_without_background: tuple[int, ...]
-    right_everywhere: tuple[int, ...]
+COUNTS = ("right", "right_without_background", "right_everywhere")
+"""Names of the counts of right cells (`counts_of`)."""
 
 
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
@@ -56,13 +50,15 @@ def run_explorations(
     *,
     shifts: int,
     batch: int,
-) -> list[Progress]:
+) -> list[tuple[list[int], dict[str, list[int]]]]:
     """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
+
+    Returns the cells of each, and after every gaze shift its `COUNTS`.
 
     Shapes: noise `(episodes, shifts+1, X·Y)`.
     """
     starts = torch.tensor([episode.start for episode in episodes])
-    progress: list[Progress] = []
+    progress = []
     for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
         choice = Greedy(drawn_from(random))
         visits, counts = [], []
@@ -79,13 +75,14 @@ def run_explorations(
             counts.append(counts_of(probabilities, answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
-        tables = torch.stack(visits, 1).tolist(), *(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True))
-        progress += [Progress(*map(tuple, row)) for row in zip(*tables, strict=True)]
+        tables = zip(*(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True)), strict=True)
+        rows = [dict(zip(COUNTS, row, strict=True)) for row in tables]
+        progress += list(zip(torch.stack(visits, 1).tolist(), rows, strict=True))
     return progress
 
 
 def counts_of(probabilities: Tensor, answers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The three counts of `Progress` for maps `(B, X·Y, K+1)`, each `(B,)`."""
+    """The three `COUNTS` for maps `(B, X·Y, K+1)`, each `(B,)`."""
     everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
     without = count_right(probabilities[..., 1:], answers[:, 1:])
     return count_right(probabilities, answers), without, count_right(probabilities, everywhere)

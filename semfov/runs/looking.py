@@ -14,9 +14,8 @@ from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import BeliefConfig, LookingConfig
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import SceneRun, store_folder
+from semfov.runs.config import EyeConfig, LookingConfig
+from semfov.runs.scene_run import ResultRecord, SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store, look_everywhere
 
@@ -27,17 +26,17 @@ class Looking(SceneRun):
     Its outcomes are the looks themselves. A subclass that compares policies adds the records of their episodes.
     """
 
-    config: LookingConfig
+    config: EyeConfig
 
-    def __init__(self, config: LookingConfig) -> None:
+    def __init__(self, config: EyeConfig) -> None:
         self.config = config
         self.check_sources()
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):
             raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
-        size, components = (config.belief.columns, config.belief.rows), len(self.scenes.classes) + 1
-        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+        components = len(self.scenes.classes) + 1
+        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *config.cells, components)
         self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
@@ -50,7 +49,7 @@ class Looking(SceneRun):
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye and the cells."""
-        return {"eye": self.eye.settings(), "cells": [self.config.belief.columns, self.config.belief.rows]}
+        return {"eye": self.eye.settings(), "cells": [*self.config.cells]}
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a scene depend on."""
@@ -60,11 +59,11 @@ class Looking(SceneRun):
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""
-        return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index).size)
+        return Grid(*self.config.cells, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:
         """Detections from every cell of a scene, read from the store, or computed and stored."""
-        store = self.store if self.config.store else None
+        store = None if isinstance(self.config, LookingConfig) and not self.config.store else self.store
         image, digest = (lambda: self.scenes[index].image[None]), (lambda: self.digest(index))
         return look_everywhere(self.eye, image, self.grid(index), store, digest)
 
@@ -94,19 +93,3 @@ class CellLooks(Looks):
         """Look, and weigh; the fixations are the centres of the cells."""
         detections = Detections.stack([self.look(number) for number in cell.tolist()])
         return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
-
-
-def looking_of(config: Any) -> Looking:
-    """Prepare the looks from every cell that a fit needs."""
-    return Looking(
-        LookingConfig(
-            data=config.data,
-            detector=config.detector,
-            sensor=config.sensor,
-            belief=BeliefConfig(columns=config.columns, rows=config.rows),
-            out=config.out,
-            cache=config.cache,
-            workers=config.workers,
-            scheduler=config.scheduler,
-        )
-    )

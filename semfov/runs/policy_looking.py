@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from semfov.belief.observers import Observer
 from semfov.errors import check, lookup
 from semfov.gaze.policies import POLICIES, Task
-from semfov.gaze.templates import at_points
 from semfov.io.code import class_digest
 from semfov.runs.candidates import Candidate, belief_settings, load_models, make_strategy
 from semfov.runs.config import PolicyConfig, RunConfig, SaliencyModel
 from semfov.runs.looking import Looking
-from semfov.runs.looks import one_thread
 from semfov.runs.presets import label, resolve
 from semfov.runs.saliency_store import SaliencyStore, saliency_table
 from semfov.runs.scene_run import digest_of, store_folder
@@ -24,7 +22,7 @@ from semfov.strategy import Strategy
 
 
 class PolicyLooking(Looking):
-    """Looks at scenes, and policies that are compared in them, with the tables that they need for each scene.
+    """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene.
 
     A subclass runs their episodes (`outcomes`).
     """
@@ -48,18 +46,18 @@ class PolicyLooking(Looking):
             observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
-        size = config.belief.columns, config.belief.rows
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, size)
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }
 
-    def _code(self) -> str:
+    @cached_property
+    def code(self) -> str:
         """Digest of the code of the run, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
-        return digest_of([super()._code(), [class_digest(POLICIES[name]) for name in foreign]])
+        return digest_of([super().code, [class_digest(POLICIES[name]) for name in foreign]])
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""
@@ -68,7 +66,7 @@ class PolicyLooking(Looking):
         return {
             **super().depends_on(),
             "task": self.task,
-            "models": [models.observation, models.evidence, models.map, models.templates],
+            "models": [models.observation, models.evidence, models.map],
             "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
             "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
             "policies": policies,
@@ -82,30 +80,8 @@ class PolicyLooking(Looking):
     def candidate(self, name: str, index: int) -> Candidate:
         """The policy of this name in tables, for a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]
-        strategy = self.strategies[name]
-        if strategy.policy.table == "attention":
-            return Candidate(strategy, self.attention(index))
-        if policy.saliency is None:
-            return Candidate(strategy)
-        saliency = self.saliency(policy.saliency, index)
-        if strategy.policy.table == "saliency":
-            return Candidate(strategy, saliency)
-        return Candidate(strategy, saliency=saliency, weight=self.config.saliency.weight)
-
-    def attention(self, index: int) -> Tensor:
-        """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""
-        crops = self.eye.sensor.crops
-        check(crops == 1, "sensor", "one view in a look, from which class templates are computed", f"{crops} crops")
-        templates, tables = self.models.templates, []
-        assert templates is not None
-        with one_thread(), torch.inference_mode():
-            image, grid = self.scenes[index].image, self.grid(index)
-            view, points = self.eye.open(image[None]), grid.centres.to(image)
-            for point in points:
-                canvas = self.eye.foveated(view, point[None])
-                maps = templates(self.eye.detector.features(canvas))
-                tables.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
-            return torch.cat(tables)
+        saliency = None if policy.saliency is None else self.saliency(policy.saliency, index)
+        return Candidate(self.strategies[name], saliency, self.config.saliency.weight)
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""

@@ -9,13 +9,13 @@ from typing import get_args
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
 from semfov.errors import InputError, check, lookup
-from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
+from semfov.gaze.policies import POLICIES, Random, SaliencyMaximum, Task, policy_names
 from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 
 TARGET_EVIDENCE = "target-evidence"
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-WORDS = {
+_WORDS = {
     "scores": Scores,
     "footprint": Footprint,
     "memory": CellMemory,
@@ -41,11 +41,6 @@ def _valid_policies(task: Task) -> list[str]:
     return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
 
 
-def table_of(policy: PolicyConfig) -> Table | None:
-    """The table that a policy needs of every scene."""
-    return POLICIES[policy.policy].table if policy.policy in POLICIES else None
-
-
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
     """The presets for a task."""
     return _presets(task, tuple(policy_names(task)))
@@ -53,17 +48,12 @@ def presets(task: Task) -> Mapping[str, PolicyConfig]:
 
 @cache
 def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
-    plain = {name: PolicyConfig(name) for name in policies if POLICIES[name].table != "saliency"}
-    salient = {
-        model: PolicyConfig(name, saliency=model)
-        for name in policies
-        if POLICIES[name].table == "saliency"
-        for model in _SALIENCY_MODELS
-    }
+    plain = {name: PolicyConfig(name) for name in policies if name != SaliencyMaximum.name}
+    salient = {model: PolicyConfig(SaliencyMaximum.name, saliency=model) for model in _SALIENCY_MODELS}
     if task == "search":
         # The scores do not matter to these: no belief guides them, or one of their own.
         alone = {name: PolicyConfig(name) for name in (Random.name, TARGET_EVIDENCE)}
-        alone |= {name: policy for name, policy in plain.items() if table_of(policy) is not None} | salient
+        alone |= {name: policy for name, policy in plain.items() if not POLICIES[name].by_belief} | salient
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: policy for name, policy in plain.items() if name not in alone}
         alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
@@ -98,10 +88,11 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
     lookup(choice.policy, _valid_policies(task), "policy")
-    if table_of(choice) == "saliency" and choice.saliency is None:
+    saliency = choice.saliency if choice.policy == SaliencyMaximum.name else None
+    if choice.policy == SaliencyMaximum.name and saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
-    for setting, words in WORDS.items():
+    for setting, words in _WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
@@ -109,7 +100,8 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     if choice.samples is not None and not (choice.policy in POLICIES and POLICIES[choice.policy].by_samples):
         names = ", ".join(name for name in policy_names(task) if POLICIES[name].by_samples)
         raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
-    scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
+    known = presets(task).values()
+    scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
@@ -135,7 +127,7 @@ def label(choice: PolicyChoice, task: Task) -> str:
         for name, preset in presets(task).items()
         if name not in _ALIASES and not name.startswith(_MAXIMUM_A_POSTERIORI)
     }
-    alone = settings.saliency if table_of(settings) == "saliency" else None
+    alone = settings.saliency if settings.policy == SaliencyMaximum.name else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
     differs = []
     for field in fields(PolicyConfig)[2:]:
@@ -144,9 +136,3 @@ def label(choice: PolicyChoice, task: Task) -> str:
             text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
             differs.append(field.name if value is True else f"{field.name} {text}")
     return ", ".join([base, *differs])
-
-
-def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
-    """Whether there is a preset of this policy with these scores."""
-    saliency = policy.saliency if table_of(policy) == "saliency" else None
-    return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

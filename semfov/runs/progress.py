@@ -5,26 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
 _Item = TypeVar("_Item")
 
 _whole: ContextVar[WholeBar | None] = ContextVar("whole", default=None)
-
-
-class Bar(Protocol):
-    """Shows the progress of a task."""
-
-    def update(self, n: float = 1) -> object:
-        """Count `n` more units as done."""
-
-    def set_postfix(self, **values: object) -> None:
-        """Show values beside the bar."""
-
-    def close(self) -> None:
-        """End the task."""
 
 
 class WholeBar:
@@ -100,14 +87,16 @@ class _Task:
         """Do nothing: the bar stays open for other tasks."""
 
 
+Bar: TypeAlias = "tqdm[Any] | _Task"
+"""Shows the progress of a task."""
+
+
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
     """A bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
     whole = _whole.get()
     if whole is not None:
         return whole.task(title, total)
-    bar: Any = tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
-    task: Bar = bar
-    return task
+    return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
 
 
 def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:

@@ -7,9 +7,9 @@ import itertools
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
@@ -22,12 +22,11 @@ from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.observation.matching import match
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import look_from
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes, prepare_worker
 from semfov.runs.store import SceneStore, looks_digest
-from semfov.runs.workers import Where, run_tasks
+from semfov.runs.workers import run_tasks
 from semfov.zoom.eye import WindowEye
 
 
@@ -64,11 +63,12 @@ class Samples:
         """The detections of successive looks, as a batch."""
         numbers = torch.arange(looks.start, looks.stop + 1)
         bounds = torch.searchsorted(self.look, numbers).tolist()
-        return Detections.stack([self._view(slice(a, b)) for a, b in itertools.pairwise(bounds)])
-
-    def _view(self, rows: slice) -> Detections:
-        boxes, scores = self.boxes[rows], self.scores[rows]
-        return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
+        return Detections.stack(
+            [
+                Detections(self.boxes[None, a:b], self.scores[None, a:b], torch.ones(1, b - a, dtype=torch.bool))
+                for a, b in itertools.pairwise(bounds)
+            ]
+        )
 
     @classmethod
     @torch.inference_mode()
@@ -88,10 +88,6 @@ class Samples:
             fixations=fixations,
         )
 
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name."""
-        return {name: getattr(self, name) for name in _NAMES}
-
     @classmethod
     def join(cls, sets: list[Samples]) -> Samples:
         """Concatenate several sets of samples in order."""
@@ -108,63 +104,34 @@ _SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.se
 """Modules that samples depend on, in addition to those of a look."""
 
 
-@dataclass(frozen=True)
-class SampleSettings:
-    """Settings that labelled detections depend on.
-
-    Attributes:
-        data: the photographs.
-        detector: the detector, which is applied to each foveated view.
-        sensor: the foveal sensor.
-        fixations: number of random fixations in each photograph, uniform over its pixels.
-        iou: smallest intersection over union at which a detection matches an object.
-        seed: random seed of the fixations.
-        shard: number of photographs in a shard, the unit of work.
-        mosaics: number of mosaics, for windows; `fixations` is then the number of windows at each magnification.
-        holdout: n; every n-th mosaic is composed of every n-th photograph, and the other mosaics of the others.
-    """
-
-    data: DataConfig
-    detector: DetectorConfig
-    sensor: SensorConfig
-    fixations: int
-    iou: float
-    seed: int
-    shard: int = 32
-    mosaics: int = 0
-    holdout: int = 10
-
-    @classmethod
-    def of(cls, config: Any) -> SampleSettings:
-        """Take those of these settings that a command has, by their names."""
-        return cls(**{each.name: getattr(config, each.name) for each in fields(cls) if hasattr(config, each.name)})
-
-
-CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
+_Cells = tuple[Grid, Tensor, Tensor]
+CellsOfLook = Callable[[tuple[int, int], Tensor], _Cells]
 """Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
 `(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
-def whole_photograph(columns: int, rows: int) -> CellsOfLook:
-    """A grid over whole photographs: every look shows all cells, at their distances from the fixation."""
-
-    def cells(size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        grid = Grid(columns, rows, size)
-        return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
-
-    return cells
+def all_cells(size: tuple[int, int], fixation: Tensor, cells: tuple[int, int] = (10, 10)) -> _Cells:
+    """A grid over a whole photograph: every look shows all cells, at their distances from the fixation."""
+    grid = Grid(*cells, size)
+    return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
 
 
 class Sampler:
-    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs."""
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
+
+    The settings are those of the command: `data`, `detector` and `sensor`; `fixations` in each photograph, uniform over
+    its pixels; the `iou` at which a detection matches an object; `seed`; and the photographs in a `shard`, the unit of
+    work.
+    """
 
     sources: ClassVar[tuple[str, ...]] = _SOURCES
     coordinates: ClassVar[int] = 2
 
-    def __init__(self, settings: SampleSettings, folder: Path) -> None:
-        self.settings = settings
-        check_sources(settings.data, settings.detector)
+    def __init__(self, config: Any, folder: Path) -> None:
+        self.config = config
+        check_sources(config.data, config.detector)
         self.eye, self.scenes = self.make()
+        self.shards = range(-(-len(self.scenes) // config.shard))
         components = len(self.scenes.classes) + 1
         schema = Schema(
             {
@@ -180,29 +147,18 @@ class Sampler:
         what = {
             "settings": self.eye.settings(),
             "scenes": self.scenes.fingerprint,
-            **{name: getattr(settings, name) for name in ("fixations", "iou", "seed", "shard")},
+            **{name: getattr(config, name) for name in ("fixations", "iou", "seed", "shard")},
         }
         self.store = SceneStore(folder, what, looks_digest(*self.sources), schema)
 
     def make(self) -> tuple[Eye | WindowEye, Scenes]:
         """Make the eye and open the scenes."""
-        eye = make_eye(self.settings.detector, self.settings.sensor)
-        return eye, make_scenes(self.settings.data, eye.detector.classes)
+        eye = make_eye(self.config.detector, self.config.sensor)
+        return eye, make_scenes(self.config.data, eye.detector.classes)
 
-    def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+    def cells(self, size: tuple[int, int], fixation: Tensor) -> _Cells:
         """The cells in which misses are counted (`CellsOfLook`)."""
-        return whole_photograph(10, 10)(size, fixation)
-
-    @property
-    def foveal_eye(self) -> Eye:
-        """The eye, which must be a foveal one."""
-        assert isinstance(self.eye, Eye)
-        return self.eye
-
-    @property
-    def shards(self) -> range:
-        """The numbers of the shards."""
-        return range(-(-len(self.scenes) // self.settings.shard))
+        return all_cells(size, fixation)
 
     def load(self, shard: int) -> Samples | None:
         """The samples of a shard; None if they are missing or damaged."""
@@ -211,7 +167,7 @@ class Sampler:
 
     def save(self, shard: int, samples: Samples) -> None:
         """Store the samples of a shard."""
-        self.store.write(self.digest(shard), samples.tensors())
+        self.store.write(self.digest(shard), vars(samples))
 
     def by_shard(self) -> Iterator[Samples]:
         """The samples of one shard after another, so that not all are in memory."""
@@ -230,7 +186,7 @@ class Sampler:
         return Samples.join(
             [
                 samples[
-                    torch.rand(len(samples), generator=generator_for("detections", self.settings.seed, shard)) < share
+                    torch.rand(len(samples), generator=generator_for("detections", self.config.seed, shard)) < share
                 ]
                 for shard, samples in enumerate(self.by_shard())
             ]
@@ -242,8 +198,8 @@ class Sampler:
 
     def scenes_of(self, shard: int) -> range:
         """The photographs of a shard."""
-        first = shard * self.settings.shard
-        return range(first, min(first + self.settings.shard, len(self.scenes)))
+        first = shard * self.config.shard
+        return range(first, min(first + self.config.shard, len(self.scenes)))
 
     def digest(self, shard: int) -> str:
         """sha256 of what the pixels of a shard's photographs depend on, and of their numbers."""
@@ -255,41 +211,39 @@ class Sampler:
         return Samples.join([self._look(index) for index in self.scenes_of(shard)])
 
     def _look(self, index: int) -> Samples:
-        settings, scene = self.settings, self.scenes[index]
+        config, scene = self.config, self.scenes[index]
         grid = Grid(1, 1, scene.size)
-        generator = generator_for("fixations", settings.seed, scene.id)
-        points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
-        detections = look_from(self.foveal_eye, scene.image, points)
-        return Samples.of(detections, points, self.scenes.annotation(index), index, settings.iou)
+        generator = generator_for("fixations", config.seed, scene.id)
+        points = torch.rand(config.fixations, 2, generator=generator) * grid.extent - 0.5
+        detections = look_from(cast(Eye, self.eye), scene.image, points)
+        return Samples.of(detections, points, self.scenes.annotation(index), index, config.iou)
 
 
 _process: dict[str, Sampler] = {}
 
 
-def _prepare(kind: type[Sampler], settings: SampleSettings, folder: Path) -> None:
+def _prepare(kind: type[Sampler], config: Any, folder: Path) -> None:
     prepare_worker()
-    _process["sampler"] = kind(settings, folder)
+    _process["sampler"] = kind(config, folder)
 
 
 def _run_shard(shard: int) -> bytes:
-    return pack_tensors(_process["sampler"].sample(shard).tensors())
+    return pack_tensors(vars(_process["sampler"].sample(shard)))
 
 
-def collect_samples(
-    settings: SampleSettings, folder: Path, where: Where, title: str, kind: type[Sampler] = Sampler
-) -> Sampler:
+def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:
     """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
 
     The result is the same to the last bit wherever the work is done, on processors of one kind.
     """
-    sampler = kind(settings, folder)
+    sampler = kind(config, folder)
     todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
     done = run_tasks(
         _run_shard,
         todo,
-        where=where,
+        where=config.where,
         setup=_prepare,
-        settings=(kind, settings, folder),
+        settings=(kind, config, folder),
         title=title,
         unit="shard",
     )

@@ -16,12 +16,52 @@ from typing import Any
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.io.code import class_digest, package_digest
+from semfov.io.files import check_regular, write_text
 from semfov.io.pretrained import Pretrained
+from semfov.io.schema import is_number
 from semfov.runs.config import WHERE
-from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import run_tasks
+
+ResultRecord = dict[str, Any]
+"""The stored outcome of an episode, made of JSON values."""
+
+
+class SceneResults:
+    """Outcomes of finished scenes, one file each."""
+
+    def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
+        self.folder = folder / key
+        self.key = key
+        self.digest = digest
+
+    def path(self, index: int) -> Path:
+        """Path of a scene's file."""
+        return self.folder / f"{index:06d}.json"
+
+    def load(self, index: int) -> dict[str, Any] | None:
+        """The outcomes of a scene; None if they are missing or damaged."""
+        path = self.path(index)
+        try:
+            check_regular(path)
+            result = json.loads(path.read_text(encoding="utf-8"))
+            records, seconds = result["records"], result["seconds"]
+            whole = result["key"] == self.key and result["sha256"] == self._sha256(index, records, seconds)
+            formed = isinstance(records, list) and all(isinstance(record, dict) for record in records)
+            formed = formed and isinstance(seconds, dict) and all(map(is_number, seconds.values()))
+        except Exception:  # whatever is wrong with the file, the scene can be run again
+            return None
+        return result if whole and formed else None
+
+    def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
+        """Store the outcomes of a scene."""
+        verified = {"key": self.key, "sha256": self._sha256(index, records, seconds)}
+        write_text(self.path(index), json.dumps({**verified, "records": records, "seconds": seconds}))
+
+    def _sha256(self, index: int, records: object, seconds: object) -> str:
+        return hashlib.sha256(json.dumps([index, self.digest(index), records, seconds]).encode()).hexdigest()
+
 
 _log = logging.getLogger(__name__)
 
@@ -41,8 +81,8 @@ class SceneRun(ABC):
 
     @cached_property
     def code(self) -> str:
-        """sha256 of all code that the outcomes depend on."""
-        return self._code()
+        """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
+        return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
     def key(self) -> str:
@@ -56,10 +96,6 @@ class SceneRun(ABC):
     def own_settings(self, *others: str) -> dict[str, Any]:
         """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
         return {name: value for name, value in self.config.plain().items() if name not in (*_BESIDES, *others)}
-
-    def _code(self) -> str:
-        """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
-        return digest_of([package_digest(), versions(), class_digest(type(self))])
 
     @property
     def results(self) -> SceneResults:
@@ -96,7 +132,8 @@ def finish(run: SceneRun, title: str) -> None:
     """Run the scenes that are not finished yet, and store their outcomes."""
     results = run.results
     todo = [index for index in range(len(run.scenes)) if results.load(index) is None]
-    older = results.by_other_code()
+    others = results.folder.parent.glob(f"{results.key.partition('-')[0]}-*")
+    older = max((len(list(folder.glob("*.json"))) for folder in others if folder != results.folder), default=0)
     if todo and older:
         _log.warning(
             "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "

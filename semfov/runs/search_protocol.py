@@ -20,7 +20,7 @@ from semfov.strategy import Strategy
 
 
 @dataclass(frozen=True)
-class Episode:
+class Trial:
     """One search for a target class in a scene."""
 
     scene: int
@@ -32,12 +32,8 @@ class Episode:
     commonest: bool
 
 
-@dataclass(frozen=True)
-class EpisodeOutcome:
-    """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
-
-    cells: tuple[int, ...]
-    found_at: int
+EpisodeOutcome = tuple[list[int], int]
+"""Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
 
 
 def episodes_of(
@@ -47,7 +43,7 @@ def episodes_of(
     rows: int,
     protocol: ProtocolConfig,
     targets: Sequence[int] | None = None,
-) -> list[Episode]:
+) -> list[Trial]:
     """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
 
     Starts differ from each other as long as there are enough cells.
@@ -76,7 +72,7 @@ def episodes_of(
         order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
         cells = tuple(goal.nonzero()[:, 0].tolist())
         episodes += [
-            Episode(index, target, cue, repetition, start, cells, target == commonest)
+            Trial(index, target, cue, repetition, start, cells, target == commonest)
             for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
         ]
     return episodes
@@ -103,7 +99,7 @@ def choose_classes(
 
 @dataclass(frozen=True)
 class DrawnSearch:
-    """A search for a drawn class, which the photograph may hold or not.
+    """A search for a drawn class, which the photograph may hold or not; `spare` ones serve only some purposes of a fit.
 
     Shapes: goal `(X·Y,)`, start `(1,)`, noise `(1, shifts+1, X·Y)`.
     """
@@ -112,6 +108,7 @@ class DrawnSearch:
     goal: Tensor
     start: Tensor
     noise: Tensor
+    spare: bool = False
 
     @property
     def present(self) -> bool:
@@ -142,18 +139,18 @@ def choose_searches(
     ]
 
 
-def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
+def tie_noise(scenes: Scenes, episode: Trial, cells: int, protocol: ProtocolConfig) -> Tensor:
     """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
     return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
 
 
-def looks_of(episodes: Sequence[Episode], detections: Detections, grid: Grid) -> StoredLooks:
+def looks_of(episodes: Sequence[Trial], detections: Detections, grid: Grid) -> StoredLooks:
     """The looks of episodes of one scene, which all policies share."""
     return StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
 
 
 def run_episodes(
-    episodes: Sequence[Episode],
+    episodes: Sequence[Trial],
     candidate: Candidate,
     looks: StoredLooks,
     noise: Tensor,
@@ -173,7 +170,7 @@ def run_episodes(
 
 
 def _run_batch(
-    episodes: Sequence[Episode], candidate: Candidate, looks: StoredLooks, noise: Tensor, shifts: int
+    episodes: Sequence[Trial], candidate: Candidate, looks: StoredLooks, noise: Tensor, shifts: int
 ) -> list[EpisodeOutcome]:
     grid = looks.grid
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
@@ -204,7 +201,7 @@ def _run_batch(
         number = seeking[step.episodes[going]]
         visits[number, step.shift + 1] = step.next_cell[going]
         found_at[number[lands(step)[going]]] = step.shift + 1
-    return [EpisodeOutcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
+    return [(row[row >= 0].tolist(), int(at)) for row, at in zip(visits, found_at, strict=True)]
 
 
 def search_steps(

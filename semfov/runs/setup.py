@@ -7,7 +7,6 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -20,7 +19,6 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
-from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended_model
 from semfov.io.files import check_regular
 from semfov.io.pretrained import shipped_model
@@ -59,7 +57,16 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     _check_data(data)
     if data.root is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
-    return _photographs(data, classes, None if data.ids is None else _read_ids(data.ids), data.limit)
+    ids = None
+    if data.ids is not None:
+        check_regular(data.ids)
+        try:
+            ids = data.ids.read_text(encoding="utf-8").split()
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(
+                f"{data.ids}: expected a text file with one id per line; it cannot be read ({error})"
+            ) from None
+    return _photographs(data, classes, ids, data.limit)
 
 
 def _photographs(
@@ -83,15 +90,6 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
     others = [name for number, name in enumerate(ids) if number % every]
     return _photographs(data, classes, others), _photographs(data, classes, ids[::every])
-
-
-def _read_ids(path: Path) -> list[str]:
-    """Read the ids of photographs from a text file with one per line."""
-    check_regular(path)
-    try:
-        return path.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: expected a text file with one id per line; it cannot be read ({error})") from None
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
@@ -178,13 +176,6 @@ def if_shipped(
         return None
 
 
-def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
-    """Load class templates by name, or those shipped for the detector; check that they fit the eye."""
-    model = ClassTemplates.from_pretrained(name or eye.detector.name)
-    model.check_eye(eye.settings(), eye.detector.classes)
-    return model
-
-
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Numbers of two settings of glibc's malloc (malloc.h)."""
 
@@ -195,17 +186,11 @@ def prepare_worker() -> None:
     Only worker processes are silenced: the main process has logged the same messages already.
     """
     torch.set_num_threads(1)
-    _keep_memory()
-    if multiprocessing.parent_process() is not None:
-        logging.getLogger("semfov").setLevel(logging.ERROR)
-
-
-def _keep_memory() -> None:
-    """Have glibc keep freed memory; otherwise it would return and request memory at every look.
-
-    Dask's workers return memory at once, by a variable of the environment, which also takes away glibc's own rule.
-    """
+    # Otherwise glibc would return and request memory at every look. Dask's workers return memory at once, by a variable
+    # of the environment, which also takes away glibc's own rule.
     with suppress(OSError, AttributeError):  # other systems have no such setting
         setting = ctypes.CDLL(None).mallopt
         setting(_MMAP_THRESHOLD, 31 << 20)
         setting(_TRIM_THRESHOLD, 1 << 30)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)

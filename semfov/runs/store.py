@@ -127,32 +127,24 @@ class DetectionStore(LookStore[Any, Detections]):
         """A number or a box."""
         return tuple(row[1:]) if row[0] < 0 else int(row[0])
 
-    def pack(self, looks: Sequence[Detections]) -> dict[str, Tensor]:
-        """Convert detections to tensors for a file."""
-        return pack(looks)
+    @staticmethod
+    def pack(looks: Sequence[Detections]) -> dict[str, Tensor]:
+        """Join the detections of looks without padding, which makes up most of a padded batch."""
+        return {
+            "count": torch.cat([look.mask.sum(-1) for look in looks]),
+            "boxes": torch.cat([look.boxes[look.mask] for look in looks]),
+            "scores": torch.cat([look.scores[look.mask] for look in looks]),
+        }
 
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[int | BoxKey]) -> list[Detections]:
-        """Convert the tensors of a file back to the detections of each action."""
-        return unpack(tensors)
-
-
-def pack(looks: Sequence[Detections]) -> dict[str, Tensor]:
-    """Join the detections of looks without padding, which makes up most of a padded batch."""
-    return {
-        "count": torch.cat([look.mask.sum(-1) for look in looks]),
-        "boxes": torch.cat([look.boxes[look.mask] for look in looks]),
-        "scores": torch.cat([look.scores[look.mask] for look in looks]),
-    }
-
-
-def unpack(tensors: Mapping[str, Tensor]) -> list[Detections]:
-    """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
-    counts = tensors["count"].tolist()
-    looks = zip(tensors["boxes"].split(counts), tensors["scores"].split(counts), strict=True)
-    return [
-        Detections(boxes[None].clone(), scores[None].clone(), torch.ones(1, len(boxes), dtype=torch.bool))
-        for boxes, scores in looks
-    ]
+    @staticmethod
+    def unpack(tensors: Mapping[str, Tensor], actions: Sequence[object]) -> list[Detections]:
+        """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
+        counts = tensors["count"].tolist()
+        looks = zip(tensors["boxes"].split(counts), tensors["scores"].split(counts), strict=True)
+        return [
+            Detections(boxes[None].clone(), scores[None].clone(), torch.ones(1, len(boxes), dtype=torch.bool))
+            for boxes, scores in looks
+        ]
 
 
 def cell_store(

@@ -7,21 +7,69 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from contextvars import ContextVar
 from itertools import islice
+from logging import getLogger
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
-from semfov.errors import SemfovError
+from semfov.errors import InputError, SemfovError
 from semfov.io.code import package_digest
 from semfov.io.files import discard_unfinished
-from semfov.runs.cluster import ClusterLost, open_cluster
 from semfov.runs.progress import Bar, task_bar
+
+_REACH = 10.0
+"""Seconds in which a scheduler must answer."""
+
+_RETURN = 300.0
+"""Seconds in which a scheduler that was lost must be there again."""
+
+_log = getLogger(__name__)
+
+
+class _ClusterLost(Exception):
+    """The connection to the scheduler broke, and with it the tasks that it had."""
+
+
+@contextmanager
+def _open_cluster(address: str, *, again: bool = False) -> Iterator[Executor]:
+    """Connect to a Dask scheduler, and give tasks to its workers.
+
+    Dask gives the tasks of a worker that dies to another one. Slurm, Kubernetes and others start such workers by
+    `dask-jobqueue` and `dask-kubernetes`.
+    """
+    try:
+        from distributed import Client, KilledWorker
+        from distributed.comm.core import CommClosedError
+    except ModuleNotFoundError:
+        raise InputError("scheduler: needs Dask; pip install 'semfov[cluster]'") from None
+    try:
+        client = Client(address, timeout=_RETURN if again else _REACH, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"scheduler: expected the address of a running Dask scheduler, such as tcp://host:8786, got {address!r} "
+            f"({type(error).__name__}); start one with `dask scheduler`"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            _log.warning("the scheduler at %s has no worker yet; start some with `dask worker %s`", address, address)
+        executor = client.get_executor(pure=False)
+        try:
+            yield executor
+        except (CancelledError, CommClosedError):
+            raise _ClusterLost("the connection to the scheduler broke") from None
+        except KilledWorker as error:
+            raise SemfovError(
+                f"scheduler: a task ended several workers (out of memory?): {error}; give the workers more memory"
+            ) from None
+        finally:
+            executor.shutdown(wait=False)
+
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
@@ -30,7 +78,7 @@ Where = int | str | Executor | None
 """Where tasks run: in so many processes of this machine (1: in this one; None: one for each CPU core), on the workers
 of the Dask scheduler with this address, or in an executor."""
 
-OUTSTANDING = 256
+_OUTSTANDING = 256
 """Number of tasks that an executor is given at once; the others wait here, so that memory does not grow with them."""
 
 _PATIENCE = 5
@@ -146,7 +194,7 @@ def _results(
 
     try:
         with starting or nullcontext():
-            submit(OUTSTANDING)
+            submit(_OUTSTANDING)
         while running:
             done = finished.get()
             yield running.pop(done), done.result()
@@ -202,12 +250,12 @@ def _on_cluster(
     left = dict.fromkeys(tasks)
     for attempt in range(_PATIENCE):
         try:
-            with open_cluster(address, again=attempt > 0) as executor:
+            with _open_cluster(address, again=attempt > 0) as executor:
                 for task, result in _results(executor, job, [*left], bar):
                     yield task, result
                     del left[task]
             return
-        except ClusterLost as error:
+        except _ClusterLost as error:
             _log.warning("%s: %s; waiting for a scheduler at %s, %d tasks are left", title, error, address, len(left))
     raise SemfovError(
         f"{title}: the scheduler at {address} was lost {_PATIENCE} times; run the same command again, and it continues "

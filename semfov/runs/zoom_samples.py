@@ -62,7 +62,8 @@ class MosaicSampler(Sampler):
     """Looks at mosaics in windows of all magnifications at random places.
 
     The distance of a sample is the number of octaves by which the look reduces the picture (`Lattice.octaves`).
-    Fixations are `(x, y, magnification)`.
+    Fixations are `(x, y, magnification)`, so many at each magnification. Every `holdout`-th of the `mosaics` is made
+    of photographs that no other mosaic shows.
     """
 
     sources = (*GLANCES, "semfov.data.mosaics", __name__)
@@ -70,14 +71,13 @@ class MosaicSampler(Sampler):
 
     def make(self) -> tuple[WindowEye, Scenes]:
         """Make the eye and the mosaics."""
-        settings = self.settings
-        eye = WindowEye(make_detector(settings.detector)).eval().requires_grad_(False)
-        training, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
+        config = self.config
+        eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
+        training, held = split_photographs(config.data, eye.detector.classes, config.holdout)
         near, far = (
-            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=settings.mosaics, seed=settings.seed)
-            for some in (training, held)
+            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=config.mosaics, seed=config.seed) for some in (training, held)
         )
-        return eye, _HeldOutMosaics(near, far, settings.holdout)
+        return eye, _HeldOutMosaics(near, far, config.holdout)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
         """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
@@ -93,7 +93,7 @@ class MosaicSampler(Sampler):
         scene = self.scenes[index]
         eye = cast(WindowEye, self.eye)
         view = eye.open(scene.image)
-        windows = _choose_windows(view.lattice, self.settings.fixations, self.settings.seed, scene.id)
+        windows = _choose_windows(view.lattice, self.config.fixations, self.config.seed, scene.id)
         fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]
         annotation = self.scenes.annotation(index)
         samples = []
@@ -101,7 +101,7 @@ class MosaicSampler(Sampler):
             for number in range(len(windows)):
                 detections = eye.look(view, fixations[number : number + 1])
                 boxes = detections.boxes[0, detections.mask[0]]
-                labels = match(boxes, annotation.boxes, annotation.labels, iou=self.settings.iou)
+                labels = match(boxes, annotation.boxes, annotation.labels, iou=self.config.iou)
                 look = torch.zeros(len(boxes), dtype=torch.long)
                 distance = octaves[number].expand(len(boxes)).clone()
                 at = torch.tensor([index]), fixations[number : number + 1]

@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.io.schema import Field
-from semfov.runs.store import LookStore, RememberedLooks, pack, unpack
+from semfov.runs.store import DetectionStore, LookStore, RememberedLooks
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.hints import Gist
@@ -34,7 +34,12 @@ class GlanceStore(LookStore[Window, Glance]):
         return {
             "cut": Field(("M",), torch.bool),
             "show": Field(("N", self.classes), torch.float32, low=0, high=1),
-            **_gist_fields(self.classes),
+            "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
+            "gist.counts": Field(("N", 2), torch.int64, low=0),
+            "gist.cells": Field(("P",), torch.int32, low=0),
+            "gist.scores": Field(("P", self.classes), torch.float32, low=0, high=1),
+            "gist.sizes": Field(("P",), torch.float32, low=0),
+            "gist.found": Field(("Q",), torch.int32, low=0),
         }
 
     def encode(self, action: Window) -> Sequence[float]:
@@ -51,7 +56,7 @@ class GlanceStore(LookStore[Window, Glance]):
     def pack(self, looks: Sequence[Glance]) -> dict[str, Tensor]:
         """Convert glances to tensors for a file."""
         return {
-            **pack([glance.detections for glance in looks]),
+            **DetectionStore.pack([glance.detections for glance in looks]),
             "cut": torch.cat([glance.cut for glance in looks]),
             "show": torch.stack([glance.show for glance in looks]),
             **_pack_gists([glance.gist for glance in looks], self.classes),
@@ -59,8 +64,9 @@ class GlanceStore(LookStore[Window, Glance]):
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
         """Convert the tensors of a file back to the glances at these windows."""
+        seen = DetectionStore.unpack(tensors, actions)
         cut, gists = tensors["cut"].split(tensors["count"].tolist()), _unpack_gists(tensors, actions)
-        return [Glance(*each) for each in zip(actions, unpack(tensors), cut, tensors["show"], gists, strict=True)]
+        return [Glance(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
 
 
 class StoredGlances(Glances):
@@ -87,20 +93,8 @@ class StoredGlances(Glances):
         self.looks.save()
 
 
-def _gist_fields(kinds: int) -> dict[str, Field]:
-    """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file."""
-    return {
-        "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
-        "gist.counts": Field(("N", 2), torch.int64, low=0),
-        "gist.cells": Field(("P",), torch.int32, low=0),
-        "gist.scores": Field(("P", kinds), torch.float32, low=0, high=1),
-        "gist.sizes": Field(("P",), torch.float32, low=0),
-        "gist.found": Field(("Q",), torch.int32, low=0),
-    }
-
-
 def _pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Pack gists into the tensors of `_gist_fields`; a look without a gist has no cells."""
+    """Pack gists into tensors for a file; a look without a gist has no cells."""
     frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
     cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
     scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]

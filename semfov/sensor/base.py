@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import as_positions
-from semfov.errors import InputError, check, check_finite, values_known
+from semfov.errors import check, check_finite, values_known
 from semfov.io.state import StatedModule
 
 
@@ -160,16 +160,15 @@ class Sensor(StatedModule, ABC):
     def width(cls, settings: Mapping[str, Any]) -> float:
         """Tell the width of the fovea, in pixels of the image that the settings are for.
 
+        Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
+
         Args:
             settings: settings of the sensor.
 
         Returns:
             The width.
-
-        Raises:
-            InputError: the sensor has no fovea.
         """
-        raise InputError(f"sensor: expected a sensor with a fovea, got {cls.__name__}, which has none")
+        return 100.0
 
     @classmethod
     def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:
@@ -195,6 +194,12 @@ class Sensor(StatedModule, ABC):
         """
         numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
+
+    def extra_repr(self) -> str:
+        """The settings as text."""
+        settings = self.settings()
+        named = ((name, settings[name]) for name in self.names)
+        return ", ".join(f"{name}={v:g}" if isinstance(v, float) else f"{name}={v!r}" for name, v in named)
 
 
 def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:

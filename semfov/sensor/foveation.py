@@ -1,7 +1,6 @@
 """The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, get_args
 
 import torch
@@ -75,17 +74,12 @@ def foveate(
         return foveate(bands, points, sigma=sigma, growth=growth)[0]
     bands = image if isinstance(image, Bands) else laplacian_pyramid(as_batch(image), levels, convention)
     fixation, many = fixations(gaze, bands.base)
-    _check_values(sigma, growth)
+    if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
+        for name, value in (("sigma", sigma), ("growth", growth)):
+            positive = bool((torch.as_tensor(value) > 0).all())
+            check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
     result = _collapse(bands, fixation, _widths(sigma, bands.base), growth)
     return result if many else result[:, 0]
-
-
-@dataclass(frozen=True)
-class _FoveationCanvas:
-    """A canvas that `Foveation.open` has prepared; sigma `(1, 2)`."""
-
-    bands: Bands
-    sigma: Tensor
 
 
 class Foveation(Sensor):
@@ -135,14 +129,17 @@ class Foveation(Sensor):
         self.convention: Convention = convention
         given = isinstance(sigma, Tensor) and sigma.requires_grad
         check(not (given and learnable), "learnable", "False for a sigma that is learned outside", learnable)
-        self.given_sigma = sigma if given else None
+        self.given_sigma = sigma if isinstance(sigma, Tensor) and given else None
         log_sigma = None if given else torch.tensor(float(sigma)).log()
         self.log_sigma = None if log_sigma is None else nn.Parameter(log_sigma, requires_grad=learnable)
 
     @property
     def sigma(self) -> Tensor:
         """Width of the fovea in image pixels."""
-        return self.given_sigma if self.log_sigma is None else self.log_sigma.exp()
+        if self.log_sigma is not None:
+            return self.log_sigma.exp()
+        assert self.given_sigma is not None
+        return self.given_sigma
 
     def pyramid(self, image: ImageLike) -> Bands:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
@@ -155,14 +152,15 @@ class Foveation(Sensor):
         """
         return laplacian_pyramid(as_batch(image), self.levels, self.convention)
 
-    def open(self, canvas: Tensor, scale: Tensor) -> _FoveationCanvas:
-        """Compute the pyramid of a canvas, and scale the width of the fovea."""
+    def open(self, canvas: Tensor, scale: Tensor) -> tuple[Bands, Tensor]:
+        """Compute the pyramid of a canvas, and scale the width of the fovea, `(1, 2)`."""
         shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
-        return _FoveationCanvas(self.pyramid(canvas), self.sigma * shrink)
+        return self.pyramid(canvas), self.sigma * shrink
 
-    def look(self, state: _FoveationCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: tuple[Bands, Tensor], gaze: Tensor) -> Tensor:
         """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
-        return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
+        bands, sigma = state
+        return foveate(bands, gaze[None], sigma=sigma, growth=self.growth)[0]
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
@@ -196,12 +194,6 @@ class Foveation(Sensor):
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
         )
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        own = self.settings()
-        settings = f"levels={self.levels}, growth={own['growth']:g}, convention={self.convention!r}"
-        return f"sigma={own['sigma']:g}, {settings}"
 
 
 def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:
@@ -264,11 +256,3 @@ def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
     fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
     check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
     return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
-
-
-def _check_values(sigma: float | Tensor, growth: float | Tensor) -> None:
-    if not values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
-        return
-    for name, value in (("sigma", sigma), ("growth", growth)):
-        positive = bool((torch.as_tensor(value) > 0).all())
-        check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())

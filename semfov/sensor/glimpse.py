@@ -77,20 +77,9 @@ def glimpse(
 
 
 def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Compute the windows that are centred at points and fill a canvas at given magnifications.
+    r"""Windows `(..., 4)` that are centred at points and fill a canvas of `(w, h)` pixels at given magnifications.
 
     .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
-
-    Args:
-        points: `(..., 2)`, pixel centres at integers.
-        magnification: m, canvas pixels per picture pixel, `(...)`.
-        size: `(w, h)` of the canvas.
-
-    Returns:
-        Windows `(..., 4)`, `(x1, y1, x2, y2)`, edges between pixels.
-
-    >>> windows_at(torch.tensor([[9.5, 9.5]]), torch.tensor([2.0]), (10, 20))
-    tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
     """
     check_shape(points, "points", 2)
     points = as_positions(points)
@@ -104,15 +93,10 @@ def edges_at(point: _Length, magnification: _Length, length: _Length) -> tuple[_
 
 
 def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:
-    """Compute the window that shows a box closely, with some of its surroundings.
+    """The window `(4,)` that shows a box closely, with some of its surroundings.
 
     The window is a square, `context` times as large as the longer side of the box, and at least `least` times as large
     as the longer side of the picture. It is moved to lie inside the picture. Where the picture is narrower, it is cut.
-
-    >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 80))
-    tensor([ 0., 10., 60., 70.])
-
-    Shapes: box `(4,)`, picture `(width, height)` → `(4,)`.
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
@@ -125,13 +109,7 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
 
 
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """List magnifications one octave apart, from the one that shows the whole picture up to a finest one.
-
-    >>> ladder((2560, 1920), (416, 416))
-    (0.1625, 0.325, 0.65)
-
-    Shapes: picture `(width, height)`, size `(width, height)`.
-    """
+    """Magnifications one octave apart, from the one that shows the whole picture up to a finest one."""
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
     check(finest > 0, "finest", "a positive magnification", finest)
     whole = min(size[0] / picture[0], size[1] / picture[1])

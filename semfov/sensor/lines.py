@@ -18,11 +18,11 @@ from semfov.errors import values_known
 # Lines of up to this many pixels are computed by one dense matrix, longer lines tile by tile.
 _SMALL = 160
 
-Constant = TypeVar("Constant")
+_Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
 
 
-def constant(function: Callable[[*_Settings], Constant]) -> Callable[[*_Settings], Constant]:
+def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Settings], _Constant]:
     """Cache the results of a function of sizes and settings; a compiled graph computes its own."""
 
     @lru_cache(maxsize=256)
@@ -32,10 +32,10 @@ def constant(function: Callable[[*_Settings], Constant]) -> Callable[[*_Settings
             return function(*settings)
 
     @wraps(function)
-    def call(*settings: *_Settings) -> Constant:
+    def call(*settings: *_Settings) -> _Constant:
         if torch.compiler.is_compiling():
             return function(*settings)
-        result: Constant = remember(*settings)
+        result: _Constant = remember(*settings)
         return result
 
     return call
@@ -43,20 +43,14 @@ def constant(function: Callable[[*_Settings], Constant]) -> Callable[[*_Settings
 
 @dataclass(frozen=True)
 class Taps:
-    """A linear filter of a line: every output pixel is a weighted sum of input pixels.
-
-    Shapes: index `(length, taps)`, weight `(length, taps)`.
-    """
+    """A linear filter of a line: each output pixel is a weighted sum of input pixels `(length, taps)`."""
 
     index: Tensor
     weight: Tensor
 
 
 class Lines(NamedTuple):
-    """A matrix from input lines to output lines, dense or cut into tiles.
-
-    Shapes: first `(a, n)`, middle `(tiles, tile, window)`, last `(b, m)`.
-    """
+    """A matrix from input to output lines: dense, or tiles `(tiles, tile, window)` between dense ends."""
 
     first: Tensor
     middle: Tensor | None = None

@@ -142,14 +142,6 @@ def from_log_polar(
     return result if many else result[:, 0]
 
 
-@dataclass(frozen=True)
-class _LogPolarCanvas:
-    """A canvas that `LogPolar.open` has prepared."""
-
-    levels: _Levels
-    retina: _Retina
-
-
 class LogPolar(Sensor):
     """A sensor with receptors on rings, see `log_polar`; its views are back-projections of the cortical images.
 
@@ -223,18 +215,18 @@ class LogPolar(Sensor):
         finest = image[0] if isinstance(image, tuple) else image
         return self.back(self.cortical(image, gaze), gaze, _size(finest))
 
-    def open(self, canvas: Tensor, scale: Tensor) -> _LogPolarCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
         own = self.retina
         retina = _Retina(own.fovea, own.spacing, own.pooling, (across, down))
-        return _LogPolarCanvas(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
+        return gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina
 
-    def look(self, state: _LogPolarCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
-        fixation, _ = fixations(gaze[None], state.levels[0])
-        cortical = _sample(state.levels, fixation, state.retina)
-        return _project(cortical, fixation, _size(state.levels[0]), state.retina)[0]
+        levels, retina = state
+        fixation, _ = fixations(gaze[None], levels[0])
+        return _project(_sample(levels, fixation, retina), fixation, _size(levels[0]), retina)[0]
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
@@ -245,11 +237,6 @@ class LogPolar(Sensor):
     def width(cls, settings: Mapping[str, Any]) -> float:
         """Tell the eccentricity at which acuity is half the acuity at the fixation."""
         return float(settings["fovea"])
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        own = self.retina
-        return f"fovea={own.fovea:g}, spacing={own.spacing:g}, pooling={own.pooling:g}"
 
 
 def _size(image: Tensor) -> tuple[int, int]:

@@ -1,7 +1,6 @@
 """The multi-scale fovea: square crops around the fixation, each twice as wide as the one before, all of one size."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,14 +14,6 @@ from semfov.sensor.glimpse import windows_at
 
 _Planes = tuple[Tensor, ...]
 """Planes of all squares of 2^l pixels that touch an image, with a black border, finest scale first."""
-
-
-@dataclass(frozen=True)
-class _MultiScaleCanvas:
-    """A canvas that `MultiScaleFovea.open` has prepared; size `(width, height)`."""
-
-    means: _Planes
-    size: tuple[int, int]
 
 
 class MultiScaleFovea(Sensor):
@@ -128,21 +119,22 @@ class MultiScaleFovea(Sensor):
         width, height = (max(1, round(length * reference / max(size))) for length in size)
         return width, height
 
-    def open(self, canvas: Tensor, scale: Tensor) -> _MultiScaleCanvas:
+    def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Planes, tuple[int, int]]:
         """Compute the means of a canvas. Crops are in pixels of the canvas, whatever the scale."""
-        return _MultiScaleCanvas(self.means(canvas), (canvas.shape[-1], canvas.shape[-2]))
+        return self.means(canvas), (canvas.shape[-1], canvas.shape[-2])
 
-    def look(self, state: _MultiScaleCanvas, gaze: Tensor) -> Tensor:
+    def look(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor) -> Tensor:
         """Compute the crops `(F·L, 3, side, side)` around fixations `(F, 2)`, those of a fixation together."""
-        return self(state.means, gaze[None])[0].flatten(0, 1)
+        return self(state[0], gaze[None])[0].flatten(0, 1)
 
-    def picture(self, state: _MultiScaleCanvas, gaze: Tensor) -> Tensor:
+    def picture(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor) -> Tensor:
         """Compose the crops into pictures `(F, 3, H, W)` in which each place is shown by its finest crop."""
-        crops = self(state.means, gaze[None])[0]
+        means, size = state
+        crops = self(means, gaze[None])[0]
         fixation, _ = fixations(gaze, crops)
         windows = self.windows(fixation[:, 0])
-        x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in state.size)
-        picture = crops.new_zeros(len(crops), crops.shape[2], state.size[1], state.size[0])
+        x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in size)
+        picture = crops.new_zeros(len(crops), crops.shape[2], size[1], size[0])
         for scale in reversed(range(self.scales)):
             low, side = windows[:, scale, :2], self.side * 2**scale
             across, down = (2 * (place - low[:, axis, None]) / side - 1 for axis, place in enumerate((x, y)))
@@ -151,7 +143,7 @@ class MultiScaleFovea(Sensor):
             picture = torch.where((where.abs() <= 1).all(-1)[:, None], crop, picture)
         return picture
 
-    def boxes_to_canvas(self, state: _MultiScaleCanvas, gaze: Tensor, boxes: Tensor) -> Tensor:
+    def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
         windows = self.windows(as_positions(gaze, boxes)).flatten(0, 1)[:, None]
         unit = (windows[..., 2:] - windows[..., :2]).repeat(1, 1, 2) / self.side
@@ -170,10 +162,6 @@ class MultiScaleFovea(Sensor):
     def borders(cls, settings: Mapping[str, Any]) -> list[float]:
         """List where acuity changes: at half the side of each crop."""
         return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        return f"side={self.side}, scales={self.scales}"
 
     def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
         """Crops `(B, G, C, side, side)` of one scale, from the means of its squares."""

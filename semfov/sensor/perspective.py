@@ -68,17 +68,11 @@ def go_around(panorama: Tensor) -> Tensor:
 
 
 def even_rows(panorama: Tensor) -> Tensor:
-    r"""Smooth every row of a panorama to the resolution of the horizon.
+    r"""Smooth every row of a panorama `(..., H, W)` to the resolution of the horizon.
 
     A pixel at latitude φ covers cos φ times the width of a pixel at the horizon. Each pixel becomes the mean of the row
     over :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is
     exact for any width.
-
-    Args:
-        panorama: `(..., H, W)`.
-
-    Returns:
-        The smoothed panorama, `(..., H, W)`.
     """
     high, wide = panorama.shape[-2:]
     latitude = (torch.arange(high, dtype=torch.float64, device=panorama.device) + 0.5) / high - 0.5

@@ -12,22 +12,12 @@ from semfov.errors import check, check_shape, values_known
 
 
 def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Compute the directions of pixels of an equirectangular panorama.
+    r"""Directions `(..., 3)`, unit vectors, of pixels `(..., 2)` of an equirectangular panorama.
 
     .. math:: \lambda = 360° \frac{x + ½}{W} - 180°, \quad \varphi = 90° - 180° \frac{y + ½}{H}, \quad
               d = (\cos\varphi \sin\lambda, -\sin\varphi, \cos\varphi \cos\lambda)
 
     where the longitude λ increases to the right from the middle, and the latitude φ increases upwards from the horizon.
-
-    Args:
-        points: pixels `(..., 2)`, pixel centres at integers.
-        size: `(W, H)` of the panorama.
-
-    Returns:
-        Unit vectors `(..., 3)`.
-
-    >>> panorama_directions(torch.tensor([511.5, 255.5]), (1024, 512))
-    tensor([0., -0., 1.])
     """
     check_shape(points, "points", 2)
     longitude = (points[..., 0] + 0.5) * (2 * torch.pi / size[0]) - torch.pi
@@ -37,14 +27,9 @@ def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
-    """Compute the pixels of directions in an equirectangular panorama, the inverse of `panorama_directions`.
+    """Pixels `(..., 2)` of directions `(..., 3)` in an equirectangular panorama, the inverse of `panorama_directions`.
 
     x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
-
-    >>> panorama_points(torch.tensor([0.0, -1.0, 1.0]), (1024, 512))
-    tensor([511.5000, 127.5000])
-
-    Shapes: directions `(..., 3)`, size `(width, height)` → `(..., 2)`.
     """
     check_shape(directions, "directions", 3)
     x, y, z = directions.unbind(-1)
@@ -60,18 +45,7 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def angle_between(one: Tensor, other: Tensor) -> Tensor:
-    r"""Compute the angle between directions, :math:`\operatorname{atan2}(|a × b|, a · b)`.
-
-    Args:
-        one: a, vectors `(..., 3)` of any length.
-        other: b, vectors `(..., 3)` of any length.
-
-    Returns:
-        Angles `(...)` in degrees.
-
-    >>> angle_between(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 0.0]))
-    tensor(90.)
-    """
+    r"""Angle between directions `(..., 3)` of any length in degrees, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
     one, other = torch.broadcast_tensors(one, other)
     sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
     return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))

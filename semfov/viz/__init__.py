@@ -6,16 +6,13 @@ last value of a cell. To draw in an existing figure, give its axes as `ax=` or `
 
 from semfov.viz.animation import animate
 from semfov.viz.belief import class_posterior, plot_belief, plot_belief_bars, plot_belief_strip
-from semfov.viz.curves import plot_cumulative_performance, plot_curve_panels, plot_success_rate
+from semfov.viz.curves import plot_cumulative_performance, plot_success_rate
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.fixation import plot_fixation
-from semfov.viz.presence import plot_roc
-from semfov.viz.reliability import plot_cell_reliability, plot_reliability
-from semfov.viz.saliency import plot_saliency
+from semfov.viz.reliability import plot_reliability
 from semfov.viz.scanpath import plot_episode, plot_foveated_strip, plot_scanpath
 from semfov.viz.semantic import cell_entropy, named_regions, plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure
-from semfov.viz.zoom import plot_zoom_path
 
 __all__ = [
     "COLOURS",
@@ -27,18 +24,13 @@ __all__ = [
     "plot_belief",
     "plot_belief_bars",
     "plot_belief_strip",
-    "plot_cell_reliability",
     "plot_cumulative_performance",
-    "plot_curve_panels",
     "plot_episode",
     "plot_fixation",
     "plot_foveated_strip",
     "plot_reliability",
-    "plot_roc",
-    "plot_saliency",
     "plot_scanpath",
     "plot_semantic_map",
     "plot_success_rate",
-    "plot_zoom_path",
     "save_figure",
 ]

@@ -6,7 +6,7 @@ import base64
 import io
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.inputs import ImageLike
 from semfov.errors import DataError, check
 from semfov.io.files import replacing
-from semfov.paths import Record, Scanpath
+from semfov.paths import Record
 from semfov.viz.drawing import photograph_of
-from semfov.viz.fixation import FixationFigure
-from semfov.viz.scanpath import views_of
+from semfov.viz.fixation import LookFigure, views_of
 from semfov.viz.style import STYLE
 
 Frame = NDArray[np.uint8]
@@ -47,7 +47,13 @@ class Film:
 
     def save(self, path: str | PathLike[str]) -> list[Path]:
         """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""
-        return _save_animation(self.frames, Path(path), seconds=self.seconds, hold=self.hold)
+        path = Path(path)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            _write_gif(self.frames, file, self.seconds, self.hold)
+        ffmpeg = shutil.which("ffmpeg")
+        if ffmpeg is None:
+            return [path]
+        return [path, _save_mp4(ffmpeg, self.frames, path.with_suffix(".mp4"), self.seconds, self.hold)]
 
     def _repr_html_(self) -> str:
         """The film as a GIF inside the notebook's file."""
@@ -60,22 +66,23 @@ class Film:
 
 
 def animate(
-    scanpath: Scanpath,
+    scanpath: Record,
     path: str | PathLike[str] | None = None,
     *,
-    image: Tensor | None = None,
+    image: ImageLike | None = None,
     views: Sequence[Tensor] | None = None,
     boxes: Tensor | None = None,
     seconds: float = 1.0,
     hold: float = 2.0,
 ) -> Path | Film:
-    """Make a film of an episode: for each fixation the scanpath so far, the foveated view, and the belief.
+    """Make a film of a record of any kind, with a frame for each look, as `plot_fixation` draws it.
 
     Args:
-        scanpath: the episode.
+        scanpath: the record.
         path: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
-        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
-        views: for each fixation the foveated photograph `(3, h, w)`; None takes the scanpath's own.
+        image: `(3, H, W)`, RGB in [0, 1], or another picture of any common kind (`semfov.as_image`); None takes the
+            record's own.
+        views: for each fixation the foveated photograph `(3, h, w)`; None takes the record's own.
         boxes: `(M, 4)`, true boxes of the target.
         seconds: duration of each frame.
         hold: additional seconds of the last frame.
@@ -84,8 +91,7 @@ def animate(
         The path of the GIF, or a film, which a notebook shows.
 
     Raises:
-        InputError: the photograph or the views are neither given nor kept by the scanpath, or a duration is out of
-            range.
+        InputError: the picture is neither given nor kept by the record, or a duration is out of range.
         DataError: the file cannot be written.
 
     Example::
@@ -93,50 +99,23 @@ def animate(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         animate(scanpath, "search.gif", seconds=0.5)
     """
-    film = film_of(scanpath, image=image, views=views, boxes=boxes, seconds=seconds, hold=hold)
+    check(seconds > 0, "seconds", "a positive time", seconds)
+    check(hold >= 0, "hold", "0 seconds or more", hold)
+    frames = _look_frames(scanpath, photograph_of(scanpath, image), views, boxes)
+    film = Film(frames, seconds, hold, scanpath.describe())
     return film if path is None else film.save(path)[0]
 
 
-def film_of(
-    scanpath: Scanpath,
-    *,
-    image: Tensor | None = None,
-    views: Sequence[Tensor] | None = None,
-    boxes: Tensor | None = None,
-    seconds: float = 1.0,
-    hold: float = 2.0,
-) -> Film:
-    """Make the film of an episode; arguments and errors as for `animate`."""
-    check(seconds > 0, "seconds", "a positive time", seconds)
-    check(hold >= 0, "hold", "0 seconds or more", hold)
-    frames = _episode_frames(scanpath, photograph_of(scanpath, image), views_of(scanpath, views), boxes)
-    return Film(frames, seconds, hold, scanpath.describe())
-
-
-def _episode_frames(
-    scanpath: Scanpath, image: Tensor, views: Sequence[Tensor], boxes: Tensor | None = None, dpi: int = 90
+def _look_frames(
+    record: Record, image: Tensor, views: Sequence[Tensor] | None, boxes: Tensor | None = None
 ) -> list[Frame]:
-    """Frames of an episode, all drawn in one figure; each is the figure of `plot_fixation`."""
+    """Frames of a record, all drawn in one figure; each is the figure of `plot_fixation`."""
     from matplotlib import rc_context
 
-    def figures() -> Iterator[Any]:
-        drawn = FixationFigure(scanpath, image, views[0], boxes)
-        for fixation, view in enumerate(views):
-            yield drawn.show(fixation, view)
-
+    shown = views_of(record, image, views)
     with rc_context(STYLE):
-        return render(figures(), dpi)
-
-
-def film_or_file(
-    record: Record, figures: Iterable[Any], seconds: float, hold: float, file: str | PathLike[str] | None
-) -> Path | Film:
-    """The film of a record, whose frames are figures; with a file it is written there, and the path returned."""
-    from matplotlib import rc_context
-
-    with rc_context(STYLE):
-        film = Film(render(figures), seconds, hold, record.describe())
-    return film if file is None else film.save(file)[0]
+        figure = LookFigure(record, image, shown[0], boxes)
+        return render(figure.show(number, view) for number, view in enumerate(shown))
 
 
 def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
@@ -150,22 +129,6 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return frames
-
-
-def in_palette(frame: Frame, refine: int = 0) -> Any:
-    """A frame as a Pillow image of 256 colours of its own, with dithering; each round of refinement takes seconds."""
-    from PIL import Image
-
-    image = Image.fromarray(frame)
-    return image.quantize(palette=image.quantize(256, kmeans=refine))
-
-
-def _save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:
-    """Write frames as a GIF and, where ffmpeg is installed, as an MP4 beside it; frames `(H, W, 3)`."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        _write_gif(frames, file, seconds, hold)
-    ffmpeg = shutil.which("ffmpeg")
-    return [path] if ffmpeg is None else [path, _save_mp4(ffmpeg, frames, path.with_suffix(".mp4"), seconds, hold)]
 
 
 def _write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:

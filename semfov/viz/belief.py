@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
-from semfov.viz.drawing import check_fixation, choose_fixations, draw_gaze, draw_image, draw_overlay, draw_scale
+from semfov.viz.drawing import check_fixation, choose_fixations, draw_cross, draw_image, draw_overlay, draw_scale
 from semfov.viz.style import PROBABILITY, make_figure, only, root, styled
 
 if TYPE_CHECKING:
@@ -83,7 +83,9 @@ def plot_belief(
         save_figure(plot_belief(scanpath), "belief.pdf")
     """
     figure, (axes,) = make_figure(1, 1, width=5.6, height=4.6, layout="compressed", axes=only(ax))
-    drawn = draw_belief(axes, scanpath, check_fixation(scanpath, fixation), target, _grey(scanpath, image))
+    drawn = draw_belief(
+        axes, scanpath, check_fixation(scanpath, fixation), target, scanpath.image if image is None else image
+    )
     draw_scale(axes, drawn, f"probability of {_name(scanpath, target)}")
     return figure
 
@@ -120,7 +122,7 @@ def plot_belief_strip(
         save_figure(plot_belief_strip(scanpath, most=4, columns=2), "beliefs.pdf")
     """
     check(columns >= 1, "columns", "at least 1", columns)
-    fixations, grey = choose_fixations(scanpath, most), _grey(scanpath, image)
+    fixations, grey = choose_fixations(scanpath, most), scanpath.image if image is None else image
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
     width, height = scanpath.grid.extent.tolist()
@@ -203,20 +205,9 @@ def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | Non
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
     drawn = draw_overlay(axes, scanpath.grid, posterior)
-    draw_gaze(axes, scanpath, fixation)
-    axes.set_title(belief_title(scanpath, fixation, target), parse_math=False)
+    draw_cross(axes, scanpath.fixations[fixation])
+    axes.set_title(f"p({_name(scanpath, target)}) up to {float(posterior.max()):.2f}", parse_math=False)
     return drawn
-
-
-def belief_title(scanpath: Scanpath, fixation: int, target: int | None = None) -> str:
-    """Text with the highest probability of a class in any cell after a fixation."""
-    highest = float(class_posterior(scanpath, target)[fixation].max())
-    return f"p({_name(scanpath, target)}) up to {highest:.2f}"
-
-
-def _grey(scanpath: Scanpath, image: Tensor | None) -> Tensor | None:
-    """The photograph under the belief: the given one, or the scanpath's own."""
-    return scanpath.image if image is None else image
 
 
 def _name(scanpath: Scanpath, target: int | None) -> str:

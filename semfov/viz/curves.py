@@ -1,4 +1,4 @@
-"""Curves over gaze shifts."""
+"""Curves: over gaze shifts, and of hits against false alarms."""
 
 from __future__ import annotations
 
@@ -73,44 +73,6 @@ def plot_success_rate(
     return _plot_curves(curves, errors, title, "cells with the right class (%)", ax)[0]
 
 
-@styled
-def plot_curve_panels(
-    panels: Mapping[str, tuple[_Curves, _Curves]],
-    *,
-    label: str,
-    columns: int = 2,
-    axes: Sequence[Axes] | None = None,
-) -> Figure:
-    """Plot curves of several experiments with the same policies side by side, with one legend.
-
-    Args:
-        panels: for each title, curves in [0, 1] and their standard errors, as for `plot_cumulative_performance`.
-        label: of the vertical axis.
-        columns: number of panels in a row.
-        axes: axes to draw in, one for each panel; None makes a figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: there is no panel, or the number of axes does not fit.
-
-    >>> curves = {"random": np.linspace(0, 0.8, 31)}
-    >>> figure = plot_curve_panels({"wide": (curves, {}), "narrow": (curves, {})}, label="targets found (%)")
-    """
-    check(len(panels) > 0, "panels", "at least one panel", 0)
-    columns = len(panels) if axes is not None else columns
-    rows = -(-len(panels) // columns)
-    figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5, axes=axes)
-    for panel, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
-        _draw(panel, curves, errors, band=0.15)
-        panel.set(xlabel="gaze shifts", ylabel=label, title=title)
-    for panel in every[len(panels) :]:
-        panel.remove()
-    legend_of(figure, every[0], columns=3, inside=axes is not None)
-    return figure
-
-
 def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
     """The curves that a legend names: the highest on average, and random gaze as the reference.
 
@@ -131,7 +93,7 @@ def others_named(count: int) -> str:
     return f"{count} other{'s' if count != 1 else ''}"
 
 
-def _draw(axes: Axes, curves: _Curves, errors: _Curves | None, band: float, named: Sequence[str] | None = None) -> None:
+def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequence[str] | None = None) -> None:
     """Draw curves with bands of one standard error; those that are not in `named` are grey."""
     from matplotlib.ticker import MaxNLocator
 
@@ -147,7 +109,7 @@ def _draw(axes: Axes, curves: _Curves, errors: _Curves | None, band: float, name
         error = None if errors is None else errors.get(name)
         if error is not None and np.isfinite(error).all():
             low, high = 100 * (curve - error), 100 * (curve + error)
-            axes.fill_between(shifts, low, high, color=style["color"], alpha=band, lw=0)
+            axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
     axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3, linewidth=0.5)
@@ -167,7 +129,7 @@ def _plot_curves(
 ) -> tuple[Figure, Axes]:
     check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
-    _draw(axes, curves, errors, band=0.15, named=highlighted(curves))
+    draw_curves(axes, curves, errors, named=highlighted(curves))
     axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     lines, names = axes.get_legend_handles_labels()
     if len(curves) > len(COLOURS):

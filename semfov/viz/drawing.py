@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.fixations import Fixations
+from semfov.data.inputs import ImageLike, as_image
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check, check_shape
-from semfov.paths import Record, Scanpath
+from semfov.paths import Record
+from semfov.paths.look import LookView
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
@@ -28,25 +31,27 @@ LABEL = 6.5
 """Font size of the labels of boxes."""
 
 
-def photograph_of(record: Record, image: Tensor | None) -> Tensor:
-    """The given image, or the one that the record kept; image `(3, h, w)` → `(3, h, w)`."""
-    picture = record.image if image is None else image
-    if picture is None:
+def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor:
+    """The given picture, or the one that the record kept, `(3, h, w)`."""
+    kept = record.image if isinstance(record, Record) else None
+    if image is not None:
+        return as_image(image)
+    if kept is None:
         raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
-    return picture
+    return kept
 
 
-def check_fixation(scanpath: Scanpath, fixation: int) -> int:
-    """The number of a fixation; negative numbers count from the end."""
-    count = len(scanpath)
+def check_fixation(record: Record, fixation: int) -> int:
+    """The number of a look; negative numbers count from the end."""
+    count = len(record)
     check(-count <= fixation < count, "fixation", f"a number from 0 to {count - 1}, or -1 for the last", fixation)
     return fixation % count
 
 
-def choose_fixations(scanpath: Scanpath, most: int) -> list[int]:
-    """Numbers of at most `most` fixations: the first ones and the last."""
+def choose_fixations(record: Record, most: int) -> list[int]:
+    """Numbers of at most `most` looks: the first ones and the last."""
     check(most >= 1, "most", "at least 1", most)
-    count = len(scanpath)
+    count = len(record)
     return list(range(count)) if count <= most else [*range(most - 1), count - 1]
 
 
@@ -75,9 +80,8 @@ def picture_array(image: Tensor, *, grey: bool = False) -> Any:
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
     """Draw a value of every cell `(X·Y,)` as a colour."""
     width, height = grid.extent.tolist()
-    drawn = axes.imshow(
-        cell_table(grid, values), extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style
-    )
+    table = values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
+    drawn = axes.imshow(table, extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style)
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     return drawn
 
@@ -94,11 +98,6 @@ def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
     first = axes[0] if isinstance(axes, list) else axes
     figure: Any = first.figure
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.85, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
-
-
-def cell_table(grid: Grid, values: Tensor) -> Any:
-    """Values of cells `(X·Y,)` as a table `(Y, X)`."""
-    return values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
@@ -121,28 +120,22 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
     ]
 
 
-def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """Draw a cross at the point of gaze of a fixation."""
-    return draw_cross(axes, scanpath.fixations[fixation])
-
-
-def draw_cross(axes: Axes, point: Tensor) -> list[Artist]:
+def draw_cross(axes: Axes, point: Tensor | Sequence[float]) -> list[Artist]:
     """Draw a cross at the point of gaze, `(x, y)` in pixels."""
-    x, y = (point.cpu() + 0.5).tolist()
+    x, y = (float(side) + 0.5 for side in point)
     return [
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
         *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
     ]
 
 
-def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6) -> list[Artist]:
-    """Draw the most confident detections of a look (`draw_look`); labels do not cover the point of gaze."""
-    width, height = scanpath.grid.extent.tolist()
-    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
-    reach = 8 * per_point(axes)
-    gaze = (x - reach, y - reach, x + reach, y + reach)
-    detections = confident_detections(scanpath.detections[fixation], most)
-    return draw_look(axes, detections, scanpath.classes, (width, height), target=scanpath.target, obstacles=[gaze])
+def draw_view(axes: Axes, record: Record, number: int, view: LookView, most: int) -> list[Artist]:
+    """Draw gaze and most confident detections of a look into its view; labels do not cover the point of gaze."""
+    look, (x, y), reach = record.looks[number].detections, view.gaze, 8 * per_point(axes)
+    detections = confident_detections(Detections(view.boxes[None], look.scores, look.mask), most)
+    gaze = (x + 0.5 - reach, y + 0.5 - reach, x + 0.5 + reach, y + 0.5 + reach)
+    drawn = draw_look(axes, detections, record.classes, view.size, target=record.target, obstacles=[gaze])
+    return [*draw_cross(axes, view.gaze), *drawn]
 
 
 def confident_detections(detections: Detections, most: int) -> Detections:

@@ -1,29 +1,31 @@
-"""One fixation in a figure: a frame of an animation."""
+"""One look of a record in a figure: a frame of an animation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from semfov.paths import Scanpath
-from semfov.viz.belief import belief_title, draw_belief
-from semfov.viz.belief import class_posterior as posterior_of
+from semfov.data.large import open_large
+from semfov.errors import check
+from semfov.paths import Record, Scanpath
+from semfov.paths.look import LookView
 from semfov.viz.drawing import (
-    cell_table,
     check_fixation,
-    draw_detections,
-    draw_gaze,
+    draw_cross,
+    draw_grid,
     draw_image,
+    draw_overlay,
     draw_scale,
+    draw_view,
     photograph_of,
     picture_array,
 )
-from semfov.viz.objects import draw_legend
-from semfov.viz.path import path_of
-from semfov.viz.scanpath import MOST_BOXES, annotation_entries, draw_place
-from semfov.viz.semantic import draw_semantic_map, most_probable, write_names
+from semfov.viz.objects import draw_legend, draw_objects
+from semfov.viz.path import LookPath
+from semfov.viz.scanpath import annotation_entries, draw_place
+from semfov.viz.semantic import write_names
 from semfov.viz.style import lay_out, make_figure, styled
 
 if TYPE_CHECKING:
@@ -31,10 +33,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_MOST_BOXES = 10
+"""Largest number of detections of a look that are drawn."""
+
 
 @styled
 def plot_fixation(
-    scanpath: Scanpath,
+    scanpath: Record,
     fixation: int,
     image: Tensor | None = None,
     view: Tensor | None = None,
@@ -42,93 +47,112 @@ def plot_fixation(
     boxes: Tensor | None = None,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """Plot one fixation: the scanpath so far, the foveated view with its detections, and the belief after the look.
+    """Plot one look: the looks and objects so far, what it shows with its detections, and the belief after it.
 
-    The belief is the target's posterior, or the semantic map if nothing was searched for.
+    The belief is the probability of the target, or of any object if nothing was searched for. Windows have none.
 
     Args:
-        scanpath: the episode.
-        fixation: number of the fixation; -1 is the last.
-        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
-        view: the foveated photograph `(3, h, w)`, of any size; None takes the scanpath's own.
+        scanpath: the record, of any kind.
+        fixation: number of the look; -1 is the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the record's own.
+        view: what the look shows, the foveated photograph `(3, h, w)`, of any size; None takes the record's own.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
-        axes: three axes to draw in; None makes a figure.
+        axes: axes to draw in, three, or two for windows; None makes a figure.
 
     Returns:
         The figure.
 
     Raises:
-        InputError: the photograph or the view is neither given nor kept by the scanpath, or there is no such fixation.
+        InputError: the photograph is neither given nor kept by the record, or there is no such look.
 
     Example::
 
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_fixation(scanpath, 0), "first.png")
     """
-    fixation = check_fixation(scanpath, fixation)
-    view = scanpath.views()[fixation] if view is None else view
-    return FixationFigure(scanpath, photograph_of(scanpath, image), view, boxes, axes).show(fixation, view)
+    fixation, image = check_fixation(scanpath, fixation), photograph_of(scanpath, image)
+    views = None if view is None else [view] * len(scanpath)
+    seen = views_of(scanpath, image, views)[fixation]
+    return LookFigure(scanpath, image, seen, boxes, axes).show(fixation, seen)
 
 
-class FixationFigure:
-    """A figure of one fixation that can show other fixations: it is laid out once, and only differences are redrawn.
+def views_of(record: Record, image: Tensor, views: Sequence[Tensor] | None) -> list[LookView]:
+    """What the looks showed, from the given views `(3, h, w)` of the whole picture, or from the picture `(3, H, W)`."""
+    if views is None:
+        return list(record.look_views(open_large(image)))
+    check(len(views) == len(record), "views", f"{len(record)} views, one for each fixation", len(views))
+    return [
+        LookView(view, record.size, look.detections.boxes[0], look.fixation)
+        for look, view in zip(record, views, strict=True)
+    ]
 
-    Shapes: image `(3, H, W)`, view `(3, h, w)`, boxes `(M, 4)`.
+
+class LookFigure:
+    """A figure of one look that can show other looks: it is laid out once, and only differences are redrawn.
+
+    Shapes: image `(3, H, W)`, boxes `(M, 4)`.
     """
 
     def __init__(
         self,
-        scanpath: Scanpath,
+        record: Record,
         image: Tensor,
-        view: Tensor,
+        view: LookView,
         boxes: Tensor | None = None,
         axes: Sequence[Axes] | None = None,
     ) -> None:
-        self.scanpath = scanpath
-        height = 4 * image.shape[-2] / image.shape[-1] + 0.3
-        self.figure, self.axes = make_figure(1, 3, width=12.6, height=height, layout="compressed", axes=axes)
-        path_axes, view_axes, belief_axes = self.axes
+        self.record, believed = record, record.belief_map(0)
+        panels, aspect = 2 if believed is None else 3, image.shape[-2] / image.shape[-1]
+        wide = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
+        height = wide * aspect / 1.05 + 0.3
+        self.figure, self.axes = make_figure(1, panels, wide * panels, height, layout="compressed", axes=axes)
+        path_axes, view_axes, *others = self.axes
         if axes is None:
             # Hidden axes save the layout of ticks, a tenth of the time.
             for panel in self.axes:
                 panel.xaxis.set_visible(False)
                 panel.yaxis.set_visible(False)
-        draw_place(path_axes, scanpath, image, boxes)
-        draw_legend(path_axes, annotation_entries(scanpath, boxes))
-        self.view = draw_image(view_axes, view, scanpath.grid)
-        view_axes.set_title("what the eye sees")
-        if scanpath.target is None:
-            self.belief = draw_semantic_map(belief_axes, scanpath, 0, image)
-        else:
-            self.belief = draw_belief(belief_axes, scanpath, 0, None, image)
-        # `show` draws the cross of the gaze.
-        for line in list(belief_axes.lines):
-            line.remove()
-        draw_scale(belief_axes, self.belief, "probability")
-        path_axes.set_title("fixation 0")
+        draw_place(path_axes, record, image, boxes)
+        draw_legend(path_axes, annotation_entries(record, boxes))
+        self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")
+        view_axes.set(xticks=[], yticks=[], title="what the eye sees")
+        self.named = isinstance(record, Scanpath) and record.target is None
+        if believed is not None:
+            (belief_axes,), (grid, chances) = others, believed
+            draw_image(belief_axes, image, grid, grey=True)
+            self.belief = draw_overlay(belief_axes, grid, chances)
+            if self.named:
+                draw_grid(belief_axes, grid)
+            draw_scale(belief_axes, self.belief, "probability")
+        path_axes.set_title("look 0")
         lay_out(self.figure)
         if axes is None:
             # The layout does not change any more, and computing it again takes as long as drawing.
             self.figure.set_layout_engine("none")
-        self.path = path_of(path_axes, scanpath)
+        self.path = LookPath(path_axes, record)
         self.changing: list[Artist] = []
 
-    def show(self, fixation: int, view: Tensor) -> Figure:
-        """Show a fixation, seen as `view` `(3, h, w)`."""
-        path_axes, view_axes, belief_axes = self.axes
+    def show(self, number: int, view: LookView) -> Figure:
+        """Show a look."""
+        record, (path_axes, view_axes, *others) = self.record, self.axes
+        look, (width, height) = record.looks[number], view.size
         for artist in self.changing:
             artist.remove()
-        self.path.show(fixation)
-        path_axes.set_title(f"fixation {fixation}")
-        self.view.set_data(picture_array(view))
-        self.changing = draw_gaze(view_axes, self.scanpath, fixation) + draw_gaze(belief_axes, self.scanpath, fixation)
-        self.changing += draw_detections(view_axes, self.scanpath, fixation, MOST_BOXES)
-        if self.scanpath.target is None:
-            values: Any = most_probable(self.scanpath, fixation)
-            belief_axes.set_title(f"semantic map after fixation {fixation}")
-            self.changing += write_names(belief_axes, self.scanpath, fixation)
-        else:
-            values = posterior_of(self.scanpath)[fixation]
-            belief_axes.set_title(belief_title(self.scanpath, fixation), parse_math=False)
-        self.belief.set_data(cell_table(self.scanpath.grid, values))
+        self.path.show(number)
+        path_axes.set_title(f"look {number}" if look.seconds is None else f"look {number}, {look.seconds:.2f} s")
+        self.changing = draw_objects(path_axes, record, last=number, tagged=False)
+        self.view.set_data(picture_array(view.pixels))
+        self.view.set_extent((0, width, height, 0))
+        view_axes.set(xlim=(0, width), ylim=(height, 0))
+        self.changing += draw_view(view_axes, record, number, view, _MOST_BOXES)
+        for axes, believed in zip(others, [record.belief_map(number)], strict=False):
+            assert believed is not None
+            grid, chances = believed
+            self.belief.set_data(chances.detach().cpu().reshape(grid.rows, grid.columns).numpy())
+            self.changing += draw_cross(axes, look.fixation)
+            title = f"p({record.target_name or 'any object'}) up to {float(chances.max()):.2f}"
+            if isinstance(record, Scanpath) and self.named:
+                title = f"semantic map after fixation {number}"
+                self.changing += write_names(axes, record, number)
+            axes.set_title(title, parse_math=False)
         return self.figure

@@ -55,7 +55,8 @@ def place_numbers(
         others = [point for point in points if point != points[number]]
         for x, y in _around(points[number], (width, height), reach):
             label = _into(x - width / 2, y - height / 2, width, height, frame)
-            if not _covers_any(label, placed) and not any(_holds(label, point) for point in others):
+            x1, y1, x2, y2 = label
+            if not _covers_any(label, placed) and not any(x1 < x < x2 and y1 < y < y2 for x, y in others):
                 places[number] = label
                 placed.append(label)
                 break
@@ -91,10 +92,6 @@ def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
             angle = math.pi / 8 * turn
             yield point[0] + radius * math.cos(angle), point[1] + radius * math.sin(angle)
         radius += step / 2
-
-
-def _holds(label: LabelBox, point: _Point) -> bool:
-    return label[0] < point[0] < label[2] and label[1] < point[1] < label[3]
 
 
 def _into(x: float, y: float, width: float, height: float, frame: _Size) -> LabelBox:

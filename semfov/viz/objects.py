@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from semfov.paths import Record
+from semfov.paths.merging import number_of
 from semfov.viz.drawing import LABEL, Tag, draw_boxes, draw_tags
 from semfov.viz.labels import LabelBox
 from semfov.viz.style import FOUND, TARGET
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 LegendEntry = tuple[str, str, str]
@@ -44,15 +46,16 @@ def draw_objects(
     *,
     last: int | None = None,
     tagged: bool = True,
-) -> None:
+) -> list[Artist]:
     """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
 
     For labels the figure must be laid out, because their positions depend on the layout.
     """
-    rows = [row for row in record.object_rows() if last is None or row["look"] <= last]
+    last = len(record) if last is None else last
+    rows = [row for row in record.object_rows() if row["look"] <= last]
     width, height = record.size
-    for look in record.refuted:
-        draw_boxes(axes, look.box[None], FOUND, ":", 1.6)
+    refuted = [look.box for look in record.refuted if number_of(look) <= last]
+    drawn = [artist for box in refuted for artist in draw_boxes(axes, box[None], FOUND, ":", 1.6)]
     tags: list[Tag] = []
     many = len(rows) > _NAMED
     single = many and record.target is not None
@@ -62,10 +65,11 @@ def draw_objects(
         text = f"{row['score']:.2f}" if single else f"{row['class']} {row['score']:.2f}"
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
-            draw_boxes(axes, Tensor([box]), colour, width=line)
+            drawn += draw_boxes(axes, Tensor([box]), colour, width=line)
             tags.append(Tag(box, text, colour))
     if tagged:
-        draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
+        drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
+    return drawn
 
 
 def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:

@@ -1,4 +1,4 @@
-"""Drawing of the gaze's path: numbered fixations, coloured by time."""
+"""Drawing of looks: the path of the gaze, numbered and coloured by time, and outlines of what looks show."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semfov.data.fixations.record import FixationValues
-from semfov.paths import Scanpath
+from semfov.paths import Record
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import LabelBox, place_numbers
-from semfov.viz.style import FOUND, TIME
+from semfov.viz.style import FOUND, GAZE, TIME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,11 +19,62 @@ if TYPE_CHECKING:
 _POINTS = 6.5
 
 
-def path_of(axes: Axes, scanpath: Scanpath) -> GazePath:
-    """Draw the path of an episode."""
-    width, height = scanpath.grid.extent.tolist()
-    points = scanpath.fixations.detach().double().cpu().numpy()
-    return GazePath(axes, points, (width, height), found=scanpath.found)
+class LookPath:
+    """The looks of a record: outlines of what they show, and the path of the gaze or, of windows, their numbers."""
+
+    def __init__(self, axes: Axes, record: Record) -> None:
+        self.gaze: GazePath | None = None
+        self.number_boxes: list[LabelBox] = []
+        self._outlines: list[tuple[int, Any]] = []
+        self._numbers: list[tuple[int, Any]] = []
+        width = record.around
+        if record.how != "windows":
+            points = np.array([look.fixation for look in record]).reshape(-1, 2)
+            found = bool(getattr(record, "found", False))
+            self.gaze = GazePath(axes, points, record.size, found=found, around=width)
+            self.number_boxes = self.gaze.number_boxes
+        room, middles = 0.025 * record.size[0], list[tuple[float, float]]()
+        for look in record:
+            border = record.outline(look)
+            if border is None:
+                continue
+            x, y = border.numpy().T
+            for shift in (0.0,) if width is None else (-width, 0.0, width):
+                (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
+                self._outlines.append((look.number, line))
+            if self.gaze is None:
+                middles.append(_free(look.region, middles, room))
+                text = axes.text(*middles[-1], str(look.number), color="white", fontsize=6, ha="center", va="center",
+                                 bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
+                self._numbers.append((look.number, text))
+        self.number_boxes += [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in middles]
+
+    @property
+    def outlined(self) -> bool:
+        """Whether some looks show a part of the picture."""
+        return bool(self._outlines)
+
+    def show(self, last: int) -> None:
+        """Show the looks up to `last`, whose outline is wider."""
+        if self.gaze is not None:
+            self.gaze.show(last)
+        for number, artist in (*self._outlines, *self._numbers):
+            artist.set_visible(number <= last)
+        for number, line in self._outlines:
+            line.set_linewidth(2.0 if number == last else 0.8)
+
+
+def _free(region: LabelBox, numbers: list[tuple[float, float]], room: float) -> tuple[float, float]:
+    """Position `(x, y)` for the number of a window: the corner farthest from other numbers, or the middle."""
+    x1, y1, x2, y2 = region
+    left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
+    places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
+
+    def far(place: tuple[float, float]) -> float:
+        # Distances beyond the width of a number count the same, so that the first free corner is taken.
+        return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in numbers)])
+
+    return max(places, key=far)
 
 
 class GazePath:
@@ -31,22 +82,39 @@ class GazePath:
 
     All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown.
 
+    In a picture that repeats after the width `around`, a saccade takes the short way, across the seam if need be.
+
     Shapes: fixations `(n, 2)`, frame `(width, height)`.
     """
 
-    def __init__(self, axes: Axes, fixations: FixationValues, frame: tuple[float, float], *, found: bool) -> None:
+    def __init__(
+        self,
+        axes: Axes,
+        fixations: FixationValues,
+        frame: tuple[float, float],
+        *,
+        found: bool,
+        around: float | None = None,
+    ) -> None:
         from matplotlib import colormaps
         from matplotlib.collections import LineCollection
 
         self.path, self.frame, self.found = fixations + 0.5, frame, found
         count = len(self.path)
         self.colours = colormaps[TIME](np.linspace(0, 1, max(count, 2))[:count])
-        lines = np.stack([self.path[:-1], self.path[1:]], 1)
+        before, after = self.path[:-1], self.path[1:]
+        segments = [np.stack([before, after], 1)]
+        if around is not None:
+            way = after - before
+            way[:, 0] = (way[:, 0] + around / 2) % around - around / 2
+            segments = [np.stack([before, before + way], 1), np.stack([after - way, after], 1)]
+        self.segments = np.concatenate(segments, 1).reshape(-1, 2, 2)
+        self.each = len(segments)
+        coloured = np.repeat(self.colours[1:], self.each, 0)
         self.lines: list[Any] = [
-            axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=width), autolim=False)
-            for colours, width in (((1, 1, 1, 0.7), 1.6), (self.colours[1:], 0.8))
+            axes.add_collection(LineCollection(list(self.segments), colors=colours, linewidths=width), autolim=False)
+            for colours, width in (((1, 1, 1, 0.7), 1.6), (coloured, 0.8))
         ]
-        self.segments = lines
         x, y = self.path.T
         self.dots = axes.scatter(x, y, s=16, c=self.colours, edgecolors="white", linewidths=0.6, zorder=5)
         self.numbers = self._numbers(axes)
@@ -87,10 +155,10 @@ class GazePath:
             written.append(text)
         return written
 
-    def show(self, last: int) -> list[Any]:
+    def show(self, last: int) -> None:
         """Show the fixations up to `last`; a frame marks its number, in green if the target was found there."""
         for lines in self.lines:
-            lines.set_segments(list(self.segments[:last]))
+            lines.set_segments(list(self.segments[: last * self.each]))
         self.dots.set_offsets(self.path[: last + 1])
         self.dots.set_facecolor([tuple(colour) for colour in self.colours[: last + 1]])
         for number, text in enumerate(self.numbers):
@@ -100,4 +168,3 @@ class GazePath:
                 box: Any = text.get_bbox_patch()
                 found = ends and self.found and last == len(self.path) - 1
                 box.set(edgecolor=FOUND if found else "white", linewidth=1.6 if ends else 0.7)
-        return [*self.lines, self.dots, *(text for text in self.numbers if text is not None)]

@@ -2,108 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
-from semfov.data.inputs import ImageLike, as_image
-from semfov.errors import InputError, check
-from semfov.paths import Scanpath
+from semfov.data.inputs import ImageLike
+from semfov.errors import check
+from semfov.paths import Record, Scanpath
+from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     choose_fixations,
     draw_boxes,
-    draw_detections,
-    draw_gaze,
     draw_grid,
     draw_image,
     draw_scale,
+    draw_view,
     photograph_of,
 )
 from semfov.viz.objects import LegendEntry, draw_legend, draw_objects, object_entries
-from semfov.viz.path import GazePath, path_of
+from semfov.viz.path import GazePath, LookPath
 from semfov.viz.semantic import draw_semantic_map, write_names
-from semfov.viz.style import TRUTH, lay_out, make_figure, only, root, styled
+from semfov.viz.style import GAZE, TRUTH, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-MOST_BOXES = 6
+_MOST_BOXES = 6
 """Largest number of detections of a look that are drawn."""
 
 
 @styled
 def plot_scanpath(
-    scanpath: Scanpath | Fixations,
+    scanpath: Record | Fixations,
     image: ImageLike | None = None,
     *,
     boxes: Tensor | None = None,
     objects: bool = True,
     ax: Axes | None = None,
 ) -> Figure:
-    """Plot numbered fixations on the photograph, coloured by time, with the grid and the objects.
+    """Plot the looks of a record of any kind on the picture, with the objects.
 
-    A legend explains the colours of the boxes: those of objects that a closer look or the decision confirmed, and
-    others. Fixations of people have no grid and no objects; their target's box is drawn dashed.
+    Fixations of an eye are numbered dots, coloured by time. Looks that show a part of the picture, such as windows and
+    the views of a head, are outlined. A legend explains the colours of the boxes: those of objects that a closer look
+    or the decision confirmed, and others. Fixations of people have no objects; their target's box is drawn dashed.
 
     Args:
-        scanpath: the episode, or the fixations of a person (`semfov.data.fixations`).
-        image: the picture, of any common type (`semfov.as_image`); None takes the scanpath's own. Fixations of people
-            need it.
+        scanpath: the record, or the fixations of a person (`semfov.data.fixations`).
+        image: the picture in any size, of any common kind (`semfov.as_image`); None takes the record's own. Fixations
+            of people need it.
         boxes: `(M, 4)`, true boxes of the target, drawn dashed.
-        objects: whether to draw the objects of the scanpath.
+        objects: whether to draw the objects of the record.
         ax: axes to draw in; None makes a figure.
 
     Returns:
         The figure.
 
     Raises:
-        InputError: the photograph is neither given nor kept by the scanpath.
+        InputError: the picture is neither given nor kept by the record.
 
     Example::
 
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_scanpath(scanpath), "scanpath.pdf")
     """
-    image = None if image is None else as_image(image)
+    image, (width, height) = photograph_of(scanpath, image), scanpath.size
+    figure, (axes,) = make_figure(
+        1, 1, width=7.2, height=7.2 * height / width + 0.6, layout="compressed", axes=only(ax)
+    )
     if isinstance(scanpath, Fixations):
-        return _plot_person(scanpath, image, boxes, ax)
-    image = photograph_of(scanpath, image)
-    height = 6.4 * image.shape[-2] / image.shape[-1] + 0.6
-    figure, (axes,) = make_figure(1, 1, width=6.4, height=height, layout="compressed", axes=only(ax))
+        boxes = Tensor([scanpath.box]) if boxes is None and scanpath.box is not None else boxes
+        draw_place(axes, scanpath, image, boxes)
+        title = f"{len(scanpath)} fixations"
+        if scanpath.target is not None:
+            title = f"“{scanpath.target}”{ {None: '', True: ', found', False: ', not found'}[scanpath.found] }"
+        axes.set_title(f"{scanpath.picture}, {scanpath.subject}: {title}", parse_math=False)
+        lay_out(figure)
+        GazePath(axes, scanpath.points, scanpath.size, found=bool(scanpath.found))
+        return figure
     draw_place(axes, scanpath, image, boxes)
     axes.set_title(scanpath.describe(), parse_math=False)
-    draw_legend(axes, [*annotation_entries(scanpath, boxes), *(object_entries(scanpath) if objects else [])])
+    outlined = any(scanpath.outline(look) is not None for look in scanpath)
+    entries = [*annotation_entries(scanpath, boxes), *(object_entries(scanpath) if objects else [])]
+    draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
     lay_out(figure)
-    path = path_of(axes, scanpath)
+    path = LookPath(axes, scanpath)
     if objects:
         draw_objects(axes, scanpath, path.number_boxes)
-    return figure
-
-
-def _plot_person(fixations: Fixations, image: Tensor | None, boxes: Tensor | None, ax: Axes | None) -> Figure:
-    """Plot fixations of a person on the photograph."""
-    if image is None:
-        raise InputError("image: expected the photograph, as fixations of people hold none, got None")
-    width, height = fixations.size
-    tall = 6.4 * height / width + 0.6
-    figure, (axes,) = make_figure(1, 1, width=6.4, height=tall, layout="compressed", axes=only(ax))
-    draw_image(axes, image, Grid(1, 1, fixations.size))
-    if boxes is None and fixations.box is not None:
-        boxes = Tensor([fixations.box])
-    if boxes is not None:
-        draw_boxes(axes, boxes, TRUTH, "--", 1.8)
-    title = f"{fixations.picture}, {fixations.subject}: {len(fixations)} fixations"
-    if fixations.target is not None:
-        outcome = {None: "", True: ", found", False: ", not found"}[fixations.found]
-        title = f"{fixations.picture}, {fixations.subject}: “{fixations.target}”{outcome}"
-    axes.set_title(title, parse_math=False)
-    lay_out(figure)
-    GazePath(axes, fixations.points, (width, height), found=bool(fixations.found))
     return figure
 
 
@@ -136,19 +125,19 @@ def plot_foveated_strip(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_foveated_strip(scanpath, most=4), "views.png")
     """
-    views = views_of(scanpath, views)
+    views = _views(scanpath, views)
     check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most)
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
     height = rows * (2.6 * views[0].shape[-2] / views[0].shape[-1] + 0.3)
     figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
-    used = list(zip(panels, fixations, strict=False))
-    for panel, fixation in used:
-        _draw_view(panel, scanpath, fixation, views[fixation])
+    for panel, fixation in zip(panels, fixations, strict=False):
+        draw_image(panel, views[fixation], scanpath.grid)
+        panel.set_title(f"fixation {fixation}")
     for panel in panels[len(fixations) :]:
         panel.remove()
-    _label_views(figure, scanpath, used)
+    _label_views(panels, scanpath, fixations, views)
     return figure
 
 
@@ -187,7 +176,7 @@ def plot_episode(
     """
     from matplotlib.figure import Figure
 
-    image, views = photograph_of(scanpath, image), views_of(scanpath, views)
+    image, views = photograph_of(scanpath, image), _views(scanpath, views)
     fixations = choose_fixations(scanpath, most)
     aspect = image.shape[-2] / image.shape[-1]
     width = 2.5 * len(fixations) + 5.8
@@ -200,51 +189,48 @@ def plot_episode(
     draw_legend(first, annotation_entries(scanpath, boxes))
     panels = right.subplots(2, len(fixations), squeeze=False)
     for (above, below), fixation in zip(panels.T, fixations, strict=True):
-        _draw_view(above, scanpath, fixation, views[fixation])
+        draw_image(above, views[fixation], scanpath.grid)
+        above.set_title(f"fixation {fixation}")
         if scanpath.target is None:
             drawn = draw_semantic_map(below, scanpath, fixation, image)
         else:
             drawn = draw_belief(below, scanpath, fixation, None, image)
     draw_scale(list(panels.flat), drawn, "probability")
-    whole = root(first)
-    _label_views(whole, scanpath, zip(panels[0], fixations, strict=True))
-    path_of(first, scanpath)
+    _label_views(panels[0], scanpath, fixations, views)
+    LookPath(first, scanpath)
     if scanpath.target is None:
         for below, fixation in zip(panels[1], fixations, strict=True):
             write_names(below, scanpath, fixation)
-    return whole
+    return root(first)
 
 
-def draw_place(axes: Axes, scanpath: Scanpath, image: Tensor, boxes: Tensor | None) -> None:
-    """Draw the photograph, the grid, and the true boxes of the target."""
-    draw_image(axes, image, scanpath.grid)
-    draw_grid(axes, scanpath.grid)
+def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
+    """Draw the picture, the cells of a fovea, and the true boxes of the target."""
+    believed = record.belief_map(0) if isinstance(record, Record) and record.how == "fovea" else None
+    grid = Grid(1, 1, record.size) if believed is None else believed[0]
+    draw_image(axes, image, grid)
+    draw_grid(axes, grid)
     if boxes is not None:
         draw_boxes(axes, boxes, TRUTH, "--", 1.8)
 
 
-def annotation_entries(scanpath: Scanpath, boxes: Tensor | None) -> list[LegendEntry]:
+def annotation_entries(record: Record, boxes: Tensor | None) -> list[LegendEntry]:
     """Entries of a legend for the true boxes of the target, where there are any."""
-    name = "target" if scanpath.target is None else scanpath.classes[scanpath.target]
-    return [(TRUTH, "--", f"annotated: {name}")] if boxes is not None and len(boxes) else []
+    some = boxes is not None and len(boxes)
+    return [(TRUTH, "--", f"annotated: {record.target_name or 'target'}")] if some else []
 
 
-def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:
-    """Draw the foveated view of a fixation."""
-    draw_image(axes, view, scanpath.grid)
-    draw_gaze(axes, scanpath, fixation)
-    axes.set_title(f"fixation {fixation}")
-
-
-def views_of(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
+def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
     """The given views, or those of the scanpath."""
     views = scanpath.views() if views is None else views
     check(len(views) == len(scanpath), "views", f"{len(scanpath)} views, one for each fixation", len(views))
     return views
 
 
-def _label_views(figure: Figure, scanpath: Scanpath, views: Iterable[tuple[Axes, int]]) -> None:
-    """Draw the detections of views, after the layout of the figure, on which the positions of labels depend."""
-    lay_out(figure)
-    for axes, fixation in views:
-        draw_detections(axes, scanpath, fixation, MOST_BOXES)
+def _label_views(panels: Sequence[Axes], scanpath: Scanpath, fixations: Sequence[int], views: Sequence[Tensor]) -> None:
+    """Draw gaze and detections into views, after the layout of the figure, on which the positions of labels depend."""
+    lay_out(root(panels[0]))
+    for axes, fixation in zip(panels, fixations, strict=False):
+        look = scanpath.looks[fixation]
+        view = LookView(views[fixation], scanpath.size, look.detections.boxes[0], look.fixation)
+        draw_view(axes, scanpath, fixation, view, _MOST_BOXES)

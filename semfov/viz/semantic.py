@@ -14,7 +14,7 @@ from semfov.paths import Scanpath
 from semfov.viz.drawing import (
     check_fixation,
     draw_cells,
-    draw_gaze,
+    draw_cross,
     draw_grid,
     draw_image,
     draw_overlay,
@@ -92,7 +92,7 @@ def plot_semantic_map(
     values = cell_entropy(scanpath)
     style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
     bits = draw_cells(unsure, grid, values[fixation], alpha=0.65 if image is not None else None, **style)
-    draw_gaze(unsure, scanpath, fixation)
+    draw_cross(unsure, scanpath.fixations[fixation])
     unsure.set_title(f"uncertainty after fixation {fixation}")
     draw_scale(unsure, bits, "entropy (bits)")
     lay_out(figure)
@@ -104,16 +104,11 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     """Draw the probability of the most probable object of every cell, from 0 to 1, over a photograph."""
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
-    drawn = draw_overlay(axes, scanpath.grid, most_probable(scanpath, fixation))
+    drawn = draw_overlay(axes, scanpath.grid, scanpath.probabilities[fixation, :, 1:].amax(-1))
     draw_grid(axes, scanpath.grid)
-    draw_gaze(axes, scanpath, fixation)
+    draw_cross(axes, scanpath.fixations[fixation])
     axes.set_title(f"semantic map after fixation {fixation}")
     return drawn
-
-
-def most_probable(scanpath: Scanpath, fixation: int) -> Tensor:
-    """Probability of the most probable object of every cell, `(X·Y,)`."""
-    return scanpath.probabilities[fixation, :, 1:].detach().cpu().amax(-1)
 
 
 def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:

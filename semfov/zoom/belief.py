@@ -15,6 +15,7 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
+from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
 
 _CLEAR = 0.1
@@ -91,6 +92,11 @@ class ZoomBelief:
         """The learned evidence; only searches ask for it."""
         assert isinstance(self._evidence, GlimpseEvidence), "searches go by learned evidence"
         return self._evidence
+
+    @property
+    def photograph(self) -> PhotographEvidence | None:
+        """The evidence for photographs, where the picture is one: nothing in it can be looked at an octave closer."""
+        return self.evidence.photograph if self.lattice.levels == 1 else None
 
     @property
     def foresight(self) -> float:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.detection.detections import Detections
@@ -17,6 +18,9 @@ from semfov.zoom.lattice import Lattice
 _CONTEXT = 3.0
 """Side of the window of a closer look, in longer sides of the examined box."""
 
+PART, _AROUND = 0.6, 2.0
+"""Least side of that window in a photograph, in longer sides of the photograph, and of the box."""
+
 _SMALLEST = 1e-4
 
 
@@ -24,7 +28,8 @@ def closer_window(lattice: Lattice, box: Tensor) -> Window:
     """The window that shows a box closely, with its surroundings.
 
     It is three times as large as the longer side of the box (`semfov.sensor.glimpse.window_around`), but its
-    magnification is at most one octave above that of the last level: pictures show no more beyond it.
+    magnification is at most one octave above that of the last level: pictures show no more beyond it. In a photograph
+    it is twice as large, and at least 0.6 of the longer side: it shows other places, too.
 
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> closer_window(lattice, torch.tensor([600.0, 600.0, 800.0, 700.0])).within
@@ -35,15 +40,25 @@ def closer_window(lattice: Lattice, box: Tensor) -> Window:
 
     Shapes: box `(4,)`.
     """
-    smallest = min(lattice.canvas) / (2 * lattice.magnifications[-1])
-    window = window_around(box.double(), lattice.size, context=_CONTEXT, least=smallest / max(lattice.size))
+    context, least = _AROUND, PART
+    if lattice.levels > 1:
+        context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
+    window = window_around(box.double(), lattice.size, context=context, least=least)
     x1, y1, x2, y2 = window.tolist()
     return around(lattice, (x1, y1, x2, y2))
 
 
 def look_closely(glances: Glances, box: Tensor) -> Glance:
     """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
-    return glances.see([closer_window(glances.lattice, box)], hints=False)[0]
+    return glances.see([closer_window(glances.lattice, box)], hints=glances.lattice.levels == 1)[0]
+
+
+def candidates(glance: Glance) -> Detections:
+    """What a look shows of places that may hold a target: its detections, in a photograph all its hints."""
+    if glance.hints is None:
+        return glance.detections
+    boxes, scores = glance.hints.boxes, glance.hints.scores
+    return Detections(boxes[None], F.pad(scores, (1, 0))[None], torch.ones(1, len(boxes), dtype=torch.bool))
 
 
 class WindowLook(NamedTuple):
@@ -85,6 +100,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
+    least = DETECTION_SCORE
+    """Score from which on a box seems to hold the target."""
+
     def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
         self._target, self.likely = target, likely
@@ -98,7 +116,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._look, self._number = look, look.number
         scores = look.detections.scores[0, :, self._target]
-        of_target = look.detections.mask[0] & (scores >= DETECTION_SCORE)
+        of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
             self._detections.append(_Dated(self._frame, look.detections.boxes[0][of_target], scores[of_target]))
 
@@ -172,3 +190,42 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Probability that the target is where the highest score is this one."""
         picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
         return float((picture + place - top).sigmoid())
+
+
+class PhotographPlaces(CandidateBoxes):
+    r"""Places of a photograph that seem to hold the target, hints among them.
+
+    A look at a place is worth the probability that the target is there, and at none of the places looked at before:
+
+    .. math:: v = p \, (1 - \max_i p_i)
+    """
+
+    least = 0.002
+
+    def __init__(self, target: int, forgetting: Forgetting | None = None) -> None:
+        super().__init__(target, 0.0, forgetting)
+        self._known: list[tuple[int, float]] = []  # with their frames
+
+    @property
+    def left(self) -> float:
+        """Worth of the best look that is left; below 0 if there is none."""
+        place = super().due(0.0, last=True)
+        return -1.0 if place is None else self._worth(place)
+
+    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
+        """The most evident place, if a look at it is worth a pass."""
+        place = super().due(0.0, last=True)
+        return None if place is None or self._worth(place) < least else place
+
+    def _worth(self, place: CandidatePlace) -> float:
+        return place.probability * (1 - max((known for _, known in self._known), default=0.0))
+
+    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
+        """Make the record of the last closer look."""
+        self._known.append((self._frame, place))
+        return super().record(box, place, presence)
+
+    def wait(self) -> None:
+        """Let a frame pass."""
+        super().wait()
+        self._known = [each for each in self._known if each[0] >= self._frame - self.forgetting.span]

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision import MOST_CLOSER, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import CandidateBoxes, WindowLook
+from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, WindowLook, candidates
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
@@ -106,12 +106,15 @@ class SearchFacts:
     @torch.no_grad()
     def presence(self, ahead: float) -> float:
         """Predict whether the picture holds the target."""
+        photograph, target = self.belief.photograph, torch.tensor(self.belief.target)
+        if photograph is not None:
+            return float(photograph.presence(torch.tensor(self.best), target).sigmoid())
         odds = self.belief.evidence.anywhere(torch.tensor(self.best), self.case(ahead))
         return float(odds.sigmoid())
 
 
 CLOSER = 100
-"""Default for the largest number of closer looks: as many as there are passes for."""
+"""Largest number of closer looks in a large picture: as many as there are passes for."""
 
 _SCORE = 0.5
 """Default for the score from which on a detection alone counts as found."""
@@ -134,22 +137,40 @@ class WindowDecisions:
         *,
         confirm: float | None = None,
         give_up: float | None = None,
-        closer: int = CLOSER,
+        closer: int | None = None,
         forgetting: Forgetting | None = None,
     ) -> None:
-        self.thresholds = (evidence.thresholds or _DEFAULTS).changed(give_up=give_up)
+        self.evidence, self.target, self._close_up = evidence, target, close_up
+        self._given, self._most, self._forgetting = (confirm, give_up), closer, forgetting
+        self.thresholds = _DEFAULTS
         self.verifier: Verifier[WindowLook] | None = None
-        model = evidence.verification
-        if closer and model is not None and model.thresholds is not None:
-            places = CandidateBoxes(target, self.thresholds.confirm, forgetting)
-            at = model.thresholds.changed(confirm, self.thresholds.give_up)
-            self.verifier = Verifier(model, places, close_up, at, closer)
-        else:
-            self.thresholds = self.thresholds.changed(confirm)
         self.outcome = 0
         self._facts: SearchFacts | None = None
         self._ahead = 0.0
         self._presence: float | None = None
+
+    def _begin(self, belief: ZoomBelief) -> SearchFacts:
+        """Choose thresholds and closer looks by the kind of picture."""
+        (confirm, give_up), evidence = self._given, self.evidence
+        photograph = belief.photograph
+        at = evidence.thresholds if photograph is None else photograph.verification.thresholds
+        model = evidence.verification if photograph is None else photograph.verification
+        self.thresholds = (at or _DEFAULTS).changed(give_up=give_up)
+        usual = CLOSER if photograph is None else MOST_CLOSER
+        most = usual if self._most is None else self._most
+        if most and model is not None and model.thresholds is not None:
+            worth = self.thresholds.give_up
+            at = model.thresholds.changed(confirm, worth)
+            places: CandidateBoxes
+            if photograph is None:
+                places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting)
+            else:
+                places = PhotographPlaces(self.target, self._forgetting)
+                at = at.changed(place=worth)  # all further looks are closer ones
+            self.verifier = Verifier(model, places, self._close_up, at, most)
+        else:
+            self.thresholds = self.thresholds.changed(confirm)
+        return SearchFacts(belief)
 
     def wait(self) -> None:
         """Let the time of a frame pass. In a stream, call it before every frame."""
@@ -158,18 +179,19 @@ class WindowDecisions:
 
     def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
         """Take in a look, and choose the place that is to be looked at closely."""
-        self._facts = self._facts or SearchFacts(turn.belief)
+        self._facts = self._facts or self._begin(turn.belief)
         self._facts.see(turn.looks)
         self._ahead, self._presence = turn.ahead, None
         facts, self.outcome = self._facts, 0
-        if not facts.detected and self._ahead >= self.thresholds.give_up and not self.looks:
+        unseen = not facts.detected and self._ahead >= self.thresholds.give_up
+        if unseen and turn.belief.photograph is None and not self.looks:
             return  # no probability ends the search
         self._presence = facts.presence(self._ahead)
         if self.verifier is None:
             state = torch.tensor([self._presence]), torch.tensor([facts.detected]), torch.tensor([self._ahead])
             self.outcome = int(settle(*state, self.thresholds))
             return
-        look = WindowLook(turn.glance.detections, number, self._presence, facts.best, self._ahead)
+        look = WindowLook(candidates(turn.glance), number, self._presence, facts.best, self._ahead)
         self.verifier.see(look, last=last)
         self.outcome = self.verifier.outcome()
 

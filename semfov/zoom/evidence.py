@@ -18,6 +18,7 @@ from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, percep
 from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.hints import Gist
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import (
     CROWD,
     STEPS,
@@ -32,6 +33,7 @@ from semfov.zoom.networks import (
     tapered,
     through,
 )
+from semfov.zoom.photograph import PHOTOGRAPH, PhotographEvidence, photograph_fields
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
@@ -75,6 +77,7 @@ class GlimpseEvidence(Pretrained):
         thresholds: thresholds at which searches decide; None where none were chosen.
         verification: probabilities after closer looks; None decides searches without them.
         certainty: probability that an object is there; None where it was not fitted.
+        photograph: evidence for photographs; None where it was not fitted.
         metadata: JSON values kept with the model.
 
     Raises:
@@ -106,6 +109,7 @@ class GlimpseEvidence(Pretrained):
             **survey_fields(),
             "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
             "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
+            **photograph_fields(),
         },
         {
             "classes": Number(size="K"),
@@ -114,9 +118,9 @@ class GlimpseEvidence(Pretrained):
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": SURVEY,
-            # Files of earlier versions have neither of these.
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
+            "photograph": PHOTOGRAPH,
         },
     )
 
@@ -130,6 +134,7 @@ class GlimpseEvidence(Pretrained):
         thresholds: Thresholds | None = None,
         verification: Verification | None = None,
         certainty: Certainty | None = None,
+        photograph: PhotographEvidence | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -157,6 +162,7 @@ class GlimpseEvidence(Pretrained):
         self.survey = Survey(classes, foresight=foresight)
         self.verification = verification
         self.certainty = certainty
+        self.photograph = photograph
 
     def presence(
         self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
@@ -272,6 +278,17 @@ class GlimpseEvidence(Pretrained):
         """
         return tapered(self.border, span)
 
+    def certainty_in(self, lattice: Lattice) -> Certainty | None:
+        """Choose the certainty of a picture.
+
+        Args:
+            lattice: lattice of the picture.
+
+        Returns:
+            The probability that an object is there, in a photograph or in a larger picture; None where none was fitted.
+        """
+        return self.photograph.certainty if self.photograph and lattice.levels == 1 else self.certainty
+
     def check_compatible(self, settings: Mapping[str, Any]) -> None:
         """Raise `InputError` for another detector than the evidence was fitted for.
 
@@ -292,12 +309,13 @@ class GlimpseEvidence(Pretrained):
             "survey": {"foresight": self.survey.foresight},
             "verification": None if verified is None else {"thresholds": _listed(verified.thresholds)},
             "certainty": None if self.certainty is None else self.certainty.numbers,
+            "photograph": None if self.photograph is None else self.photograph.record(),
         }
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model from its file."""
-        verified, certainty = record.get("verification"), record.get("certainty")
+        verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
         model = cls(
             record["classes"],
             record["width"],
@@ -306,6 +324,7 @@ class GlimpseEvidence(Pretrained):
             thresholds=_thresholds(record["thresholds"]),
             verification=None if verified is None else Verification(thresholds=_thresholds(verified["thresholds"])),
             certainty=None if certainty is None else Certainty.of(certainty),
+            photograph=None if photograph is None else PhotographEvidence.of(record["classes"], photograph),
             metadata=record["metadata"],
         )
         model.survey.foresight = record["survey"]["foresight"]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.zoom.eye import WindowEye, WindowLooks, WindowView
-from semfov.zoom.hints import Gist, gist
+from semfov.zoom.hints import Gist, Hints, gist
 from semfov.zoom.lattice import Lattice
 
 
@@ -43,13 +43,14 @@ class Window:
 
 @dataclass(frozen=True)
 class Glance:
-    """The result of a look at a window; cut `(L,)`, show `(K,)`."""
+    """The result of a look at a window; cut `(L,)`, show `(K,)`; all hints, in a photograph alone."""
 
     window: Window
     detections: Detections
     cut: Tensor
     show: Tensor
     gist: Gist | None
+    hints: Hints | None = None
 
 
 @lru_cache(4096)
@@ -118,7 +119,7 @@ class LiveGlances(Glances):
 def glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
     detections = _only(looks.detections, number)
-    look_gist = None
+    look_gist, faint = None, None
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]
     elif _points_closer(window, lattice):
@@ -126,8 +127,9 @@ def glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) ->
         scores = look_gist.scores.flatten(0, 1)
     else:
         scores = looks.hints[number].scores
+        faint = looks.hints[number] if lattice.levels == 1 else None
     show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
-    return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist)
+    return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
 
 
 def _points_closer(window: Window, lattice: Lattice) -> bool:

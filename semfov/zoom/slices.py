@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
+from semfov.zoom.closer import PART
 from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Window, around
 from semfov.zoom.lattice import Lattice
@@ -63,14 +65,14 @@ def _squares(lattice: Lattice, side: int, step: int) -> list[Window]:
 def usual_slices(lattice: Lattice) -> list[Window]:
     """Slices as people cut them: half as long again as the canvas shows at the largest magnification.
 
-    In a picture that is not four times as long as the canvas they have the largest magnification itself. A picture that
-    the overview shows at it has none.
+    In a picture that is not four times as long as the canvas they have the largest magnification itself. A photograph
+    has four, each 0.6 as long as its longer side.
 
     >>> [len(usual_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1200, 900), (640, 480))]
-    [28, 6, 0]
+    [28, 6, 4]
     """
     if lattice.levels == 1:
-        return []
+        return slices(lattice, max(1, round(PART * max(lattice.size))), _OVERLAP)
     wider = 1.5 if lattice.levels > 2 else 1.0
     return slices(lattice, round(wider * min(lattice.canvas) / lattice.magnifications[-1]), _OVERLAP)
 
@@ -94,6 +96,10 @@ def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool
 
 def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
     """Value of a window by the raw scores of a coarser look: their sum, or the highest, over its cells."""
+    if glance.hints is not None:
+        boxes, within = glance.hints.boxes, glance.hints.boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
+        centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+        return _value(glance.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)], targets, most=most)
     look = glance.gist
     assert look is not None
     x1, y1, x2, y2 = window.cells
@@ -101,7 +107,11 @@ def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bo
     box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
     columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
     rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
-    part = look.scores[rows, columns]
+    return _value(look.scores[rows, columns], targets, most=most)
+
+
+def _value(part: Tensor, targets: Sequence[int], *, most: bool) -> float:
+    """The highest of scores `(..., K)` of the classes, or the sum of the highest of each place."""
     scores = (part[..., [target - 1 for target in targets]] if len(targets) else part).amax(-1)
     if not scores.numel():
         return 0.0

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, InputError
-from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
-from semfov.belief.belief import dirichlet_belief, pick
-from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
+from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief.belief import dirichlet_belief
+from semfov.belief.observers import AnyOf, Landing, LearnedMap, Semantic, Target
 from tests import small
 
 GRID = Grid(4, 3, (80, 60))
@@ -58,18 +58,12 @@ def map_observer(**options):
         return LearnedMap(MapEvidence(48, 24, components=4).double().requires_grad_(False), **options)
 
 
-def context_observer():
-    prior = ContextPrior(["cat", "cup", "dog"], rand(4, 3, 3), rand(4, 4, 2), [0.2], weights={"map": (1.0, 0.5)})
-    return Context(Semantic(4), prior)
-
-
 OBSERVERS = {
     "all classes": lambda: Semantic(4),
     "soft": lambda: Semantic(4, footprint="soft"),
     "misses": lambda: Semantic(4, misses=small.model().double().requires_grad_(False), memory="closest"),
     "target": target_observer,
     "map": map_observer,
-    "context": context_observer,
     "landing": lambda: Landing(3),
     "any of targets": lambda: AnyOf(target_observer(), {1: 0.3, 2: 1.0}),
     "any of a map": lambda: AnyOf(map_observer(), {1: 0.3, 2: 1.0}),
@@ -173,7 +167,7 @@ def test_before_the_first_look_all_cells_are_alike_and_infinitely_far(kind):
     present = belief.probability(2)
     assert torch.equal(present, present[:1, :1].expand(2, 12))
     assert torch.equal(belief.chance(2), present)
-    assert present.dtype == torch.float64
+    assert present.dtype == belief.closest.dtype == torch.float64
     assert bool(belief.closest.isposinf().all())
 
 
@@ -187,17 +181,6 @@ def test_probability_of_a_target_equals_a_loop():
             torch.testing.assert_close(belief.probability(target)[batch, cell], expected)
     torch.testing.assert_close(belief.probabilities.sum(-1), torch.ones(3, 12, dtype=torch.float64))
     torch.testing.assert_close(belief.probabilities[..., 2], belief.probability(2))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_before_the_first_look_all_distances_are_infinite(dtype):
-    belief = DirichletBelief(torch.ones(2, 12, 5, dtype=dtype))
-    assert belief.closest.shape == (2, 12)
-    assert belief.closest.dtype == dtype
-    assert torch.isposinf(belief.closest).all()
-    uniform = DirichletBelief.uniform(2, 12, 5, 0.5, torch.empty(0, dtype=dtype))
-    assert torch.equal(uniform.beta, torch.full((2, 12, 5), 0.5, dtype=dtype))
-    assert torch.equal(uniform.closest, belief.closest)
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
@@ -250,7 +233,7 @@ def test_an_observer_refuses_beliefs_and_looks_of_another_kind(kind):
                 observer.update(own, other.weigh(looks(), FIXATIONS, GRID, 2))
 
 
-@pytest.mark.parametrize("kind", ["context", "any of targets"])
+@pytest.mark.parametrize("kind", ["any of targets"])
 def test_beliefs_and_looks_of_another_observer_do_not_fade(kind):
     observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
     own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
@@ -260,14 +243,14 @@ def test_beliefs_and_looks_of_another_observer_do_not_fade(kind):
         observer.fade(own, Landing(3).weigh(looks(), FIXATIONS, GRID), 0.5, visited)
 
 
-@pytest.mark.parametrize("kind", ["target", "context"])
+@pytest.mark.parametrize("kind", ["target"])
 def test_a_belief_about_one_target_gives_its_probability_for_any_class(kind):
     belief = seen(OBSERVERS[kind]())
     assert torch.equal(belief.probability(3), belief.present)
     assert torch.equal(belief.probability(torch.tensor([1, 2])), belief.present)
 
 
-@pytest.mark.parametrize("kind", ["target", "context"])
+@pytest.mark.parametrize("kind", ["target"])
 def test_a_belief_about_one_target_is_refused_where_all_classes_are_needed(kind):
     belief = seen(OBSERVERS[kind]())
     with pytest.raises(InputError, match=rf"all classes \(DirichletBelief\), got {type(belief).__name__}"):
@@ -280,14 +263,6 @@ def test_a_belief_about_one_target_is_refused_where_all_classes_are_needed(kind)
 def test_a_class_index_out_of_range_is_refused(target):
     with pytest.raises(InputError, match="target: expected a class index from 0 to 4"):
         DirichletBelief(rand(2, 12, 5)).probability(torch.tensor(target))
-
-
-def test_pick_selects_one_component_per_row():
-    values, target = rand(2, 3, 4, 5), torch.tensor([4, 0])
-    got = pick(values, target)
-    for row in range(2):
-        assert torch.equal(got[row], values[row, ..., target[row]])
-    assert torch.equal(pick(values, torch.tensor(3)), values[..., 3])
 
 
 def test_put_replaces_the_beliefs_of_the_given_episodes():
@@ -332,15 +307,3 @@ def test_gathered_evidence_fades_towards_that_of_an_empty_look_from_far_away():
         torch.testing.assert_close(getattr(faded, name), getattr(belief, name) / 4)
     torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
     assert torch.equal(faded.visited, visited)
-
-
-def test_context_fades_with_the_inner_belief():
-    inner, visited = target_observer(), torch.arange(24).reshape(2, 12) % 3 == 0
-    prior = ContextPrior(["cat", "cup", "dog"], rand(4, 3, 3), rand(4, 4, 2), [0.2])
-    observer = Context(inner, prior, (1.0, 0.5))
-    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
-    faded = observer.fade(belief, look, 0.25, visited)
-    assert equal(faded.inner, inner.fade(belief.inner, look.inner, 0.25, visited))
-    assert torch.equal(faded.closest, faded.inner.closest)
-    torch.testing.assert_close(faded.scores, belief.scores / 4)
-    assert torch.equal(faded.present, belief.present)

@@ -5,21 +5,9 @@ from functools import partial
 import torch
 
 from semfov.belief import Verification
-from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
+from semfov.belief.observers import AnyOf, Landing, LearnedMap, Semantic, Target
 from tests.base_tester import GraphTester, make_testers
-from tests.small import GRID, context, detections, evidence, look, mapping, model, observing, rand
-
-
-class TestContextPrior(GraphTester):
-    def make(self):
-        return context()
-
-    def inputs(self):
-        return (rand(2, len(GRID), 4),)
-
-    @staticmethod
-    def call(module, presence):
-        return module(presence, GRID, 2)
+from tests.small import GRID, detections, evidence, look, mapping, model, observing, rand
 
 
 class TestVerification(GraphTester):
@@ -82,7 +70,6 @@ globals().update(
             "Semantic": observing,
             "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
             "Target": lambda: Target(evidence()),
-            "Context": lambda: Context(observing(), context()),
             "Landing": lambda: Landing(3),
             "LearnedMap": lambda: LearnedMap(mapping()),
             "AnyOf": lambda: AnyOf(Target(evidence()), {1: 0.3, 2: 1.0}),

@@ -45,7 +45,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     scene = embedded_picture(ActivePerception.recommended().classes[1:], "motorcycle", 0)
     places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
     path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
-    assert main(["live", str(path), "--target", "Motorbikes", "--out", str(tmp_path / "out")]) == 0
+    assert main(["live", str(path), "--target", "Motorbikes", "--how", "fovea", "--out", str(tmp_path / "out")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "most likely at" in line]
     assert len(lines) == len(places)
     assert "motorcycle: found" in lines[7]
@@ -87,7 +87,7 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert lines[0] == "red.avi: searching for “red”"
     assert re.match(r"     0  at \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at", lines[1])
     assert re.search(r"\d frames/s$", lines[4])
-    assert re.match(r"4 frames, [\d.]+ per second", lines[5])
+    assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[5])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
     run("live", path, "--frames", 2, "--out", tmp_path / "seen.avi")
     assert len(read(tmp_path / "seen.avi")) == 2

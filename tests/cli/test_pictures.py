@@ -387,10 +387,12 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     code, printed = run(*search, "--out", tmp_path / "out", "--report", tmp_path / "page.html")
     assert code == 0
     assert re.search(
-        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, probability 0\.50", printed.out
+        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, "
+        r"probability that the picture holds it: 0\.50",
+        printed.out,
     )
     assert "A closer look confirmed the target." in printed.out
-    assert re.search(r"^  look +at \(x, y\) +shows +detections +value$", printed.out, re.M)
+    assert re.search(r"^  look +at \(x, y\) +shows +detections +value +s$", printed.out, re.M)
     assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}
     (episode,) = episodes_of(tmp_path / "page.html")

@@ -9,7 +9,7 @@ import pytest
 
 import semfov
 from semfov.cli import agent, live, search, start
-from semfov.cli.main import _SUBCOMMANDS, main
+from semfov.cli.main import _SUBCOMMANDS, main, options_of
 from semfov.errors import InputError
 from semfov.runs.command import make_parser
 
@@ -121,20 +121,20 @@ def test_help_is_one_screen_with_options_that_exist(name, capsys):
 
 
 def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
-    command = _SUBCOMMANDS["search"]
     for words in (["--give-up", "0.2"], ["--give_up=0.2"], ["--give-up=0.2"]):
         with pytest.raises(SystemExit) as stopped:
             main(["search", *words, "--print-config"])
         assert stopped.value.code == 0
         assert "give_up: 0.2" in capsys.readouterr().out
-    parser = make_parser(command.options(), "", command.positional)
+    parser = make_parser(options_of("search"), "", _SUBCOMMANDS["search"])
     assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
 
 
 def test_detectors_are_listed_with_licence_and_models(capsys):
     assert main(["detectors"]) == 0
     printed = capsys.readouterr().out
-    assert re.search(r"^yolov3-tiny +35 MB .*search, closer looks, explore, large pictures +public", printed, re.M)
+    models = "search, closer looks, explore, large pictures, gaze"
+    assert re.search(rf"^yolov3-tiny +35 MB .*{models} +public", printed, re.M)
     assert re.search(r"^yolox-tiny +20 MB .* none +Apache", printed, re.M)
     assert main(["detectors", "yolox-nano"]) == 0
     printed = capsys.readouterr().out

@@ -345,7 +345,7 @@ def test_thresholds_are_those_of_the_verification_unless_given():
     """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
 
     def thresholds(**options):
-        return agent(Counted(3)).live("red", **options)._fovea.thresholds
+        return agent(Counted(3)).live("red", **options)._episodes["fovea"].thresholds
 
     assert thresholds(rate=0) == AT
     assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Grid
-from semfov.belief import Belief, ContextPrior
-from semfov.belief.observers import Context, Look, Observer, Semantic
+from semfov.belief import Belief
+from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import (
-    OUTCOMES,
     Decision,
     conclude,
     decide,
@@ -54,10 +53,6 @@ class Guided(Known):
 
     def chance(self, target):
         return self.present / 10
-
-
-def test_names_of_outcomes():
-    assert OUTCOMES == ("undecided", "found", "absent", "undecided")
 
 
 def test_thresholds_change_one_at_a_time():
@@ -371,19 +366,6 @@ def test_without_thresholds_a_detection_confirms_the_target(image):
         assert len(never) == 12
         assert (never.found, never.decision.outcome) == (False, "undecided")
     assert searcher.search(image, "green", start=0, shifts=3).decision.outcome == "undecided"
-
-
-def test_context_uses_the_thresholds_of_the_observer_that_it_wraps(image):
-    nothing = ContextPrior(
-        ["red", "green"], torch.zeros(3, 3, 3), torch.zeros(3, 3, 2), [0.2], weights={"evidence": (1.0, 1.0)}
-    )
-    script = [(cells(c5=0.4), 0.3), (cells(c5=0.9), 0.85)]
-    observer = Context(Scripted(*script), nothing)
-    assert observer.thresholds == AT
-    assert Semantic(3).thresholds is Context(Semantic(3), nothing, (1.0, 1.0)).thresholds is None
-    scanpath = agent(observer).search(image, "red", start=0)
-    assert (scanpath.decision.outcome, scanpath.cells.tolist()) == ("found", [0, 5])
-    assert scanpath.decision.probability == pytest.approx(0.85)
 
 
 @pytest.mark.parametrize("observer", [Scripted((cells(), 0.5)), Semantic(3)], ids=["thresholds", "none"])

@@ -187,14 +187,14 @@ def test_another_number_of_threads_or_process_opens_a_new_session(make_small, th
     detector, canvas = make_small("auto"), canvases(1, 3, 32, 64)
     for number in threads():
         detector.propose(canvas)
-        session = detector._twin._opened[1]
+        session = detector._twin._opened[()][1]
         assert session.threads == number
         detector.propose(canvas)
-        assert detector._twin._opened[1] is session
+        assert detector._twin._opened[()][1] is session
     pid = os.getpid()
     monkeypatch.setattr(os, "getpid", lambda: pid + 1)
     detector.propose(canvas)
-    assert detector._twin._opened[1] is not session
+    assert detector._twin._opened[()][1] is not session
 
 
 @pytest.mark.parametrize("damage", [b"", b"half", None])
@@ -215,7 +215,7 @@ def test_every_network_and_version_has_its_own_export(make_small, folder, monkey
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
     assert exported(network, folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.darknet_onnx.VERSION", _VERSION + 1)
+    monkeypatch.setattr("semfov.detection.darknet_onnx._VERSION", _VERSION + 1)
     assert exported(network, folder) != path
     assert network_digest(copy.deepcopy(network).double()) == network_digest(network)
     with torch.no_grad():

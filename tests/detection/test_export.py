@@ -69,7 +69,7 @@ def test_other_detectors_and_unwritable_files_are_refused(make_small, tmp_path, 
     assert not (tmp_path / "out.onnx").exists()
 
 
-@pytest.mark.parametrize("command", ["semfov.detection.export", "semfov.zoom.export"])
+@pytest.mark.parametrize("command", ["semfov.detection.export", "examples.export_look"])
 def test_command_lines_refuse_a_missing_file_in_one_line(command, tmp_path, monkeypatch, capsys):
     words = ["export", "yolov3-tiny", str(tmp_path / "tiny.onnx"), "--weights", str(tmp_path / "no.weights")]
     monkeypatch.setattr(sys, "argv", words)

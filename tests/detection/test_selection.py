@@ -1,7 +1,11 @@
+import subprocess
+import sys
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torchvision.ops import batched_nms, nms
 
 from semfov.detection import Candidates, Selection, letterbox
 from semfov.detection.selection import select, suppress
@@ -132,3 +136,28 @@ def test_invalid_scores_and_boxes_are_refused_and_are_no_image_without_detection
     assert Fixed(candidates=made_of())(image).count.tolist() == [2]
     with pytest.raises(InputError, match=message):
         Fixed(candidates=made_of(**changes))(image)
+
+
+@given(st.integers(0, 2**32), st.integers(100, 500), st.booleans(), st.integers(1, 400))
+def test_suppression_of_many_boxes_equals_torchvision(seed, count, per_class, limit):
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(count, 2, generator=generator) * 60
+    boxes = torch.cat([corner, corner + 1 + torch.rand(count, 2, generator=generator) * 20], -1)
+    confidence = torch.randperm(count, generator=generator) / count  # without ties
+    labels = torch.randint(3, (count,), generator=generator)
+    expected = batched_nms(boxes, confidence, labels, 0.5) if per_class else nms(boxes, confidence, 0.5)
+    selection = Selection(limit=limit, per_class=per_class)
+    assert torch.equal(suppress(boxes, confidence, labels, selection), expected[:limit])
+
+
+@pytest.mark.slow
+def test_a_look_imports_no_compiler():
+    """With torchvision's operators comes a compiler, which takes longer to import than torch itself."""
+    code = """
+import sys, torch
+from semfov.detection.selection import Selection, suppress
+suppress(torch.tensor([[0.0, 0, 9, 9]]), torch.ones(1), torch.zeros(1), Selection())
+print([name for name in ("torch._dynamo", "torch._inductor", "sympy", "torchvision") if name in sys.modules])
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"

@@ -13,18 +13,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from semfov import DataError, EmbeddedScenes, Grid, InputError
 from semfov.envs import (
-    BeliefObservation,
     GazeExplore,
     GazeSearch,
     GazeVectorEnv,
-    GlimpseObservation,
-    MaskedRandom,
-    VectorBeliefObservation,
     open_scenery,
-    run_agent,
 )
 from semfov.envs.registration import IDS
 from semfov.metrics.search import random_search
+from tests.envs.agents import MaskedRandom, run_agent
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
@@ -108,7 +104,7 @@ def test_a_seed_repeats_an_episode_and_other_seeds_give_others(sceneries, task):
         observation, info = env.reset(seed=seed)
         record = [observation]
         for _ in range(4):
-            observation, reward, terminated, _, info = env.step(random(observation, info))
+            observation, reward, terminated, _, info = env.step(random(info))
             record.append({**observation, "reward": reward})
             if terminated:
                 break
@@ -162,11 +158,11 @@ def test_random_gaze_finds_targets_as_often_as_in_closed_form(world):
 
 def test_rewards_of_an_exploration_add_up_to_its_success(sceneries):
     env, random = GazeExplore(sceneries["exploration"], price=0.02, find=2.0), MaskedRandom(3)
-    observation, info = env.reset(seed=1)
+    _, info = env.reset(seed=1)
     before, total, steps = info["result"], 0.0, 0
     truncated = False
     while not truncated:
-        observation, reward, _, truncated, info = env.step(random(observation, info))
+        _, reward, _, truncated, info = env.step(random(info))
         total, steps = total + reward, steps + 1
     assert steps == 6
     assert total == pytest.approx(2.0 * (info["result"] - before) - 0.02 * steps, abs=1e-6)
@@ -198,34 +194,28 @@ def test_infos_have_the_detections_of_the_look(sceneries):
     assert seen["scores"][seen["mask"]] == pytest.approx(live.scores[0].numpy(), abs=1e-4)
 
 
-def test_wrappers_return_only_the_belief_or_only_the_glimpse(sceneries):
+def test_observations_have_the_belief_and_the_glimpse_of_the_eye(sceneries):
     scenery = sceneries["search"]
-    env = BeliefObservation(gymnasium.make(IDS["search"], scenery=scenery))
+    env = GazeSearch(scenery, belief=True, glimpse=48)
     observation, info = env.reset(seed=0)
     assert observation in env.observation_space
-    chance, visited, here = observation.reshape(3, -1)
+    chance, visited, here = observation["belief"].reshape(3, -1)
     assert np.array_equal(visited, 1 - info["action_mask"])
     assert np.array_equal(visited, here)
     assert chance[visited == 1] == 0
-    env.step(0 if here[0] == 0 else 1)
-    target = env.unwrapped.gazes.targets
-    believed = env.unwrapped.gazes.belief.chance(target)[0].clone()
-    moved = env.observation({}).reshape(3, -1)
-    assert moved[0][moved[1] == 0] == pytest.approx(believed.numpy()[moved[1] == 0])
+    picture = scenery.image(info["scene"]).permute(1, 2, 0).mul(255).numpy()
+    assert abs(observation["glimpse"].mean() - picture.mean()) < 6
+    assert observation["glimpse"].std() > 10
+    moved = env.step(0 if here[0] == 0 else 1)[0]["belief"].reshape(3, -1)
+    believed = env.gazes.belief.chance(env.gazes.targets)[0].numpy()
+    assert moved[0][moved[1] == 0] == pytest.approx(believed[moved[1] == 0])
     assert (moved[1].sum(), moved[2].sum()) == (2, 1)
 
-    glimpse = GlimpseObservation(GazeSearch(scenery), side=48)
-    observation, info = glimpse.reset(seed=0)
-    assert observation in glimpse.observation_space
-    picture = scenery.image(info["scene"]).permute(1, 2, 0).mul(255).numpy()
-    assert abs(observation.mean() - picture.mean()) < 6
-    assert observation.std() > 10
 
-    envs = VectorBeliefObservation(GazeVectorEnv("search", 2, scenery, together=False))
-    observations, _ = envs.reset(seed=0)
-    assert np.array_equal(observations[0], env.reset(seed=0)[0])
-    with pytest.raises(InputError, match=r"env: expected a GazeEnv or a ZoomEnv, got CartPoleEnv"):
-        BeliefObservation(gymnasium.make("CartPole-v1"))
+def test_stable_baselines_accepts_the_environments(sceneries):
+    """Its checker has no complaints; the belief is left out, since it would object that it is not an image."""
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(GazeSearch(sceneries["search"], glimpse=64))
 
 
 def test_the_rendered_picture_changes_as_the_episode_goes_on(sceneries):
@@ -274,8 +264,6 @@ def test_invalid_calls_are_refused(sceneries):
     envs.reset()
     with pytest.raises(InputError, match="actions: expected 2 cells from 0 to 19"):
         envs.step(np.array([0, 20]))
-    with pytest.raises(InputError, match="autoreset_mode='Disabled'"):
-        run_agent(envs, MaskedRandom(), scenery.episodes(0))
     with pytest.raises(InputError, match="unknown action 'pixel'"):
         gymnasium.make(IDS["search"], action="pixel")
 

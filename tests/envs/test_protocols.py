@@ -5,8 +5,9 @@ import pytest
 
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.run import SearchConfig, SearchRun
-from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
+from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
+from tests.envs.agents import PolicyAgent, run_agent
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow, pytest.mark.lab]
 
@@ -46,11 +47,11 @@ def run_one_at_a_time(env, episodes):
     """Fixated cells, the shift that found the target, and the results of every look."""
     agent, ran = PolicyAgent(env), []
     for episode in episodes:
-        observation, info = env.reset(options={"episode": episode})
+        _, info = env.reset(options={"episode": episode})
         cells, results, found, over = [episode.start], [info["result"]], -1, False
         while not over:
-            action = agent(observation, info)
-            observation, _, terminated, truncated, info = env.step(action)
+            action = agent(info)
+            _, _, terminated, truncated, info = env.step(action)
             cells.append(int(action))
             results.append(info["result"])
             over = terminated or truncated
@@ -104,8 +105,8 @@ def test_beliefs_computed_together_agree_up_to_rounding(sceneries):
 
 def test_the_policy_agent_accepts_wrapped_environments(sceneries):
     env = gymnasium.wrappers.TimeLimit(GazeSearch(sceneries["search"]), 3)
-    observation, info = env.reset(seed=0)
-    assert info["action_mask"][PolicyAgent(env)(observation, info)] == 1
+    _, info = env.reset(seed=0)
+    assert info["action_mask"][PolicyAgent(env)(info)] == 1
 
 
 def test_an_environment_can_be_made_from_the_settings_of_an_evaluation(world):

@@ -11,19 +11,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from semfov import InputError
-from semfov.envs import (
-    BeliefObservation,
-    GlimpseObservation,
-    ZoomExplore,
-    ZoomPolicyAgent,
-    ZoomSearch,
-    open_zoom_scenery,
-)
+from semfov.envs import ZoomExplore, ZoomSearch, open_zoom_scenery
 from semfov.envs.registration import IDS
 from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
+from tests.envs.agents import WindowAgent
 
 KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
@@ -68,7 +62,7 @@ def test_environments_pass_the_checker_of_gymnasium(cache, task):
 def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
     """Window by window, until an object is found by its box."""
     env = ZoomSearch(zoom_scenery)
-    agent, lengths = ZoomPolicyAgent(env), set()
+    agent, lengths = WindowAgent(env), set()
     targets = zoom_scenery.episodes(0)
     assert targets
     for target in targets:
@@ -92,7 +86,7 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
     env = ZoomExplore(zoom_scenery, price=0.5, find=10.0)
-    agent = ZoomPolicyAgent(env)
+    agent = WindowAgent(env)
     _, info = env.reset(seed=0)
     before, total, truncated = info["result"], 0.0, False
     while not truncated:
@@ -123,9 +117,6 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     assert near.max() == near[0, 0] == 1
     assert near.min() == pytest.approx(1 / lattice.levels)
     assert 0 < expected.max() <= 1
-    for wrapper, key in ((BeliefObservation(env), "belief"), (GlimpseObservation(env, 32), "glimpse")):
-        assert wrapper.observation_space == env.observation_space[key]
-        assert np.array_equal(wrapper.observation(observation), observation[key])
     same, reward, _, _, later_info = env.step(closest)
     assert reward == -0.01
     assert np.array_equal(same["belief"], observation["belief"])

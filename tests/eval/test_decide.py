@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from eval.decide.plain import PLAIN, plain_rules
 from eval.decide.report import decision_summary
 from semfov.decision import OUTCOMES
 from semfov.metrics.presence import area_under_roc, hits_at
@@ -17,7 +18,8 @@ POLICIES = [
     "published belief",
     "published belief, a detection at the gaze",
 ]
-REFERENCES = ["one sharp look, highest score", "sharp look and its quarters, highest score", "class frequency"]
+SCORES = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
+REFERENCES = [*SCORES, *PLAIN, "class frequency"]
 
 
 def rows_of(text):
@@ -51,7 +53,7 @@ def test_run_writes_table_and_records(finished):
     assert sorted(there.values()) == [False] * 2 + [True] * 4
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
-    places, lands = [*POLICIES, "one sharp look"], POLICIES
+    places, lands = [*POLICIES, "one sharp look", *PLAIN], POLICIES
     compared = ["difference to target-evidence", *POLICIES[1:], *REFERENCES]
     assert [row[0] for row in rows] == [*POLICIES, *REFERENCES, *places, *compared, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
@@ -69,14 +71,52 @@ def test_without_references_the_agent_searches_as_with_them(finished, tmp_path):
     model = ("--belief.model", "HERE/observation.safetensors")
     out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--store", "false")
     agent = [record for record in records_in(finished) if record["policy"] == "target-evidence"]
-    assert records_in(out) == [{**record, "tiled": None} for record in agent]
+    assert records_in(out) == agent
     rows = rows_of((out / "decisions.md").read_text())
-    assert [row[0] for row in rows[:3]] == ["target-evidence", REFERENCES[0], REFERENCES[2]]
+    assert [row[0] for row in rows[:3]] == ["target-evidence", *SCORES]
+
+
+def test_without_plain_rules_the_quarters_are_not_looked_at(tmp_path):
+    model = ("--belief.model", "HERE/observation.safetensors")
+    out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--rules", "false", "--store", "false")
+    assert {(record["tiled"], record["plain"]) for record in records_in(out)} == {(None, None)}
+    rows = rows_of((out / "decisions.md").read_text())
+    assert [row[0] for row in rows[:3]] == ["target-evidence", SCORES[0], "class frequency"]
+
+
+def test_plain_rules_are_regressions_in_folds_of_scenes():
+    """Present targets have higher scores; places are right where the closer look is sure."""
+    torch.manual_seed(0)
+    records = []
+    for scene in range(60):
+        for present in (True, False):
+            sharp = float(torch.rand(()) * 0.5 + 0.4 * present)
+            looks = [
+                {"facts": [float(torch.randn(())), 2.0 * right - 1, 0.0, 0.0, 0.0], "right": right}
+                for right in (present, False)
+            ]
+            records.append(record("a", present, "found", 0.5, 1, sharp=sharp, tiled=sharp, plain=looks, scene=scene))
+    rules = plain_rules(records)
+    there = torch.tensor([each["present"] for each in records])
+    sharp = torch.tensor([each["sharp"] for each in records])
+    presence, _, _, passes = rules["one unfoveated pass"]
+    # In each fold the probability rises with the score, and it is the mean share of present targets.
+    for fold in range(5):
+        mine = torch.tensor([each["scene"] % 5 == fold for each in records])
+        order = sharp[mine].argsort()
+        assert bool((presence[mine][order].diff() >= 0).all())
+    assert float(presence.mean()) == pytest.approx(0.5, abs=0.05)
+    assert passes.tolist() == [1.0] * 120
+    presence, place, right, passes = rules["one unfoveated pass, two closer looks"]
+    assert passes.tolist() == [3.0] * 120
+    assert right.tolist() == there.tolist()
+    assert float(place[there].min()) > float(place[~there].max())
+    assert rules["one unfoveated pass, four quarters"][3].tolist() == [5.0] * 120
 
 
 def record(policy, present, outcome, probability, looks, **more):
     base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
-    base |= {"place": None, "closer": 0, "scene": 1, "frequency": 1 - probability}
+    base |= {"plain": None, "place": None, "closer": 0, "scene": 1, "frequency": 1 - probability}
     base |= {"sharp": probability / 2, "tiled": probability / 4}
     return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
         base | more
@@ -133,14 +173,14 @@ def test_table_matches_hand_calculations():
     mean, limit = other[-1].split(", to ")
     assert float(mean) == pytest.approx((2 * 3 + 12 * 2 + 30 * 1) / 64 / 6, abs=0.01)
     assert limit == f"{2 / 6:.3f}"
-    assert sharp == [REFERENCES[0], "0.625 ± 0.000", *hits, "-", "-"]
-    assert tiled == [REFERENCES[1], "0.625 ± 0.000", *hits, "-", "-"]
-    assert frequency[:2] == [REFERENCES[2], "0.375 ± 0.000"]
+    assert sharp == [SCORES[0], "0.625 ± 0.000", *hits, "-", "-"]
+    assert tiled == [SCORES[1], "0.625 ± 0.000", *hits, "-", "-"]
+    assert frequency[:2] == ["class frequency", "0.375 ± 0.000"]
     place = "33.3 (33.3 to 33.3)"
     assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", place, "80.0", "0.50"]
     assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
     assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", place, "-", "0.30"]
-    assert [row[0] for row in differences] == ["difference to a", "b", *REFERENCES]
+    assert [row[0] for row in differences] == ["difference to a", "b", *SCORES, "class frequency"]
     assert differences[1][1:] == ["-0.125 ± 0.000", *["-25 (-25 to -25)"] * 3, "-"]
     assert differences[2][1:] == ["+0.000 ± 0.000", *["+0 (+0 to +0)"] * 3, "+0.0 (+0.0 to +0.0)"]
     assert landed == ["a", "3", "0.300 → 0.600", "2", "0.300 → 0.850", "1", "0.300 → 0.100"]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from eval.figures import FIGURES, SAME_OBJECT, FiguresConfig, ambiguous, figures
+from eval.figures import _FIGURES, _SAME_OBJECT, _FiguresConfig, ambiguous, figures
 from semfov import Detections, FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DetectorConfig, SensorConfig
@@ -25,7 +25,7 @@ def config(tmp_path_factory):
     settings = make_eye(detector, SensorConfig(name="published")).settings()
     alpha = 0.5 + torch.rand(4, 3, 4, generator=torch.Generator().manual_seed(0))
     FovealObservationModel(alpha, [0.2, 0.5], CLASSES, metadata=settings).save(folder / "observation.safetensors")
-    return FiguresConfig(
+    return _FiguresConfig(
         picture=folder / "0.png",
         target="red",
         start=(0, 1),
@@ -42,7 +42,7 @@ def test_every_figure_is_drawn_or_said_to_be_missing(config, capsys, monkeypatch
     monkeypatch.setattr("eval.figures.save_figure", partial(save_figure, dpi=50))
     figures(config)
     told = dict(line.split(": ") for line in capsys.readouterr().out.splitlines())
-    assert list(told) == list(FIGURES)
+    assert list(told) == list(_FIGURES)
     for name, answer in told.items():
         if name == "ambiguities" and answer == "no object here changes its class":
             continue
@@ -65,7 +65,7 @@ def test_an_ambiguous_pair_is_the_surest_of_one_object_and_of_two_classes(seed):
     for number, look in enumerate(looks):
         for i in range(int(sharp.count)):
             for j in range(int(look.count)):
-                same = float(box_iou(sharp.boxes[0, i : i + 1], look.boxes[0, j : j + 1])) >= SAME_OBJECT
+                same = float(box_iou(sharp.boxes[0, i : i + 1], look.boxes[0, j : j + 1])) >= _SAME_OBJECT
                 if same and sharp.labels[0, i] != look.labels[0, j]:
                     pairs[number, i, j] = min(float(sharp.confidence[0, i]), float(look.confidence[0, j]))
     best = max(pairs, key=pairs.get)

@@ -15,14 +15,13 @@ from eval.page import paper
 from eval.page.curves import behind, corrected_signs
 from eval.page.experiments import AT_THRESHOLDS, SCORE_THRESHOLDS, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
-from eval.page.findings import BASELINES, COUNTED, FINDINGS, TESTED, VERDICTS, Advantage, Finding, Overtaken
+from eval.page.findings import _BASELINES, _FINDINGS, COUNTED, TESTED, VERDICTS, Finding, _Advantage, _Overtaken
 from eval.page.origin import missing, origin
 from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
-from eval.results import PLACE, WHOLE, fill_page, page_table, results
+from eval.results import _PLACE, _WHOLE, _fill_page, _page_table, results
 from eval.search.run import SearchConfig
 from semfov.errors import DataError, InputError
-from semfov.runs.config import SensorConfig
 from semfov.runs.presets import label
 
 ROOT = Path(__file__).parents[2]
@@ -61,7 +60,7 @@ def searches(policies, found_at):
 
 
 def lines_of(name, runs):
-    return page_table(name, runs).make(runs)
+    return _page_table(name, runs).make(runs)
 
 
 def cells_of(row):
@@ -115,16 +114,6 @@ def test_a_trial_limits_every_experiment_on_the_listed_photographs(tmp_path):
     assert {run.data.limit for run in experiments(config).values()} == {None, 100}
 
 
-def test_published_experiments_have_the_published_sensor_and_model(runs):
-    for kind in ("search", "explore"):
-        for fovea in ("published", "published-narrow"):
-            for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
-                run = runs[f"{kind}-{fovea}-{name}"]
-                assert run.sensor.name == fovea
-                assert run.belief.model == f"{detector}-{fovea}"
-                assert run.saliency.view == "foveated"
-
-
 def place(name, content="anything"):
     return f"<!-- table {name} -->\n\n{content}\n\n<!-- end -->"
 
@@ -134,19 +123,19 @@ def test_tables_of_runs_are_renewed_and_the_rest_of_the_page_stays(searched):
     page = "before\n{}\nbetween\n{}\nafter\n"
     others = [place("explore-published-nano explore -- 7654321, 2026-11-01, 300 photographs"), place("sensitivity")]
     other = "\n".join([*others, place("findings")])
-    text, kept = fill_page(page.format(place("beyond-search-tiny search"), other), runs)
+    text, kept = _fill_page(page.format(place("beyond-search-tiny search"), other), runs)
     shown = ["| policy | CP@1 | CP@5 | CP@15 | CP@30 |", "|--------|------|------|-------|-------|"]
     table = "\n".join([*shown, "| random | 1    | 2    | 4     | 5     |"])
     renewed = place("beyond-search-tiny search -- 1a2b3c4, 2026-11-23, 6 photographs", table)
     assert text == page.format(renewed, other)
     assert kept == ["explore-published-nano explore", "sensitivity", "findings"]
-    assert fill_page(text, runs) == (text, kept)
+    assert _fill_page(text, runs) == (text, kept)
 
 
 def test_a_table_of_several_experiments_waits_for_all_of_them(runs):
-    for made in WHOLE.values():
+    for made in _WHOLE.values():
         assert missing(made.made_of, runs) == list(made.made_of) != []
-    study = page_table("sensitivity", runs).made_of
+    study = _page_table("sensitivity", runs).made_of
     for name in study[1:]:
         write_manifest(runs[name].out)
     assert missing(study, runs) == ["sensitivity as published"]
@@ -165,9 +154,9 @@ def test_the_origin_of_a_table_names_every_commit_day_and_number_of_photographs(
 
 def test_unknown_tables_are_refused(runs):
     with pytest.raises(InputError, match="did you mean 'beyond-search-tiny'"):
-        fill_page(place("beyond-search-tin search"), runs)
+        _fill_page(place("beyond-search-tin search"), runs)
     with pytest.raises(InputError, match="table"):
-        fill_page(place("beyond-search-tiny third"), runs)
+        _fill_page(place("beyond-search-tiny third"), runs)
 
 
 def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
@@ -185,20 +174,12 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
         assert rows[2] == [str(number), *"xxxxx"]
 
 
-def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
-    for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
-        decide, beliefs = runs[f"decide-{name}"], runs[f"beliefs-{name}"]
-        assert decide.detector.name == beliefs.detector.name == detector
-        assert decide.sensor == beliefs.sensor == SensorConfig("gradual")
-        assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
-
-
 @pytest.mark.parametrize("page", ["results", "tables"])
 def test_every_table_of_the_pages_can_be_filled(page, runs):
     text = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
-    assert text.count("<!--") == 2 * len(PLACE.findall(text))
-    for found in PLACE.finditer(text):
-        assert set(page_table(found["name"], runs).made_of) <= runs.keys()
+    assert text.count("<!--") == 2 * len(_PLACE.findall(text))
+    for found in _PLACE.finditer(text):
+        assert set(_page_table(found["name"], runs).made_of) <= runs.keys()
         assert re.fullmatch(r"[0-9a-f]{7}.*, 2\d{3}-\d\d-\d\d.*, \d+ photographs( and \d+.*)?", found["origin"]), found[
             "name"
         ]
@@ -210,7 +191,7 @@ def test_every_table_of_the_pages_can_be_filled(page, runs):
 
 def test_no_table_is_on_both_pages():
     names = [
-        name for page in ("results", "tables") for name, _ in PLACE.findall((ROOT / f"docs/{page}.md").read_text())
+        name for page in ("results", "tables") for name, _ in _PLACE.findall((ROOT / f"docs/{page}.md").read_text())
     ]
     assert len(set(names)) == len(names) > 30
 
@@ -295,7 +276,7 @@ def test_samples_are_compared_with_the_same_policy_without(runs):
 def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
     records = searches(tuple(paper.TABLE_II | paper.TABLE_I), lambda policy, scene, _: found.get((policy, scene), 1))
-    for name in page_table("paper", runs).made_of:
+    for name in _page_table("paper", runs).made_of:
         write_records(runs[name].out, records)
     rows = [cells_of(row) for row in lines_of("paper", runs)]
     assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
@@ -310,18 +291,18 @@ def test_findings_have_sizes_and_verdicts(tmp_path):
     found = {"random": 9, "vocus2": 10}
     write_records(tmp_path, searches(found, lambda policy, scene, _: found[policy] + 5 * (scene % 2)))
     every, few = COUNTED["search"][1], COUNTED["search"][0]
-    finding = Finding("", "search", "", Advantage("random", "vocus2", (5, 9, 15)))
+    finding = Finding("", "search", "", _Advantage("random", "vocus2", (5, 9, 15)))
     assert str(finding.answer(tmp_path, few)) == "+0.0 ± 0.0 / +100.0 ± 0.0 / +0.0 ± 0.0: holds in part"
     assert str(finding.answer(tmp_path, every)) == "+0.0 ± 0.0 / +50.0 ± 22.4 / +0.0 ± 0.0: open"
     assert (
-        Finding("", "search", "", Advantage("random", "vocus2", (5, 30), 0)).answer(tmp_path, every).verdict == "holds"
+        Finding("", "search", "", _Advantage("random", "vocus2", (5, 30), 0)).answer(tmp_path, every).verdict == "holds"
     )
-    first = Finding("", "search", "", Overtaken("random", "vocus2", "")).answer(tmp_path, few)
+    first = Finding("", "search", "", _Overtaken("random", "vocus2", "")).answer(tmp_path, few)
     assert str(first) == "ahead at 9, behind at no shift: not overtaken"
     assert not finding.detects
     assert finding.test.published() == "-"
-    assert Advantage("random", "vocus2", (5, 15, 30)).published() == "+29.7 / +43.0 / +28.0"
-    assert len({finding.text for finding in FINDINGS}) == len(FINDINGS) == len(TESTED) + len(BASELINES)
+    assert _Advantage("random", "vocus2", (5, 15, 30)).published() == "+29.7 / +43.0 / +28.0"
+    assert len({finding.text for finding in _FINDINGS}) == len(_FINDINGS) == len(TESTED) + len(_BASELINES)
 
 
 def explorations(policies, right):
@@ -367,16 +348,16 @@ def test_every_threshold_has_a_model_of_its_own_and_the_same_sensor(runs):
 
 
 def test_verdicts_name_the_thresholds_at_which_they_hold(at_thresholds):
-    rows = [cells_of(row) for row in page_table("verdicts", at_thresholds).make(at_thresholds)]
+    rows = [cells_of(row) for row in _page_table("verdicts", at_thresholds).make(at_thresholds)]
     assert rows[0] == ["the paper finds", "in the paper", "counted", "YOLOX-nano", "YOLOv3-tiny"]
     assert rows[2][1:4] == ["+11.2 / +10.4 / +5.8", "one target", "holds at 0.02; reversed at 0.1, 0.25, 0.5"]
     told = {cell for row in rows[2:] for cell in row[3:]}
-    words = [row[0] for row in map(cells_of, page_table("verdicts-words", at_thresholds).make(at_thresholds)[2:])]
+    words = [row[0] for row in map(cells_of, _page_table("verdicts-words", at_thresholds).make(at_thresholds)[2:])]
     assert words == [word for word in VERDICTS if any(f"{word} at" in cell for cell in told)]
 
 
 def test_differences_are_shown_at_every_threshold(at_thresholds, tmp_path):
-    rows = [cells_of(row) for row in page_table("thresholds", at_thresholds).make(at_thresholds)]
+    rows = [cells_of(row) for row in _page_table("thresholds", at_thresholds).make(at_thresholds)]
     assert rows[0] == ["detector", "difference", "shifts", "0.02", "0.1", "0.25", "0.5"]
     assert rows[2][:5] == ["YOLOX-nano", CONTRASTS[0].text, "5", "+100.0 ± 0.0", "-100.0 ± 0.0"]
     kl = next(row for row in rows if row[1] == "exploration, with background: KL less random, calibrated")
@@ -404,7 +385,7 @@ def test_agreement_compares_policies_episode_by_episode(tmp_path):
 
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     right = {"random-raw": (1, 2), "closer-look-learned": (3, 4)}
-    for name in page_table("explore-sensor", runs).made_of:
+    for name in _page_table("explore-sensor", runs).made_of:
         more = int("200" in name)
         records = [
             {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval import semba, sensors
-from eval.semba import SembaConfig, search_scene
+from eval.semba import _search_scene, _SembaConfig
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
 from tests.colours import write_home
@@ -30,8 +30,8 @@ def given(home, out, *more):
 
 def test_sensors_are_compared_with_models_of_their_own(home, monkeypatch, capsys):
     chosen = {
-        "crops": sensors.SensorChoice("multi-scale", 64, CROPS),
-        "log-polar": sensors.SensorChoice("log-polar", 64),
+        "crops": sensors._SensorChoice("multi-scale", 64, CROPS),
+        "log-polar": sensors._SensorChoice("log-polar", 64),
     }
     monkeypatch.setattr(sensors, "CANDIDATES", chosen)
     fit = ["--fit.root", str(home / "photographs"), "--fit.annotations", str(home / "photographs/instances.json")]
@@ -84,7 +84,7 @@ def search_by_loop(run, index, target, rule, stop, shifts):
 
 def test_the_searcher_of_semba_equals_a_loop(home):
     photographs = home / "photographs"
-    config = SembaConfig(
+    config = _SembaConfig(
         data=DataConfig(photographs, photographs / "instances.json", min_instances=0),
         detector=DetectorConfig(str(home / "colours.onnx"), background="none"),
         sensor=SensorConfig("multi-scale", **CROPS),
@@ -96,7 +96,7 @@ def test_the_searcher_of_semba_equals_a_loop(home):
     )
     run, stopped = Looking(config), 0
     for index in range(2):
-        results = search_scene(config, run, index)
+        results = _search_scene(config, run, index)
         grid, annotation = run.grid(index), run.scenes.annotation(index)
         middle = grid.footprint(annotation.boxes)[:, int(grid.cell_of(grid.extent / 2))]
         targets = [t for t in run.scenes.targets(index) if not bool(middle[annotation.labels == t].any())]

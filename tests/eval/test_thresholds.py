@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval.comparison.thresholds import ThresholdEyes, ThresholdLooksConfig, look_at_thresholds
+from eval.comparison.thresholds import ThresholdLooksConfig, _ThresholdEyes, look_at_thresholds
 from semfov import Eye, Foveation
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.selection import select
@@ -40,7 +40,7 @@ def assert_same(one, other):
 
 def test_one_pass_gives_the_looks_of_every_threshold():
     sensor, image, points = Foveation(20.0), torch.rand(1, 3, 48, 64), torch.tensor([[5.0, 9.0], [40.0, 30.0]])
-    eyes = ThresholdEyes(Eye(sensor, crowd(0.9)), THRESHOLDS)
+    eyes = _ThresholdEyes(Eye(sensor, crowd(0.9)), THRESHOLDS)
     view = eyes.open(image)
     for point in points:
         looks = eyes.look(view, point[None])

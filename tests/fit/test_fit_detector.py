@@ -30,9 +30,9 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
 from semfov.fit.detector import _seconds_of_looks
 from semfov.fit.detector_report import _thin_classes
-from semfov.fit.detector_settings import FitDetectorConfig
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
+from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import VerificationFit, _VerifiedSearch, scores
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
@@ -40,7 +40,7 @@ from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
-from semfov.runs.looking import looking_of
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network
@@ -116,11 +116,8 @@ def test_the_agent_of_the_folder_finds_the_target(home):
     assert not any(parameter.requires_grad for parameter in agent.parameters())
     assert isinstance(agent.searching.observer, Target if folder.used("evidence") else Semantic)
     assert isinstance(agent.exploring.observer, LearnedMap if folder.used("map") else Semantic)
-    pixels = np.full((SIDE, SIDE, 3), 125, dtype=np.uint8)
-    pixels[56:64, 0:8] = COLOURS[2]
-    image = torch.from_numpy(pixels).permute(2, 0, 1) / 255
-    scanpath = agent.search(image, "blue", start=3, shifts=15)
-    assert 12 in scanpath.cells.tolist()
+    image = photograph_with(2, (7, 0))
+    assert 12 in agent.search(image, "blue", start=3, shifts=15).cells.tolist()
     assert len(agent.explore(image, shifts=3).cells) >= 1
 
 
@@ -139,13 +136,6 @@ def test_the_published_agent_takes_the_folder(home, search):
     assert len(agent.search(image, "blue", shifts=2, confirm=1.0).cells) == 3
     with pytest.raises(InputError, match="sensor: expected None with a folder of models"):
         ActivePerception.published(home / "models", sensor="published")
-
-
-def test_the_published_agent_needs_an_observation_model(home, tmp_path):
-    folder = copy_models(home, tmp_path)
-    rewrite_manifest(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
-    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: semfov fit"):
-        ActivePerception.published(folder)
 
 
 def test_eval_search_with_the_folder_matches_the_report(home, capsys):
@@ -170,11 +160,11 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 
 FITS = {
-    "observation": "fit_model",
-    "tempering": "hit_rates",
-    "evidence": "fit_evidence",
+    "observation": "_fit_model",
+    "tempering": "_hit_rates",
+    "evidence": "_fit_evidence",
     "verification": "fit_in_folds",
-    "map": "fit_map_evidence",
+    "map": "_fit_map_evidence",
     "parts.windows": "fit_mosaics",
 }
 
@@ -307,11 +297,6 @@ def test_the_agent_of_the_folder_looks_closely_at_a_target(home, tmp_path):
     assert 1 <= len(scanpath.closer) <= 2
     look = scanpath.closer[0]
     assert look.cell == 12
-    # The probability follows from the score of the square in the enlarged window, by the fitted regression.
-    calls = []
-    agent.eye.close_up = lambda image, box: calls.append(box) or type(agent.eye).close_up(agent.eye, image, box)
-    again = agent.search(image, "blue", start=3, shifts=15)
-    assert len(calls) == len(again.closer)
     assert scanpath.decision.outcome == "found"
     assert scanpath.decision.place == pytest.approx(max(look.place for look in scanpath.closer))
     assert agent.search(image, "blue", start=3, shifts=15, closer=0).closer == ()
@@ -417,19 +402,15 @@ def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_pat
     named = SearchConfig(models=folder, policies=(PolicyConfig("non-predictive", "calibrated"),))
     with pytest.raises(InputError, match="lacks: too few detections"):
         with_models(named)
+    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: semfov fit"):
+        ActivePerception.published(folder)
 
 
-def test_a_folder_without_models_is_refused(tmp_path):
+def test_what_has_no_models_is_refused_with_the_command_that_fits_them(home, tmp_path):
     with pytest.raises(DataError, match=r"manifest\.json: no such file; .*semfov fit"):
         ActivePerception.from_pretrained(tmp_path)
-
-
-def test_an_unknown_model_name_is_refused():
     with pytest.raises(InputError, match=r"got 'mymodels'; make a folder by `semfov fit .*mymodels`"):
         ActivePerception.from_pretrained("mymodels")
-
-
-def test_a_network_without_models_names_the_command_that_fits_them(home):
     network = str(home / "colours.onnx")
     for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
         with pytest.raises(InputError, match=r"semfov fit \S+colours\.onnx --data\.root"):
@@ -496,9 +477,7 @@ def test_differences_match_a_paired_t_test(seed):
     test = stats.ttest_rel(fitted, raw)
     assert difference.mean / difference.error == pytest.approx(test.statistic)
     assert difference.better == (test.statistic > 1)
-
-
-def test_one_photograph_or_no_difference_is_not_an_improvement():
+    # One photograph, or no difference, is no improvement.
     assert not Difference.of(np.array([1.0]), np.array([0.0])).better
     assert not Difference.of(np.ones(5), np.ones(5)).better
     assert Difference.of(np.ones(5), np.zeros(5)).better
@@ -537,7 +516,7 @@ def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path
     root = home / "photographs"
     data = DataConfig(root, root / "instances.json", 3, min_instances=0, max_target_area=None)
     detector = DetectorConfig(str(home / "colours.onnx"))
-    run = looking_of(
+    run = Looking(
         FitDetectorConfig(data=data, detector=detector, columns=3, rows=2, out=tmp_path, cache=tmp_path, workers=1)
     )
     clock = itertools.count(step=2.0)

@@ -10,7 +10,7 @@ from semfov import FovealObservationModel
 from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.observation import match
 from semfov.runs.config import DataConfig
-from semfov.runs.samples import Sampler, SampleSettings
+from semfov.runs.samples import Sampler
 from train.fit_fom import main
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
@@ -71,7 +71,7 @@ def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted,
 
 def test_detections_are_drawn_evenly(fitted):
     config = FitObservationConfig(data=DataConfig(limit=6, min_instances=0, max_target_area=None), fixations=2, shard=2)
-    sampler = Sampler(SampleSettings.of(config), fitted / "samples")
+    sampler = Sampler(config, fitted / "samples")
     every = sampler.all()
     assert torch.equal(sampler.drawn(len(every)).scores, every.scores)
     some = sampler.drawn(len(every) // 2)
@@ -98,10 +98,7 @@ def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
 
 
 def test_samples_match_looks_at_random_fixations(tmp_path):
-    settings = SampleSettings(
-        DataConfig(limit=2), FitObservationConfig().detector, FitObservationConfig().sensor, 2, 0.5, 0
-    )
-    sampler = Sampler(settings, tmp_path)
+    sampler = Sampler(FitObservationConfig(data=DataConfig(limit=2), fixations=2), tmp_path)
     samples = sampler.sample(0)
     scene = sampler.scenes[1]
     mine = samples[samples.scene == 1]

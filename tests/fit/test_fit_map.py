@@ -14,12 +14,12 @@ from semfov.episode import StoredLooks, rollout
 from semfov.fit.examples import _ExampleLooks
 from semfov.fit.map import (
     FitMapConfig,
+    _frequencies,
     _judge_map,
     _make_map_examples,
     _map_report,
     _train_gain,
     _train_map,
-    frequencies,
     map_objective,
 )
 from semfov.gaze.acquisition import CloserLook
@@ -120,7 +120,7 @@ def test_frequencies_equal_a_loop_over_cells(run):
                 count[label] += 1
     cells = 2 * CELLS
     expected = [math.log((n + 1) / (cells + 2) / (1 - (n + 1) / (cells + 2))) / 4 + 1 for n in count.values()]
-    assert frequencies(run, 2).tolist() == pytest.approx(expected, abs=1e-5)
+    assert _frequencies(run, 2).tolist() == pytest.approx(expected, abs=1e-5)
 
 
 def test_objective_equals_its_formula(examples):

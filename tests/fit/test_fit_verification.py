@@ -115,7 +115,7 @@ def test_a_single_closer_look_is_not_enough():
 
 def test_the_prior_is_the_mean_of_the_shipped_models():
     files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in SHIPPED]
-    for name, tensor in _shipped_mean().state_dict().items():
+    for name, tensor in _shipped_mean().named_parameters():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
 

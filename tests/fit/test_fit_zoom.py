@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov.agents.limits import EpisodeLimits
-from semfov.agents.windows import search_windows
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import WindowEpisode
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
@@ -23,7 +23,6 @@ from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
-from semfov.runs.samples import SampleSettings
 from semfov.runs.zoom_samples import MosaicSampler
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -124,7 +123,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
     model.check_compatible(WindowEye(Tiles(name="bright")).settings())
     # The model was fitted on one of the two mosaics and evaluated on the other; all samples of the first are counted.
-    sampler = MosaicSampler(SampleSettings.of(config), tmp_path / "out" / "samples")
+    sampler = MosaicSampler(config, tmp_path / "out" / "samples")
     samples = sampler.load(1)
     assert sum(map(sum, model.metadata["counts"])) == len(samples)
     size = sampler.scenes.annotation(1).size
@@ -177,7 +176,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
-        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8))
+        path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
         found, count = unverified(sought, model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
         assert [glance.window for glance in sought.glances[:count]] == [each.window for each in path.glances]
@@ -194,7 +193,8 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     again = verify(searches, [model.verification], limits, model.thresholds)
     for sought, each in zip(searches, again, strict=True):
-        path = search_windows(sought.looks, model, names, sought.target, EpisodeLimits(8), closer=MOST_CLOSER)
+        episode = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8), closer=MOST_CLOSER)
+        path = episode.open(sought.looks).run()
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
         assert right is None or right == sought.right(path.decision.box)

@@ -8,15 +8,14 @@ import torch
 from semfov import ActivePerception
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.detector import _manifest_of
-from semfov.fit.detector_settings import FitDetectorConfig
-from semfov.fit.parts.folder import FolderFit
+from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.parts.windows import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
+from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.windows import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig
-from semfov.runs.looking import looking_of
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
@@ -41,7 +40,7 @@ def folder_of(home, **settings):
         out=home / "models", cache=home / "cache",
     )  # fmt: skip
     config = replace(config, **settings).named()
-    return FolderFit(config, looking_of(replace(config, out=config.out / "progress")))
+    return _FolderFit(config, Looking(replace(config, out=config.out / "progress")))
 
 
 @pytest.mark.slow
@@ -77,8 +76,8 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     folder = folder_of(home)
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
-    folder.results["windows"] = replace(fitted, part=part)
-    _manifest_of(folder.config, folder.inputs.run, folder).write(home / "models")
+    folder.inputs.results["windows"] = replace(fitted, part=part)
+    _manifest_of(folder).write(home / "models")
     agent = ActivePerception.from_pretrained(home / "models")
     assert all(torch.equal(tensor, model.state_dict()[name]) for name, tensor in agent.windows.state_dict().items())
     picture = torch.full((3, 192, 256), 0.49)
@@ -86,7 +85,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     record = agent.find_all(picture, "blue", how="windows", passes=16)
     assert len(record.objects) == 1
     torch.testing.assert_close(record.objects.boxes[0], torch.tensor([160.0, 96, 168, 104]), atol=4, rtol=0)
-    # A part that is not used, or that a folder of an earlier version lacks, leaves the agent without it.
+    # A part that is not used, or that a folder lacks, leaves the agent without it.
     for parts in ({"windows": fitted.part.__class__(None, None, False, "")}, {}):
         replace(Manifest.read(home / "models"), parts=parts).write(home / "models")
         assert ModelFolder(home / "models").windows() is None
@@ -106,7 +105,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
 def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, settings, why):
     monkeypatch.setattr("semfov.fit.parts.windows.fit_mosaics", None)
     folder = folder_of(home, out=tmp_path, **settings)
-    assert folder.stages["windows"] == {}
+    assert folder.fits["windows"].tasks == {}
     part = folder.fit("windows").part
     assert (part.file, part.used, part.why) == (None, False, why)
 

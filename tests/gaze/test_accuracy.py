@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid
-from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.errors import InputError
 from semfov.gaze.acquisition import CloserLook, ExpectedAccuracy, ExpectedGain
@@ -87,19 +87,10 @@ def test_other_beliefs_are_refused(model):
 
 
 def test_closer_look_accepts_a_learned_map(model):
-    """The uncertainty of a cell is one minus the share of its most probable object among all objects."""
+    """Only the shares of the objects count, so a Dirichlet belief with these shares has the same values."""
     belief, visited = belief_of(model)
-    got = CloserLook(GRID, 0.2)(belief, visited)
-    for episode in range(3):
-        for fixation in range(20):
-            total = 0.0
-            for cell in range(20):
-                p = belief.probabilities[episode, cell, 1:].tolist()
-                away = float(GRID.cell_distance[fixation, cell])
-                before = float((1 - belief.closest[episode, cell] / 0.2).clamp(max=0).exp())
-                now = float((1 - torch.tensor(away) / 0.2).clamp(max=0).exp())
-                total += max(now - before, 0) * (1 - max(p) / sum(p))
-            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-5)
+    shares = DirichletBelief(belief.probabilities, belief.closest)
+    torch.testing.assert_close(CloserLook(GRID, 0.2)(belief, visited), CloserLook(GRID, 0.2)(shares, visited))
 
 
 LEARNED = {

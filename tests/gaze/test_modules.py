@@ -1,13 +1,10 @@
 """Acquisition functions, policies and saliency models as submodules of other modules."""
 
 import torch
-from torch import nn
 
 from semfov import acquisition, policies, saliency
 from semfov.belief import DirichletBelief
 from semfov.belief.observers import LearnedMap
-from semfov.gaze import IVSN, GazeHabits
-from semfov.gaze.templates import ClassTemplates
 from tests.base_tester import GraphTester, TensorTester, make_testers
 from tests.small import GRID, detections, look, mapping, memory, model, rand
 
@@ -65,15 +62,7 @@ for name, make in functions(2, model, rand(len(GRID))).items():
     (tester,) = made = make_testers(AcquisitionTester, {name: make})
     made[tester].autocast = AUTOCAST.get(name, AcquisitionTester.autocast)
     globals().update(made)
-globals().update(
-    make_testers(
-        AcquisitionTester,
-        {
-            "EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID),
-            "TemplateAttention": lambda: acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID),
-        },
-    )
-)
+globals().update(make_testers(AcquisitionTester, {"EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID)}))
 
 
 class TestCorrectLocalisation(AcquisitionTester, TensorTester):
@@ -119,51 +108,13 @@ class TestIdealObserver(TensorTester):
         return policies.IdealObserver(model())
 
 
-class TableTester(PolicyTester):
-    """For policies that need a table of every scene, seen from the fixated cell."""
-
-    @staticmethod
-    def call(module, beta, closest):
-        table = (rand(12, 12) if module.table == "saliency" else rand(12, 3, 12)).to(closest)
-        return module.in_scene(2, GRID, table, torch.tensor([3, 5], device=closest.device))(
-            DirichletBelief(beta, closest), closest == 0
-        )
+for kind in (each for each in policies.POLICIES.values() if each.__module__.startswith("semfov.")):
+    if kind not in (policies.IdealObserver, policies.SaliencyMaximum) and not kind.needs_map:
+        made = {kind.__name__: lambda kind=kind: kind.make(policies.Means(model().requires_grad_(False)))}
+        globals().update(make_testers(PolicyTester, made))
 
 
-globals().update(
-    make_testers(
-        TableTester,
-        {
-            "SaliencyMaximum": policies.SaliencyMaximum,
-            "TemplateSearch": policies.TemplateSearch,
-        },
-    )
-)
-
-
-globals().update(
-    make_testers(
-        PolicyTester,
-        {
-            "Random": policies.Random,
-            "NonPredictive": policies.NonPredictive,
-            "Predictive": lambda: policies.Predictive(model()),
-            "Neighbourhood": lambda: policies.Neighbourhood(model()),
-            "FovealHits": lambda: policies.FovealHits(model()),
-            "InformationOnPlace": lambda: policies.InformationOnPlace(model()),
-            "EntropyLimitMinimisation": lambda: policies.EntropyLimitMinimisation(model().requires_grad_(False)),
-            "Closer": policies.Closer,
-            "ObjectSeeking": policies.ObjectSeeking,
-            "KL": lambda: policies.KL(model()),
-            "Surprise": lambda: policies.Surprise(model()),
-            "Negentropy": lambda: policies.Negentropy(model()),
-            "Peaks": lambda: policies.Peaks(model()),
-            "ConfidenceBound": lambda: policies.ConfidenceBound(model()),
-            "Improvement": lambda: policies.Improvement(model()),
-            "Accuracy": lambda: policies.Accuracy(model().requires_grad_(False)),
-        },
-    )
-)
+globals().update(make_testers(PolicyTester, {"SaliencyMaximum": lambda: policies.SaliencyMaximum(rand(len(GRID)))}))
 
 
 class TestGain(PolicyTester):
@@ -177,38 +128,41 @@ class TestGain(PolicyTester):
         return TestExpectedGain.call(module(None, GRID), scores, boxes, fixation)
 
 
-class TestGazeHabits(TensorTester):
-    """Log probabilities of the next cell, given the present one."""
+class TestFixationDensity(GraphTester):
+    """After scanpaths of three fixations, on the cells of the picture."""
 
     batched = (0, 1, 2)
+    differentiable = (0, 1, 2)
 
     def make(self):
-        return GazeHabits(0.5, rand(len(GRID)), rand(3), [0.2, 0.5], rand(2), [2.0], 4)
+        density = saliency.FixationDensity({"fine": 3, "coarse": 2}, readouts=2, units=4, centre=-rand(3, 4))
+        with torch.no_grad():
+            for parameter in density.oculomotor.parameters():
+                parameter.add_(0.2 * torch.randn_like(parameter))
+        return density
 
     def inputs(self):
-        return rand(2, len(GRID)), torch.tensor([1, 7]), torch.full((2, len(GRID)), torch.inf)
+        return rand(2, 3, 6, 8), rand(2, 2, 3, 4), 60 * rand(2, 3, 2)
 
     @staticmethod
-    def call(module, values, cell, age):
-        return module(values, cell, age, GRID)
+    def call(module, fine, coarse, scanpath):
+        return module({"fine": fine, "coarse": coarse}, (39, 52), scanpath).flatten(1)[:, ::97]
 
 
-class TestIVSN(TensorTester):
-    batched = (0, 1)
+class TestOculomotorBias(GraphTester):
+    batched = (0,)
+    differentiable = (0, 1)
+    autocast = 0.05
 
     def make(self):
-        return IVSN(nn.Conv2d(3, 4, 3, 2, 1), nn.AdaptiveMaxPool2d(1), picture=32, target=8)
+        bias = saliency.OculomotorBias()
+        with torch.no_grad():
+            for parameter in bias.parameters():
+                parameter.add_(torch.randn_like(parameter))
+        return bias
 
     def inputs(self):
-        return rand(2, 3, 48, 64), rand(2, 3, 12, 9)
-
-
-class TestClassTemplates(GraphTester):
-    def make(self):
-        return ClassTemplates(rand(3, 5), rand(5), ("cat", "cup", "person"))
-
-    def inputs(self):
-        return (rand(2, 5, 4, 6),)
+        return rand(2, 4, 2), rand(5, 2)
 
 
 class TestVOCUS2(GraphTester):

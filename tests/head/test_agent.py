@@ -14,7 +14,6 @@ from semfov.head import Flat, Panorama
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
-from semfov.viz.head import plot_head_path
 
 
 @pytest.fixture
@@ -77,18 +76,24 @@ def test_boxes_of_a_flat_scene_lie_around_the_object(agent):
     assert ((boxes[:, 0] > 470) & (boxes[:, 2] < 570) & (boxes[:, 1] > 170) & (boxes[:, 3] < 270)).all()
 
 
+def test_the_box_of_a_decision_is_in_pixels_of_the_picture(agent):
+    """It lies around the object, whatever view it was found in, and is the box of a confirmed object."""
+    image = torch.zeros(3, 480, 640)
+    image[1, 200:240, 500:540] = 1
+    first = agent.search(Flat(image, degree=4), "green", passes=1, confirm=1.0)
+    seen = [n for n, gaze in enumerate(first.views.gaze) if (gaze - torch.tensor([519.5, 219.5])).abs().max() < 30]
+    paths = [agent.search(Flat(image, degree=4), "green", passes=1, confirm=0.0, start=start) for start in seen]
+    boxes = torch.stack([path.decision.box for path in paths if path.decision.box is not None])
+    assert len({tuple(path.pose(0).tolist()) for path in paths}) > 1
+    assert ((boxes[:, :2] > torch.tensor([470.0, 170])) & (boxes[:, 2:] < torch.tensor([570.0, 270]))).all()
+    for path in paths:
+        if path.decision.box is not None:
+            assert path.objects.boxes[path.confirmed].shape == (1, 4)
+
+
 def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama):
     path = agent.explore(Panorama(panorama, fields=(40.0, 80.0)), passes=4)
     assert {float(path.views.poses[action // 100, 2]) for action in path.actions} <= {40.0, 80.0}
-
-
-def test_a_plot_shows_at_most_the_looks_of_the_path(agent, panorama):
-    path = agent.explore(Panorama(panorama), passes=2)
-    for looks, more in ((1, ["0"]), (2, ["0", "1"])):
-        texts = [text.get_text() for text in plot_head_path(path, panorama, looks=looks).axes[0].texts]
-        assert [text for text in texts if text.isdigit()] == more
-    with pytest.raises(InputError, match="looks: expected a number from 1 to 2"):
-        plot_head_path(path, panorama, looks=3)
 
 
 def test_arguments_are_checked(agent, panorama):

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from eval.head.run import rests_on
+from eval.head.run import _rests_on
 from semfov.belief.observers import LearnedMap, Target
 from semfov.episode import rollout
 from semfov.errors import InputError
@@ -23,14 +23,9 @@ def views(panorama):
 def episode(views, eye, observer, actions, target=None):
     looks = _HeadLooks(views, live(eye, views), target)
     gain = SearchGain(views)
-    steps = rollout(
-        looks, observer, lambda _, cell: PerSecond(gain, None, int(cell)), torch.tensor(actions[:1]),
-        Given(torch.tensor([actions])), most=len(actions),
-    ) if target else rollout(
-        looks, observer, Scan(_NoGain(views), [0], 1, 0), torch.tensor(actions[:1]), Given(torch.tensor([actions])),
-        most=len(actions),
-    )  # fmt: skip
-    return [step.belief for step in steps]
+    acquire = (lambda _, cell: PerSecond(gain, None, int(cell))) if target else Scan(_NoGain(views), [0], 1, 0)
+    start, given = torch.tensor(actions[:1]), Given(torch.tensor([actions]))
+    return [step.belief for step in rollout(looks, observer, acquire, start, given, most=len(actions))]
 
 
 class _NoGain(SearchGain):
@@ -55,17 +50,17 @@ def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, 
     for cell in cells:
         point = views.view_grid.centres[cell][None]
         alone = inner(alone, eye.look(view, point), point, views.view_grid, 3)
-    seen = views.visible[pose]
-    for number in range(0, len(seen.cells), 7):
+    shown, points = views.visible[pose], views.points[pose]
+    for number in range(0, len(shown), 7):
         # Bilinear interpolation by hand, between the four cells around the point.
-        at = (seen.points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
+        at = (points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
         at = at.clamp(0, 9)
         low = at.floor().clamp(max=8).long()
         share = at - low
         table = alone.present.view(10, 10)
         rows = [(1 - share[0]) * table[low[1] + k, low[0]] + share[0] * table[low[1] + k, low[0] + 1] for k in (0, 1)]
         expected = (1 - share[1]) * rows[0] + share[1] * rows[1]
-        assert float(belief.probability(3)[0, seen.cells[number]]) == pytest.approx(float(expected), abs=1e-5)
+        assert float(belief.probability(3)[0, shown[number]]) == pytest.approx(float(expected), abs=1e-5)
 
 
 def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
@@ -78,7 +73,7 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
     for count, (belief, action) in enumerate(zip(beliefs, actions, strict=True), 1):
         place, cell = divmod(action, 100)
         centre = views.view_grid.centres[cell]
-        for number, point in zip(views.visible[place].cells.tolist(), views.visible[place].points, strict=True):
+        for number, point in zip(views.visible[place].tolist(), views.points[place], strict=True):
             distance = torch.linalg.vector_norm(point - centre) / 64
             distances[place, number] = torch.minimum(distances[place, number], distance)
         nearest, owner = distances.amin(0), belief.owner[0]
@@ -176,7 +171,7 @@ def test_explore_gain_equals_brute_force(views, eye, models):
             continue
         place, cell = divmod(action, 100)
         value = 0.0
-        for x, point in zip(views.visible[place].cells.tolist(), views.visible[place].points, strict=True):
+        for x, point in zip(views.visible[place].tolist(), views.points[place], strict=True):
             distance = torch.linalg.vector_norm(point - views.view_grid.centres[cell]) / 64
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
@@ -219,7 +214,7 @@ def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
     places = views.world.places(torch.tensor(boxes), views.poses[pose])
     for cell in range(100):
         x1, y1, x2, y2 = views.view_grid.edges[cell].tolist()
-        found = rests_on(views, pose * 100 + cell, places).tolist()
+        found = _rests_on(views, pose * 100 + cell, places).tolist()
         for rests, (left, top, right, bottom) in zip(found, boxes, strict=True):
             gap = min(right - x1, x2 - left, bottom - y1, y2 - top)
             if abs(gap) > 0.3:  # where they almost touch, rounding decides

@@ -7,10 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
-from semfov.belief import ContextPrior, MapEvidence, Verification
+from semfov.belief import MapEvidence, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
-from semfov.gaze import ClassTemplates, GazeHabits
 from semfov.io import storage
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
@@ -34,27 +33,12 @@ def everything():
     return MapEvidence(3, 2, components=3, metadata=METADATA)
 
 
-def context():
-    places, pairs = torch.randn(3, 2, 2).half().float(), torch.randn(3, 3, 2).half().float()
-    return ContextPrior(CLASSES, places, pairs, [0.1], weights={"map": (1.0, 0.5)})
-
-
 def glimpses():
     return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
 
 
 def verification():
     return Verification(thresholds=Thresholds(0.7, 0.3, 0.2), metadata=METADATA)
-
-
-def templates():
-    return ClassTemplates(torch.randn(2, 5), torch.randn(5), CLASSES, metadata=METADATA)
-
-
-def habits():
-    place, step, back = torch.randn(12), torch.randn(3), torch.randn(2)
-    sizes = {"edges": [0.1, 0.3], "ages": [2.0], "columns": 4}
-    return GazeHabits(place=place, step=step, back=back, pull=0.8, metadata={"policy": "kl"}, **sizes)
 
 
 def seeded(make):
@@ -72,7 +56,7 @@ def seeded(make):
     return made
 
 
-EVERY = (observation, evidence, everything, context, glimpses, verification, templates, habits)
+EVERY = (observation, evidence, everything, glimpses, verification)
 MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
@@ -187,7 +171,7 @@ def test_invalid_values_in_records_are_refused_and_valid_ones_are_loaded(name, t
             continue
         del record[key]
         missing = loaded_or_none(name, tmp_path, tensors, record)
-        assert missing is None or key in ("thresholds", "verification", "certainty")
+        assert missing is None or key in ("thresholds", "verification", "certainty", "photograph")
         for junk in JUNK:
             tensors, record = parts(MODELS[name]())
             loaded = loaded_or_none(name, tmp_path, tensors, {**record, key: junk})

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
-from eval.calibration.beliefs_report import add_up, curves, landing_table, pooled, write_belief_report
+from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
 from eval.search.run import SearchConfig
 from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
@@ -184,17 +184,17 @@ def test_searches_add_up_by_belief_looks_and_group():
         },
         {"seen": None, "beliefs": {"a": {"looks": {"1": {CELL_GROUPS[2]: cells((0.1, False))}}, "landing": None}}},
     ]
-    sums = add_up(searches)
+    sums = _add_up(searches)
     assert {key: each.count for key, each in sums.items()} == {
         ("a", 1, "fixated"): 3,
         ("a", 1, CELL_GROUPS[1]): 1,
         ("a", 1, CELL_GROUPS[2]): 1,
     }
-    every = pooled(sums, "a", 1)
+    every = _pooled(sums, "a", 1)
     assert (every.count, every.rate) == (5, 0.4)
     assert every.brier == pytest.approx((0.01 + 0.04 + 0.25 + 0.09 + 0.01) / 5)
-    panels, errors = curves(sums)
+    panels, errors = _curves(sums)
     assert torch.equal(panels["after 1 look"]["a"], every.bins)
     assert errors == {"a": {group: sums["a", 1, group].ece for group in CELL_GROUPS[:3]}}
     means = ["3", "0.250 → 0.625"]
-    assert landing_table(searches) == [["a", "2", means[1], "1", "0.000 → 1.000", "1", "0.500 → 0.250"]]
+    assert _landing_table(searches) == [["a", "2", means[1], "1", "0.000 → 1.000", "1", "0.500 → 0.250"]]

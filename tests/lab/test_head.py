@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from eval.head import report as head_report
-from eval.head.run import HeadConfig, HeadRun, scene_answers, tiling_order
+from eval.head.run import HeadConfig, HeadRun, _scene_answers, _tiling_order
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.scene import Annotation, Scene
@@ -108,7 +108,7 @@ def test_all_ways_start_at_the_same_view_and_the_eye_alone_never_turns_the_head(
 def test_a_raster_scan_visits_every_view_of_the_tiling(config):
     run = HeadRun(config)
     views = Views(run.world(0))
-    order = tiling_order(views, views.tiling[0][1][1])
+    order = _tiling_order(views, views.tiling[0][1][1])
     assert order[0] == views.tiling[0][1][1]
     assert sorted(order) == sorted(pose for row in views.tiling[0] for pose in row)
     steps = [float(views.world.turn(views.poses[a], views.poses[b])) for a, b in pairwise(order)]
@@ -118,7 +118,7 @@ def test_a_raster_scan_visits_every_view_of_the_tiling(config):
 def test_answers_lie_in_reachable_cells_inside_boxes(config):
     run = HeadRun(config)
     views, places, labels = Views(run.world(0)), run.places(0), run.scenes.annotation(0).labels
-    answers = scene_answers(views, places, labels, 3)
+    answers = _scene_answers(views, places, labels, 3)
     inside = places.contain(views.world.centres)
     for cell in range(0, len(views.world.scene), 11):
         held = set(labels[inside[:, cell]].tolist()) if views.reachable[cell] else set()
@@ -135,4 +135,4 @@ def test_means_and_paired_differences_match_hand_calculations():
     assert error == pytest.approx(np.std([5, 7], ddof=1) / np.sqrt(2))
     assert error_apart == pytest.approx(np.std([3, 1], ddof=1) / np.sqrt(2))
     record = {"seconds": [0.5, 1.0, 2.0], "success": [0.1, 0.2, 0.4]}
-    assert [head_report.value_by(record, s, "success") for s in (0.2, 0.5, 1.9, 9.0)] == [0.0, 0.1, 0.2, 0.4]
+    assert [head_report._value_by(record, s, "success") for s in (0.2, 0.5, 1.9, 9.0)] == [0.0, 0.1, 0.2, 0.4]

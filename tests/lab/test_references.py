@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval.explore.run import FUSED, PAINTED, sharp_maps
+from eval.explore.run import FUSED, PAINTED, _sharp_maps
 from semfov import Detections, Grid
 from semfov.runs.exploration_protocol import counts_of
 
@@ -40,7 +40,7 @@ def kaplan(beta, likelihood):
 @pytest.mark.parametrize("seed", range(4))
 def test_maps_equal_loops_over_cells_and_detections(seed, dtype, device):
     sharp = random_detections(seed, dtype=dtype, device=device)
-    maps = sharp_maps(sharp, GRID)
+    maps = _sharp_maps(sharp, GRID)
     assert set(maps) == {FUSED, PAINTED}
     for probabilities in maps.values():
         assert probabilities.shape == (1, 20, 4)
@@ -59,17 +59,10 @@ def test_maps_equal_loops_over_cells_and_detections(seed, dtype, device):
 @pytest.mark.parametrize("most", [0, 3])
 def test_maps_without_detections_are_background_or_uniform(most):
     nothing = Detections(torch.zeros(1, most, 4), torch.rand(1, most, 4), torch.zeros(1, most, dtype=torch.bool))
-    maps = sharp_maps(nothing, GRID)
+    maps = _sharp_maps(nothing, GRID)
     expected = torch.tensor([0.2, 0, 0, 0]).expand(1, 20, -1)
     torch.testing.assert_close(maps[PAINTED], expected)
     torch.testing.assert_close(maps[FUSED], torch.full((1, 20, 4), 0.25))
-
-
-def test_background_is_painted_unless_a_class_scores_higher():
-    box = torch.tensor([[[1.0, 1, 19, 14], [21, 1, 39, 14]]])
-    scores = torch.tensor([[[0.6, 0.19, 0.11, 0.1], [0.6, 0.21, 0.1, 0.09]]])
-    painted = sharp_maps(Detections(box, scores, torch.ones(1, 2, dtype=torch.bool)), GRID)[PAINTED][0]
-    assert painted.argmax(-1).tolist() == [0, 1] + [0] * 18
 
 
 def counts_by_loop(probabilities, answers):

@@ -94,6 +94,7 @@ def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, 
     mapper = LearnedMap(MapEvidence.from_pretrained(run.eye.detector.name))
     for number, record in enumerate(records):
         path = replay(run, 0, record)
+        assert path.seconds == (), "from the store it takes no time"
         for shift, (belief, values) in enumerate(steps_of(steps, number)):
             torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])
             torch.testing.assert_close(path.values[shift], values)
@@ -145,10 +146,6 @@ def test_a_search_with_a_wrong_cue_is_replayed_with_the_belief_about_the_cue(run
     path = replay(run, 0, record)
     assert path.target == record["target"] != 7
     torch.testing.assert_close(path.posterior, path.probabilities[..., 7])
-
-
-def test_a_replay_from_the_store_has_no_times(run, searched):
-    assert replay(run, 0, searched[SOUGHT][0][0]).seconds == ()
 
 
 def test_a_replayed_exploration_has_the_original_beliefs_and_values(settings):

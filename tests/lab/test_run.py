@@ -46,14 +46,13 @@ def test_a_run_has_one_store_for_each_saliency_model(config):
     assert ExploreRun(replace(explored, policies=("kl-raw", mild))).saliency_stores == {}
 
 
-def test_saliency_is_the_table_of_a_policy_or_a_prior_beside_one(config):
+def test_saliency_guides_a_policy_alone_or_beside_another(config):
     run = SearchRun(replace(config, policies=("vocus2", GUIDED, "random"), saliency=SaliencyConfig(weight=0.3)))
     alone, beside, none = (run.candidate(name, 0) for name in run.policies)
-    assert alone.saliency is None
     assert beside.weight == 0.3
-    assert torch.equal(alone.table, run.saliency("vocus2", 0))
-    assert torch.equal(beside.saliency, alone.table)
-    assert (beside.table, none.table, none.saliency) == (None, None, None)
+    assert torch.equal(alone.saliency, run.saliency("vocus2", 0))
+    assert torch.equal(beside.saliency, alone.saliency)
+    assert none.saliency is None
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import eval.comparison.report_page as module
-from eval.comparison.report_page import choose_episodes, write_run_report
+from eval.comparison.report_page import _choose_episodes, write_run_report
 from eval.explore import report as explore_report
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import report as search_report
@@ -35,10 +35,10 @@ def write_search(run, records, **options):
         run,
         records,
         curves,
-        titles=search_report.AVERAGES,
+        titles=search_report._AVERAGES,
         label="targets found (%)",
-        shifts=search_report.SEARCH_SHIFTS,
-        others={"random, by formula": search_report.expected_random(records, 5, 12)},
+        shifts=search_report._SEARCH_SHIFTS,
+        others={"random, by formula": search_report._expected_random(records, 5, 12)},
         **options,
     )
     page = path.read_text(encoding="utf-8")
@@ -49,7 +49,7 @@ def write_search(run, records, **options):
 def test_the_page_of_a_search_run_shows_curves_and_episodes(searched):
     run, records = searched
     curves, page, data = write_search(run, records)
-    chosen = choose_episodes(records, list(run.policies), 18)
+    chosen = _choose_episodes(records, list(run.policies), 18)
     assert len(chosen) == 4
     for episode, record in zip(data["episodes"], chosen, strict=True):
         assert [each["cell"] for each in episode["fixations"]] == record["cells"]
@@ -66,7 +66,7 @@ def test_the_page_of_a_search_run_shows_curves_and_episodes(searched):
 
 def test_the_size_limit_leaves_one_episode(searched, monkeypatch):
     run, records = searched
-    monkeypatch.setattr(module, "MOST_BYTES", 1)
+    monkeypatch.setattr(module, "_MOST_BYTES", 1)
     _, _, data = write_search(run, records)
     assert len(data["episodes"]) == 1
 
@@ -81,7 +81,7 @@ def test_the_page_of_an_exploration_run_shows_episodes_as_recorded(settings):
         curves,
         titles={"all classes": "all classes"},
         label="cells with the right class (%)",
-        shifts=explore_report.EXPLORATION_SHIFTS,
+        shifts=explore_report._EXPLORATION_SHIFTS,
     )
     data = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
     assert [episode["target"] for episode in data["episodes"]] == [None, None]

@@ -88,9 +88,9 @@ def cells_of(text):
 
 def test_search_tables_have_a_row_for_each_policy_and_no_durations():
     curves = {
-        average: search_report.performance(searches(), ("random",), 2, average) for average in search_report.AVERAGES
+        average: search_report.performance(searches(), ("random",), 2, average) for average in search_report._AVERAGES
     }
-    text = search_report.search_summary(curves, np.array([0.0, 0.25, 0.5]), "an eye")
+    text = search_report._search_summary(curves, np.array([0.0, 0.25, 0.5]), "an eye")
     head, _, row, formula, *rest = cells_of(text)
     assert head == ["policy", "CP@1", LAST_COLUMN]
     assert (row[0], formula) == ("random", ["random, by formula", "25.0", ""])
@@ -100,8 +100,8 @@ def test_search_tables_have_a_row_for_each_policy_and_no_durations():
 
 
 def test_exploration_tables_name_the_published_answer_first():
-    curves = {answer: explore_report.success(explorations(), ("kl-raw",), answer) for answer in explore_report.ANSWERS}
-    text = explore_report.exploration_summary(curves, 2, "an eye")
+    curves = {answer: explore_report.success(explorations(), ("kl-raw",), answer) for answer in explore_report._ANSWERS}
+    text = explore_report._exploration_summary(curves, 2, "an eye")
     published, other = text.split("**as published", 1)[1].split("**the answer", 1)
     other, everywhere = other.split("**all cells count", 1)
     assert "most probable class, background included" in published

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from eval.comparison.telling import Telling, calibrated, class_frequencies, tells
+from eval.comparison.telling import Telling, _tells, calibrated, class_frequencies
 from semfov import EmbeddedScenes
 from semfov.metrics.presence import area_under_roc, hits_at
 
@@ -63,7 +63,7 @@ def test_differences_are_those_of_the_rows_with_smaller_errors_than_unpaired(sea
 
 def test_without_absent_classes_there_is_nothing_to_tell(searches):
     told, there, scenes, _ = searches
-    assert all(map(math.isnan, tells(told["sharp"], torch.ones_like(there))))
+    assert all(map(math.isnan, _tells(told["sharp"], torch.ones_like(there))))
     telling = Telling(told, torch.ones_like(there), scenes)
     assert telling.rows() == [["-"] * 4] * 2
     assert telling.differences("sharp")[2].count("| - ") == 4

@@ -90,11 +90,11 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
 @pytest.mark.parametrize(
     ("chances", "unseen", "words"),
     [
-        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 in all)"),
-        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 in all)"),
+        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 that this detector can show)"),
+        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 that this detector can show)"),
         ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability 0.5 (about 2 ± 1 of them right)"),
         ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability 0.5 (about 2 ± 1 of them right)"),
-        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (about 0 ± 0 in all)"),
+        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (the detector hardly reacts, so no number is given)"),
     ],
 )
 def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances, unseen, words):
@@ -111,7 +111,7 @@ def test_looks_are_given_one_by_one():
     first, second = path
     assert first.fixation == tuple(path.fixations[0].tolist())
     assert first.region == (0, 0, 80, 60)
-    assert (first.number, first.seconds, first.value) == (0, 1.5, None)
+    assert (first.number, first.seconds, second.seconds, first.value) == (0, 1.5, 1.75, None)
     assert second.value == float(path.values[0, 11])
     assert torch.equal(first.detections.boxes, path.detections[0].boxes)
 
@@ -141,15 +141,14 @@ def test_boxes_of_a_head_are_in_pixels_of_the_picture_and_meet_across_the_seam()
     assert 0 <= x1 < 256 < x2
     assert (x1 + x2) / 2 == pytest.approx(253, abs=1.0)
     assert (y1 + y2) / 2 == pytest.approx(64, abs=0.5)
-    first, second = path
-    assert second.seconds == 0.75
-    assert first.region[2] - first.region[0] == pytest.approx(256 / 6, rel=0.05)
+    assert [each.seconds for each in path] == [0.5, 1.25]
+    assert path.looks[0].region[2] - path.looks[0].region[0] == pytest.approx(256 / 6, rel=0.05)
 
 
 def test_boxes_of_a_flat_scene_are_scaled():
     world = Flat((640, 480), (40, 30), degree=8)
     path = head_path(world, (455,), [look(([10.0, 10, 20, 20], 1, 0.6))])
-    x1, y1, x2, _ = path.region(0)
+    x1, y1, x2, _ = path.looks[0].region
     scale = (x2 - x1) / 40
     assert path.objects.boxes[0].tolist() == pytest.approx(
         [x1 + 10 * scale, y1 + 10 * scale, x1 + 20 * scale, y1 + 20 * scale]

@@ -129,7 +129,7 @@ def test_images_of_any_type_are_accepted(kind, folder, agent, zooming):
         for look in (agent.search(make(folder), "cup", seed=3), agent.explore(make(folder), shifts=2, seed=3)):
             assert look.grid.size == (44, 30)
         views = agent.eye.open(make(folder)), agent.eye.open(own[None])
-        torch.testing.assert_close(views[0].state.bands.base, views[1].state.bands.base, atol=1e-6, rtol=0)
+        torch.testing.assert_close(views[0].state[0].base, views[1].state[0].base, atol=1e-6, rtol=0)
         view = foveate(make(folder), (20, 12), sigma=8.0)
         wanted = foveate(expected[None], torch.tensor([20.0, 12.0]), sigma=8.0)[0]
         torch.testing.assert_close(view.reshape(wanted.shape), wanted, atol=1e-6, rtol=0)

@@ -10,9 +10,8 @@ from torch import Tensor
 import semfov
 from semfov import acquisition, fusion
 from semfov.belief import DirichletBelief
-from semfov.belief.observers import Context, Target
 from semfov.gaze import select_fixation
-from tests.small import beliefs, context, evidence, model, rand
+from tests.small import beliefs, model, rand
 
 
 def test_vmap_of_the_choice_equals_a_loop():
@@ -48,11 +47,6 @@ def test_gradients_of_acquisition_values_reach_gaze_and_width_of_the_fovea():
     for leaf in (gaze, width):
         assert bool(torch.isfinite(leaf.grad).all())
         assert float(leaf.grad.abs().sum()) > 0
-
-
-def test_a_nested_observer_is_one_module_that_contains_all_its_parts():
-    whole = Context(Target(evidence()), context(evidence=(0.5, 0.2)))
-    assert {name.split(".")[0] for name in whole.state_dict()} == {"observer", "prior"}
 
 
 @pytest.mark.parametrize("size", [(48, 64), (200, 300)])

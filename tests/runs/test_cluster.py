@@ -18,7 +18,7 @@ import torch
 
 from semfov.detection.weights import fetch
 from semfov.errors import InputError, SemfovError
-from semfov.runs import cluster, workers
+from semfov.runs import workers
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
@@ -60,7 +60,7 @@ class Waiting(Executor):
         future = Future()
         self.kept.append((future, function, arguments))
         self.most = max(self.most, len(self.kept))
-        if len(self.kept) == workers.OUTSTANDING or arguments[0] >= 998:
+        if len(self.kept) == workers._OUTSTANDING or arguments[0] >= 998:
             self.run()
         return future
 
@@ -97,7 +97,7 @@ def test_threads_of_a_worker_take_turns():
 def test_an_executor_is_given_a_limited_number_of_tasks_at_once():
     pool = Waiting()
     assert results(operator.neg, range(1000), pool) == {n: -n for n in range(1000)}
-    assert pool.most == workers.OUTSTANDING
+    assert pool.most == workers._OUTSTANDING
 
 
 def test_a_process_is_prepared_again_for_other_settings():
@@ -195,7 +195,7 @@ def worker(port, path, cache=None):
 def tasks(tmp_path, monkeypatch):
     (tmp_path / "cluster_tasks.py").write_text(TASKS)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(cluster, "_REACH", 60.0)
+    monkeypatch.setattr(workers, "_REACH", 60.0)
     import cluster_tasks
 
     yield cluster_tasks
@@ -260,7 +260,7 @@ def test_looks_of_a_cluster_come_back_and_are_the_same_to_the_bit(tmp_path, monk
 
 def test_without_a_scheduler_the_error_says_what_to_start(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "_REACH", 0.2)
+    monkeypatch.setattr(workers, "_REACH", 0.2)
     with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):
         results(operator.neg, [1, 2], f"tcp://127.0.0.1:{free_port()}")
     with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):

@@ -89,10 +89,6 @@ def ranges():
                         yield config, name, base, allowed
 
 
-def test_settings_with_a_range_are_found():
-    assert len(list(ranges())) > 25
-
-
 @pytest.mark.parametrize(("config", "name", "base", "allowed"), list(ranges()), ids=str)
 def test_settings_out_of_their_range_are_refused_by_name(config, name, base, allowed):
     required = {"policy": "random"} if config is settings.PolicyConfig else {}

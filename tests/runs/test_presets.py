@@ -1,6 +1,6 @@
 """Policies in settings: names, mappings, labels in tables, and which are refused."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import get_args
 
@@ -12,7 +12,7 @@ from semfov.errors import InputError
 from semfov.gaze.policies import Task, policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
-from semfov.runs.presets import WORDS, _valid_policies, label, presets, resolve
+from semfov.runs.presets import _WORDS, _valid_policies, label, presets, resolve
 
 TASKS = get_args(Task)
 ALIASES = {
@@ -34,7 +34,7 @@ CHANGES = [
     {"misses": True},
     {"misses": False},
     {"samples": 4},
-    *({name: word} for name, words in WORDS.items() if name != "scores" for word in get_args(words)),
+    *({name: word} for name, words in _WORDS.items() if name != "scores" for word in get_args(words)),
 ]
 
 
@@ -79,7 +79,7 @@ def test_labels_are_unique(task):
             except InputError:
                 continue
     labels = {label(policy, task) for policy in made}
-    assert len(labels) == len(made) > 500
+    assert len(labels) == len(made)
     assert labels >= {label(name, task) for name in presets(task)}
 
 
@@ -87,7 +87,6 @@ def test_labels_list_the_differences_from_a_preset():
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
     everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", 9)
-    assert len(fields(PolicyConfig)) == 8
     expected = "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, samples 9"
     assert label(everything, "search") == expected
     assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"
@@ -116,39 +115,27 @@ def test_unknown_names_get_a_suggestion(choice, task, suggested):
             call(choice, task)
 
 
-def test_a_policy_of_the_other_task_is_refused():
-    with pytest.raises(InputError, match="policy"):
-        resolve(PolicyConfig("kl"), "search")
-    with pytest.raises(InputError, match="policy"):
-        resolve(PolicyConfig("target-evidence"), "exploration")
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_saliency_without_a_model_is_refused(task):
-    with pytest.raises(InputError, match=r"^saliency: .*vocus2, itti-koch"):
-        resolve(PolicyConfig("saliency"), task)
-
-
-@pytest.mark.parametrize("tempering", [0.0, -0.5, float("nan")])
-def test_an_exponent_out_of_range_is_refused(tempering):
-    with pytest.raises(InputError, match=r"^tempering: expected a number above 0"):
-        resolve(PolicyConfig("kl", tempering=tempering), "exploration")
-
-
-@pytest.mark.parametrize("policy", ["random", "target-evidence", "saliency"])
-def test_scores_are_refused_for_policies_that_do_not_use_them(policy):
-    """Its label would be the same as with raw scores."""
-    saliency = "vocus2" if policy == "saliency" else None
-    with pytest.raises(InputError, match=f"^scores: .*'{policy}'"):
-        resolve(PolicyConfig(policy, "calibrated", saliency=saliency), "search")
-
-
 @pytest.mark.parametrize(
-    "change", [{"tempering": 0.25}, {"footprint": "soft"}, {"memory": "all"}, {"misses": True}], ids=str
-)
-def test_settings_of_a_map_are_refused_for_policies_with_their_own_belief(change):
-    with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'target-evidence'"):
-        resolve(PolicyConfig("target-evidence", **change), "search")
+    ("task", "settings", "told"),
+    [
+        ("search", {"policy": "kl"}, "policy"),
+        ("exploration", {"policy": "target-evidence"}, "policy"),
+        *((task, {"policy": "saliency"}, "^saliency: .*vocus2, itti-koch") for task in TASKS),
+        *(("exploration", {"policy": "kl", "tempering": wrong}, "^tempering: expected a number above 0")
+          for wrong in (0.0, -0.5, float("nan"))),
+        # Without scores in use, its label would be the same as with raw scores.
+        ("search", {"policy": "random", "scores": "calibrated"}, "^scores: .*'random'"),
+        ("search", {"policy": "target-evidence", "scores": "calibrated"}, "^scores: .*'target-evidence'"),
+        ("search", {"policy": "saliency", "scores": "calibrated", "saliency": "vocus2"}, "^scores: .*'saliency'"),
+        # It has a belief of its own, not the map.
+        *(("search", {"policy": "target-evidence", name: value}, f"^{name}: .*'target-evidence'")
+          for name, value in (("tempering", 0.25), ("footprint", "soft"), ("memory", "all"), ("misses", True))),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_that_a_policy_does_not_have_are_refused(task, settings, told):
+    with pytest.raises(InputError, match=told):
+        resolve(PolicyConfig(**settings), task)
 
 
 def parsed(config, *arguments):
@@ -162,14 +149,11 @@ def parsed(config, *arguments):
 MAPPING = "[{policy: non-predictive, tempering: 0.25}, random]"
 
 
-def test_a_policy_can_be_a_mapping_on_the_command_line():
+def test_a_policy_can_be_a_mapping(tmp_path):
     assert parsed(SearchConfig, "--policies", MAPPING) == (PolicyConfig("non-predictive", tempering=0.25), "random")
     given = "[recommended, {policy: kl, scores: calibrated, memory: closest, misses: true}]"
     expected = "recommended", PolicyConfig("kl", "calibrated", memory="closest", misses=True)
     assert parsed(ExploreConfig, "--policies", given) == expected
-
-
-def test_a_policy_can_be_a_mapping_in_yaml(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text(f"policies: {MAPPING}\n")
     assert parsed(SearchConfig, "--config", str(path)) == (PolicyConfig("non-predictive", tempering=0.25), "random")
@@ -194,30 +178,21 @@ BAD = {
 
 
 @pytest.mark.parametrize("wrong", BAD)
-def test_an_invalid_mapping_is_refused_in_yaml(wrong, tmp_path, capsys):
-    path = tmp_path / "run.yaml"
-    path.write_text(f"policies:\n- {BAD[wrong]}\n")
-    with pytest.raises(SystemExit) as stopped:
-        parsed(SearchConfig, "--config", str(path))
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert "policies" in error
-    assert wrong in error
-
-
-@pytest.mark.parametrize("wrong", BAD)
-def test_an_invalid_mapping_is_refused_on_the_command_line(wrong, capsys):
-    """The parser may read such a mapping as text, which is then an unknown name."""
+def test_an_invalid_mapping_is_refused(wrong, tmp_path, capsys):
+    """On the command line the parser may read such a mapping as text, which is then an unknown name."""
 
     def run(config):
         for choice in config.policies:
             resolve(choice, "search")
 
-    try:
-        code = run_command(run, SearchConfig, "Policies.", ["--policies", f"[random, {BAD[wrong]}]"])
-    except SystemExit as stopped:
-        code = stopped.code
-    assert code in (1, 2)
-    error = capsys.readouterr().err
-    assert "policies" in error
-    assert wrong in error
+    path = tmp_path / "run.yaml"
+    path.write_text(f"policies:\n- {BAD[wrong]}\n")
+    for given in (["--config", str(path)], ["--policies", f"[random, {BAD[wrong]}]"]):
+        try:
+            code = run_command(run, SearchConfig, "Policies.", given)
+        except SystemExit as stopped:
+            code = stopped.code
+        assert code == 2 or (code == 1 and given[0] == "--policies")
+        error = capsys.readouterr().err
+        assert "policies" in error
+        assert wrong in error

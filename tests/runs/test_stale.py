@@ -19,8 +19,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import SceneResults, finish, gather
 from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
@@ -118,8 +117,7 @@ def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("detector", ["yolov3-tiny"])
-def test_a_deleted_store_file_is_written_identically_with_more_threads(config, detector):
+def test_a_deleted_store_file_is_written_identically_with_more_threads(config):
     run = SearchRun(config)
     finish(run, "searching")
     (file,) = (config.cache / "looks").rglob("*.safetensors")

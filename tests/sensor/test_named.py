@@ -7,16 +7,18 @@ from typing import get_args
 import pytest
 import torch
 
+from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import main as search
 from semfov import ActivePerception, FovealObservationModel, Scanpath
 from semfov.cli.main import main as command
 from semfov.errors import InputError
 from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
-from semfov.runs.config import SensorConfig
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
 from semfov.sensor.named import SensorName
 from tests.colours import write_home
+from tests.small import run_settings
 from train.fit_fom import main as fit_fom
 
 
@@ -76,8 +78,6 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
     config = SensorConfig("dimmed", settings={"share": 0.25})
     assert sensor_of(config.make().settings()).share == 0.25
     assert Dimmed.describe(config.make().settings()) == "share 0.25"
-    with pytest.raises(InputError, match="a sensor with a fovea, got Dimmed, which has none"):
-        config.fovea  # noqa: B018
     monkeypatch.undo()
     with pytest.raises(
         InputError, match=r"the settings of a Foveation or a LogPolar or a MultiScaleFovea, got \{'kind': 'dimmed'"
@@ -89,6 +89,16 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
 def home(tmp_path_factory):
     """A folder with a network and photographs of coloured squares."""
     return write_home(tmp_path_factory.mktemp("log_polar"), 8)
+
+
+def test_a_registered_sensor_without_a_fovea_runs_in_a_study(home, tmp_path, monkeypatch):
+    monkeypatch.setitem(SENSORS, "dimmed", NamedSensor(Dimmed, {"share": 0.5}))
+    data = DataConfig(home / "photographs", home / "photographs" / "instances.json", limit=1, min_instances=0)
+    names = ("random-raw", "closer-look-raw")
+    settings = run_settings(tmp_path, starts=1, shifts=2) | {"data": data, "policies": names}
+    detector = DetectorConfig(str(home / "colours.onnx"))
+    records, _ = ExploreRun(ExploreConfig(detector=detector, sensor=SensorConfig("dimmed"), **settings)).outcomes(0)
+    assert {record["policy"] for record in records} >= set(names)
 
 
 def given(home, out, *more):

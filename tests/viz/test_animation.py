@@ -14,8 +14,8 @@ from PIL import Image
 
 from semfov import Detections, Grid, InputError
 from semfov.viz import animate, plot_fixation
-from semfov.viz.animation import _episode_frames, _in_one_palette, _save_animation, render
-from semfov.viz.fixation import FixationFigure
+from semfov.viz.animation import Film, _in_one_palette, _look_frames, render
+from semfov.viz.fixation import LookFigure, views_of
 from tests import small
 
 
@@ -43,7 +43,7 @@ def frames():
 
 
 def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
-    _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    Film(frames, 0.5, 1.5).save(tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3
         for number, (shade, duration) in enumerate([(0, 500), (100, 500), (200, 2000)]):
@@ -54,7 +54,7 @@ def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
 def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
-    _, path = _save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
+    _, path = Film(frames, 0.5, 1.5).save(tmp_path / "a.gif")
     command = ["ffmpeg", "-loglevel", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(command, capture_output=True, check=True).stdout, np.uint8)
     shown = pixels.reshape(-1, 32, 42, 3)[:, 10, 10, 0]
@@ -64,13 +64,13 @@ def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
 
 def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert _save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
+    assert Film(frames).save(tmp_path / "a.gif") == [tmp_path / "a.gif"]
 
 
 def test_frames_equal_figures_drawn_one_by_one(searched):
     """All frames are drawn with one figure, but each equals the figure of `plot_fixation`."""
     scanpath, image, views = searched
-    frames = _episode_frames(scanpath, image, views)
+    frames = _look_frames(scanpath, image, views)
     assert len(frames) == len(scanpath)
     for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
         (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
@@ -83,11 +83,12 @@ def test_frames_equal_figures_drawn_one_by_one(searched):
 
 def test_frames_do_not_depend_on_earlier_frames(searched):
     scanpath, image, views = searched
-    figure = FixationFigure(scanpath, image, views[0])
-    (last,) = render([figure.show(2, views[2])])
+    seen = views_of(scanpath, image, views)
+    figure = LookFigure(scanpath, image, seen[0])
+    (last,) = render([figure.show(2, seen[2])])
     for number in (0, 1):
-        figure.show(number, views[number])
-    (again,) = render([figure.show(2, views[2])])
+        figure.show(number, seen[number])
+    (again,) = render([figure.show(2, seen[2])])
     np.testing.assert_array_equal(last, again)
 
 
@@ -114,7 +115,7 @@ def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_pa
 
 def test_frames_share_their_colours(searched):
     """Parts that do not change must not flicker."""
-    first, *others = _in_one_palette(_episode_frames(*searched))
+    first, *others = _in_one_palette(_look_frames(*searched))
     assert all(frame.getpalette() == first.getpalette() for frame in others)
 
 

@@ -12,20 +12,16 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from semfov import Detections, Grid, InputError, Scanpath
 from semfov.decision import Decision
-from semfov.gaze.saliency import cell_saliency
-from semfov.metrics.calibration import BinarySums
 from semfov.viz import (
     COLOURS,
     plot_belief,
     plot_belief_bars,
     plot_belief_strip,
-    plot_cell_reliability,
     plot_cumulative_performance,
     plot_episode,
     plot_fixation,
     plot_foveated_strip,
     plot_reliability,
-    plot_saliency,
     plot_scanpath,
     plot_success_rate,
 )
@@ -235,20 +231,6 @@ def test_plot_of_a_fixation_shows_scanpath_view_and_belief(scanpath, image):
     assert explored.axes[2].get_title() == "semantic map after fixation 1"
 
 
-def test_saliency_frames_the_most_salient_cell(image):
-    saliency = torch.rand(30, 40)
-    saliency[25, 33] = 2
-    grid = Grid(4, 3, (80, 60))
-    picture, whole, cells, *_ = draw(plot_saliency(saliency, image, grid=grid)).axes
-    np.testing.assert_allclose(np.asarray(picture.images[0].get_array()), image.permute(1, 2, 0))
-    np.testing.assert_allclose(np.asarray(whole.images[0].get_array()), saliency)
-    expected = cell_saliency(saliency[None], 4, 3, "max")[0]
-    np.testing.assert_allclose(np.asarray(cells.images[0].get_array()).ravel(), expected)
-    (frame,) = cells.patches
-    assert frame.get_bbox().bounds == (60, 40, 20, 20)
-    assert len(draw(plot_saliency(saliency, image)).axes) == 3  # photograph, map, its scale
-
-
 def test_figures_do_not_depend_on_matplotlib_settings():
     import matplotlib as mpl
 
@@ -293,22 +275,3 @@ def test_reliability_of_a_calibrated_model_lies_on_the_diagonal():
     axes = draw(plot_reliability({"perfect": (probabilities, labels)})).axes[0]
     x, y = axes.lines[1].get_data()
     np.testing.assert_allclose(x, y, atol=0.03)
-
-
-def test_reliability_of_cells_lies_on_the_diagonal_in_log_odds():
-    torch.manual_seed(0)
-    p = torch.rand(200_000, dtype=torch.float64) ** 3
-    sums = BinarySums.of(p, torch.rand(len(p)) < p)
-    few = BinarySums.of(p[:5], p[:5] > 2)
-    panels = {"after 1 look": {"right": sums.bins, "rare": few.bins}, "after 5 looks": {"right": sums.bins}}
-    errors = {"right": {"fixated": 0.01, "others": 0.02}, "rare": {"fixated": 0.2, "others": 0.1}}
-    first, second, last = draw(plot_cell_reliability(panels, errors, groups="cells")).axes
-    for axes in (first, second):
-        assert (axes.get_xscale(), axes.get_yscale()) == ("logit", "logit")
-        x, y = axes.lines[1].get_data()
-        assert len(x) > 18
-        np.testing.assert_allclose(x, y, atol=0.02)
-    assert len(first.lines[2].get_xdata()) == 0
-    assert [axes.get_title() for axes in (first, second)] == list(panels)
-    assert [list(line.get_ydata()) for line in last.lines] == [list(each.values()) for each in errors.values()]
-    assert [line.get_color() for line in last.lines] == [line.get_color() for line in first.lines[1:]]

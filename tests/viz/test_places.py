@@ -12,7 +12,6 @@ from PIL import Image
 
 from semfov import InputError, viz
 from semfov.errors import DataError
-from semfov.metrics.calibration import BinarySums
 
 CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
 
@@ -22,27 +21,22 @@ def calls(scanpath):
     image = torch.rand(3, 60, 80)
     views = [image] * 3
     p = torch.rand(500, 1)
-    sums = BinarySums.of(p[:, 0].double(), torch.rand(500) < p[:, 0]).bins
     return {
         "plot_belief": ((scanpath,), {"image": image}, "ax"),
         "plot_belief_bars": ((scanpath,), {}, 3),
         "plot_belief_strip": ((scanpath,), {"image": image}, 3),
-        "plot_cell_reliability": (({"one": {"a": sums}}, {"a": {"x": 0.1}}), {"groups": "cells"}, 2),
         "plot_cumulative_performance": ((CURVES,), {}, "ax"),
-        "plot_curve_panels": (({"a": (CURVES, {}), "b": (CURVES, {})},), {"label": "found"}, 2),
         "plot_episode": ((scanpath, image, views), {}, "figure"),
         "plot_fixation": ((scanpath, 1, image, image), {}, 3),
         "plot_foveated_strip": ((scanpath, views), {}, 3),
         "plot_reliability": (({"one": (torch.cat([p, 1 - p], 1), torch.zeros(500, dtype=torch.long))},), {}, 2),
-        "plot_roc": (({"one": torch.rand(40)}, torch.arange(40) < 20), {}, 2),
-        "plot_saliency": ((torch.rand(30, 40), image), {"grid": scanpath.grid}, 3),
         "plot_scanpath": ((scanpath, image), {}, "ax"),
         "plot_semantic_map": ((scanpath,), {"image": image}, 2),
         "plot_success_rate": ((CURVES,), {}, "ax"),
     }
 
 
-NAMES = [name for name in viz.__all__ if name.startswith("plot_") and name != "plot_zoom_path"]
+NAMES = [name for name in viz.__all__ if name.startswith("plot_")]
 
 
 @pytest.mark.parametrize("name", NAMES)

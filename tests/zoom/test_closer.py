@@ -255,7 +255,7 @@ def test_the_verification_is_saved_with_the_evidence(tmp_path):
     assert again.verification.thresholds == AT
     assert torch.equal(again.verification.linear.weight, model.verification.linear.weight)
     tensors, record = read(tmp_path / "own.safetensors", "glimpse-evidence")
-    # Files of earlier versions have neither tensors nor record of a verification.
+    # Evidence without a verification has neither tensors nor record of one.
     old = {name: tensor for name, tensor in tensors.items() if not name.startswith("verification")}
     write_file(
         tmp_path / "old.safetensors", old, {name: each for name, each in record.items() if name != "verification"}

@@ -174,6 +174,6 @@ def test_a_path_has_a_text_and_an_html_form(eye, picture):
     assert drawing.find("image") is not None
     assert len(drawing.findall("text")) == path.passes - 1
     for number in range(path.passes):
-        box, action = path.region(number), path.glances[number].window
+        box, action = path.looks[number].region, path.glances[number].window
         x1, y1, x2, y2 = path.lattice.boxes(torch.tensor([action.level, *action.cells[:2]])).tolist()
         assert box == pytest.approx((max(x1, 0), max(y1, 0), min(x2, 1024), min(y2, 768)), abs=1e-3)

@@ -5,10 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-import semfov
 from semfov.errors import InputError
 from semfov.sensor.glimpse import glimpse, windows_at
-from semfov.zoom import WindowEye, WindowView
+from semfov.zoom import WindowEye
 from semfov.zoom.eye import BORDER
 
 
@@ -166,12 +165,3 @@ def test_settings_include_the_treatment_of_cut_boxes(detector):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.full((1, 3), torch.nan))
     with pytest.raises(InputError, match="fixations: expected positive magnifications"):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.tensor([[3.0, 4.0, -1.0]]))
-
-
-@pytest.mark.parametrize(
-    ("module", "old", "new"),
-    [(semfov, "ZoomEye", WindowEye), (semfov.zoom, "ZoomEye", WindowEye), (semfov.zoom, "ZoomView", WindowView)],
-)
-def test_former_names_of_the_eye_work_and_warn(module, old, new):
-    with pytest.warns(DeprecationWarning, match=f"{module.__name__}.{old} is now {module.__name__}.{new.__name__}"):
-        assert getattr(module, old) is new

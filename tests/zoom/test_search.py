@@ -12,7 +12,7 @@ from semfov.agents import ZoomAgent
 from semfov.data.large import open_large
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.viz.zoom import plot_zoom_path
+from semfov.viz import plot_scanpath
 from semfov.zoom import GlimpseEvidence, WindowEye, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 from semfov.zoom.lattice import Lattice
@@ -106,12 +106,12 @@ def test_zooming_pays_only_for_large_pictures(agent, picture):
 
 def test_a_path_can_be_plotted_in_new_and_in_given_axes(agent, picture):
     path = agent.search(picture, "red", passes=4)
-    figure = plot_zoom_path(path, picture)
+    figure = plot_scanpath(path, picture)
     assert len(figure.axes) == 1
     assert path.describe().startswith("red: ")
     mine = Figure()
     given, other = mine.subplots(1, 2)
-    assert plot_zoom_path(path, picture, ax=given) is mine
+    assert plot_scanpath(path, picture, ax=given) is mine
     assert given.get_title() == figure.axes[0].get_title()
     assert [len(given.patches), len(given.texts)] == [len(figure.axes[0].patches), len(figure.axes[0].texts)]
     assert not other.images

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from semfov.agents import ZoomAgent
-from semfov.agents.limits import EpisodeLimits
+from semfov.agents.episode import EpisodeLimits
 from semfov.errors import InputError
 from semfov.zoom import WindowEye
 from semfov.zoom.glances import LiveGlances

@@ -10,7 +10,6 @@ from semfov import ActivePerception
 from semfov.agents import ZoomAgent
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.live import WindowPerception
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.objects import without_replaced
@@ -40,7 +39,7 @@ def agent(detector):
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, picture, target, one_thread):
     path = agent.find_all(picture, target, passes=9)
     targets = {None: (), 3: (3,)}.get(target) if not isinstance(target, list) else tuple(target)
-    live = WindowPerception(agent, None, targets, rate=0)
+    live = agent.episode(None, targets, rate=0)
     moments = [live.step(picture) for _ in path.glances]
     same_looks(moments, path)
     assert moments[-1].decision is None
@@ -54,7 +53,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, pict
     model = {"closely": evidence(), "plain": GlimpseEvidence(3, 8), "slices": None}[kind]
     agent = ZoomAgent(WindowEye(detector), model).eval()
     path = agent.search(picture, "red")
-    live = WindowPerception(agent, 1, rate=0)
+    live = agent.episode(1, rate=0)
     moments = [live.step(picture) for _ in path.glances]
     same_looks(moments, path)
     last = moments[-1]
@@ -72,7 +71,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     image[1, 320:344, 640:664] = 1
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     path = agent.search(image, "red", closer=2)
-    live = WindowPerception(agent, 1, rate=0, closer=2)
+    live = agent.episode(1, rate=0, closer=2)
     moments = [live.step(image) for _ in path.glances]
     same_looks(moments, path)
     assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
@@ -80,7 +79,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
 
 
 def test_windows_are_looked_at_again_after_the_half_life_of_evidence(agent, picture):
-    live, last = WindowPerception(agent, rate=math.log(2) / 4.5), {}
+    live, last = agent.episode(rate=math.log(2) / 4.5), {}
     overviews = []
     for number in range(30):
         moment = live.step(picture)
@@ -105,8 +104,8 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
         image[0, 320:352, x : x + 32] = 1
         return image
 
-    live = WindowPerception(agent, rate=0.04)
-    kept = WindowPerception(agent, rate=0)
+    live = agent.episode(rate=0.04)
+    kept = agent.episode(rate=0)
     for x in [160] * 24 + [800] * 20:
         moment, old = live.step(frame(x)), kept.step(frame(x))
         if x == 160:
@@ -120,7 +119,7 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
 
 def test_a_found_target_is_lost_when_it_leaves(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence())
-    live = WindowPerception(agent, 1, rate=0.1)
+    live = agent.episode(1, rate=0.1)
     found = [live.step(picture).decision.outcome for _ in range(12)]
     gone = [live.step(torch.zeros_like(picture)).decision for _ in range(20)]
     assert "found" in found

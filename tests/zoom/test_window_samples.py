@@ -7,10 +7,9 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.fit.observation import _count_misses
+from semfov.fit.observation import FitObservationConfig, _count_misses
 from semfov.observation.matching import box_iou
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.samples import SampleSettings
+from semfov.runs.config import DataConfig
 from semfov.runs.zoom_samples import MosaicSampler, _choose_windows, _HeldOutMosaics
 from semfov.zoom.lattice import Lattice
 
@@ -51,8 +50,8 @@ def sampler(detector, monkeypatch, tmp_path):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: detector)
     monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
-    settings = SampleSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
-    return MosaicSampler(settings, tmp_path)
+    config = FitObservationConfig(data=data, fixations=2, shard=1, mosaics=2, holdout=2)
+    return MosaicSampler(config, tmp_path)
 
 
 @pytest.mark.slow

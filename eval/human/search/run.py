@@ -18,8 +18,8 @@ from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Episode, looks_of, run_episodes, tie_noise
+from semfov.runs.scene_run import ResultRecord
+from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
 
 
@@ -104,18 +104,18 @@ class PeopleSearchRun(PolicyLooking):
         goal = tuple(y * grid.columns + x for y in range(top, bottom + 1) for x in range(left, right + 1))
         start = int(grid.cell_of(torch.tensor(self.config.screen.start)))
         (target,) = self.scenes.targets(index)
-        episode = Episode(index, target, target, 0, start, goal, True)
+        episode = Trial(index, target, target, 0, start, goal, True)
         looks = looks_of([episode], detections, grid)
         noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
         records: list[ResultRecord] = []
         for policy in self.policies:
             candidate = self.candidate(policy, index)
             with torch.inference_mode():
-                (outcome,) = run_episodes(
+                ((cells, found_at),) = run_episodes(
                     [episode], candidate, looks, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(policy)
-            path = {"cells": list(outcome.cells), "found_at": outcome.found_at}
+            path = {"cells": cells, "found_at": found_at}
             records.append({"policy": policy, "scene": name, "target_name": search.target, **path})
         return records, watch.seconds
 

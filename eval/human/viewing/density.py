@@ -11,11 +11,11 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional as F
 
+from eval.human.habits.gaze_habits import standardised as over_cells
+from eval.human.habits.log_linear import fit_log_linear
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.errors import check
-from semfov.gaze.habits import standardised as over_cells
-from semfov.gaze.log_linear import fit_log_linear
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def log_densities(terms: Sequence[Tensor], weights: Tensor) -> Tensor:
 
 
 def fit_density(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float = 0.0) -> DensityWeights:
-    """Fit the weights of a density by maximum likelihood (`semfov.gaze.log_linear`).
+    """Fit the weights of a density by maximum likelihood (`eval.human.habits.log_linear`).
 
     Args:
         names: names of the terms.

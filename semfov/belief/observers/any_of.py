@@ -129,19 +129,16 @@ class AnyOf(Observer):
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> AnyBelief:
         """Fade the beliefs of the inner observer."""
-        belief, look = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
-        pairs = zip(belief.inner, look.inner, strict=True)
-        return _with(belief, tuple(self.observer.fade(each, of, keep, visited) for each, of in pairs))
+        return self._each(belief, look, lambda each, of: self.observer.fade(each, of, keep, visited))
 
     def update(self, belief: Belief, look: Look) -> AnyBelief:
         """Update the beliefs of the inner observer."""
+        return self._each(belief, look, self.observer.update)
+
+    def _each(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> AnyBelief:
         belief, look = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
-        pairs = zip(belief.inner, look.inner, strict=True)
-        return _with(belief, tuple(self.observer.update(each, of) for each, of in pairs))
-
-
-def _with(belief: AnyBelief, inner: tuple[Belief, ...]) -> AnyBelief:
-    return replace(belief, inner=inner, closest=inner[0].closest)
+        inner = tuple(change(each, of) for each, of in zip(belief.inner, look.inner, strict=True))
+        return replace(belief, inner=inner, closest=inner[0].closest)
 
 
 def class_meant(belief: Belief, target: int) -> int:

@@ -15,16 +15,10 @@ from semfov.belief.evidence import Evidence, farther, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
 
-_READ = ("closest", "score", "looks", "visited")
-"""Gathered values that the networks read without change, in the order of `Gathered`."""
-
 
 @dataclass(frozen=True)
 class EvidenceLook(Look):
-    """Evidence of looks about one class in every cell, or about T classes at once.
-
-    Shapes: evidence `(B, X·Y)`, distance `(B, X·Y)`, score `(B,)`, fixated `(B,)`, target `(B,)`.
-    """
+    """Evidence `(B, X·Y)` of looks about one class, or `(B, T, X·Y)` about T classes at once."""
 
     evidence: Tensor
     distance: Tensor
@@ -36,10 +30,7 @@ class EvidenceLook(Look):
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
-    """Base of beliefs that are computed from the evidence of all looks, about one class or about each of K classes.
-
-    Shapes: closest `(B, X·Y)`, nearest `(B, X·Y)`, weight `(B, X·Y)`, score `(B,)`, looks `(B,)`, visited `(B, X·Y)`.
-    """
+    """Base of beliefs that are computed from the evidence of all looks, about one class or each of K classes."""
 
     closest: Tensor
     nearest: Tensor
@@ -61,17 +52,7 @@ class Gatherer(Observer):
         self.together = together
 
     def nothing(self, batch: int, grid: Grid, like: Tensor, *classes: int) -> dict[str, Tensor]:
-        """Gathered evidence before the first look.
-
-        Args:
-            batch: B, number of episodes.
-            grid: the cells.
-            like: a tensor that gives dtype and device.
-            classes: number of rows for each episode, where 1 broadcasts to any number; left out for a single class.
-
-        Returns:
-            The attributes of `GatheredBelief`.
-        """
+        """Gathered evidence before the first look, for one class, or with a row for each of several `classes`."""
         cells, each = like.new_zeros(batch, len(grid)), like.new_zeros(batch, *classes, len(grid))
         return {
             "closest": cells + torch.inf,
@@ -85,15 +66,7 @@ class Gatherer(Observer):
         }
 
     def gather(self, belief: GatheredBelief, look: EvidenceLook) -> dict[str, Tensor]:
-        """Gather the evidence of one more look in each episode.
-
-        Args:
-            belief: the belief so far.
-            look: the evidence of the look.
-
-        Returns:
-            The attributes of `GatheredBelief`.
-        """
+        """Gather the evidence of one more look in each episode: the attributes of `GatheredBelief`."""
 
         def by_cell(values: Tensor) -> Tensor:
             """`(B, X·Y)`, the same for all classes."""
@@ -115,18 +88,16 @@ class Gatherer(Observer):
         """Inputs of the networks: the attributes of `Gathered` up to the class, for one class or several."""
         total, weight = gathered["total"], gathered["weight"]
         mean = total / (weight if total.ndim == weight.ndim else weight[:, None])
-        return [gathered["nearest"], gathered["best"], mean, *(gathered[name] for name in _READ)]
+        unchanged = (gathered[name] for name in ("closest", "score", "looks", "visited"))
+        return [gathered["nearest"], gathered["best"], mean, *unchanged]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
         r"""Discount the gathered evidence, and count the closest look as one from farther away; see `Observer.fade`.
 
-        Let r = -ln k. The evidence for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards :math:`e_0`, the
-        evidence of a look from far away without detections. Looks are weighted by their nearness :math:`e^{-d/R}`
-        (`semfov.belief.evidence.nearness`), which is multiplied by k. For the closest look this means
-        :math:`d \leftarrow d + r R`, so that in time a new look from farther away takes its place.
-
-        Returns:
-            The faded belief.
+        The evidence for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards :math:`e_0`, that of a look from
+        far away without detections. The weight of a look, :math:`e^{-d/R}` (`nearness`), is multiplied by k. For the
+        closest look this means :math:`d \leftarrow d - R \ln k`, so that in time a new look from farther away takes its
+        place.
         """
         if keep == 1:
             return belief

@@ -99,12 +99,13 @@ class LearnedMap(Gatherer):
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> MapLook:
         """Evidence for all classes, the same for every target."""
         targets = torch.arange(1, len(self.model.prior), device=fixation.device)
-
-        def evidence(boxes: Tensor, scores: Tensor, mask: Tensor, point: Tensor) -> Tensor:
-            return self.model(Detections(boxes, scores, mask), point, grid, targets)
-
-        rows = detections.boxes, detections.scores, detections.mask, fixation
-        by_class = self.each(evidence, *rows)
+        by_class = self.each(
+            lambda boxes, scores, mask, point: self.model(Detections(boxes, scores, mask), point, grid, targets),
+            detections.boxes,
+            detections.scores,
+            detections.mask,
+            fixation,
+        )
         every = targets.expand(len(fixation), -1)
         where = grid.distance(fixation), highest_score(detections, targets), grid.cell_of(fixation)
         return MapLook(by_class, *where, every, grid.columns, torch.ones_like(every))
@@ -134,20 +135,9 @@ class LearnedMap(Gatherer):
     ) -> Tensor:
         """Probabilities `(B, X·Y, T+1)` from the gathered evidence."""
         classes = nearest.shape[1]
-
-        def of_class(values: Tensor) -> Tensor:
-            return values.repeat_interleave(classes, 0)
-
-        rows = Gathered(
-            nearest.flatten(0, 1),
-            best.flatten(0, 1),
-            mean.flatten(0, 1),
-            of_class(closest),
-            score.flatten(),
-            of_class(looks),
-            of_class(visited),
-            targets.flatten(),
-        )
+        nearest, best, mean = (values.flatten(0, 1) for values in (nearest, best, mean))
+        distance, number, seen = (values.repeat_interleave(classes, 0) for values in (closest, looks, visited))
+        rows = Gathered(nearest, best, mean, distance, score.flatten(), number, seen, targets.flatten())
         cells = self.model.log_odds(rows, columns, classes)
         nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
         return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -16,16 +16,9 @@ from semfov.belief.likelihood import Observation, likelihoods
 from semfov.belief.observers.base import Look, Observer, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
+from semfov.observation.foveal import FovealObservationModel
 
 CellMemory = Literal["all", "closest"]
-
-
-class _MissLikelihood(Protocol):
-    """Protocol of a model of miss rates, as `semfov.FovealObservationModel` is one."""
-
-    def miss_likelihood(self, distance: Tensor) -> Tensor:
-        """Likelihood `(..., K+1)` of every class where nothing was detected, at distances `(...)`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -51,15 +44,11 @@ class SemanticLook(Look):
     def join(cls, looks: Sequence["SemanticLook"]) -> "SemanticLook":
         """Concatenate several batches of looks, padded to the largest number of detections."""
         most = max(look.likelihood.shape[-2] for look in looks)
-
-        def filled(values: Tensor) -> Tensor:
-            return pad(values, (0, 0, 0, most - values.shape[-2]))
-
-        return cls(
-            torch.cat([filled(look.likelihood) for look in looks]),
-            torch.cat([filled(look.footprint) for look in looks]),
-            torch.cat([look.distance for look in looks]),
+        likelihood, footprint = (
+            torch.cat([pad(each, (0, 0, 0, most - each.shape[-2])) for each in values])
+            for values in ([look.likelihood for look in looks], [look.footprint for look in looks])
         )
+        return cls(likelihood, footprint, torch.cat([look.distance for look in looks]))
 
 
 class Semantic(Observer):
@@ -97,7 +86,7 @@ class Semantic(Observer):
     """
 
     observation: Observation | None
-    misses: _MissLikelihood | None
+    misses: FovealObservationModel | None
 
     def __init__(
         self,
@@ -109,7 +98,7 @@ class Semantic(Observer):
         footprint: Footprint = "overlap",
         tempering: float = 1.0,
         memory: CellMemory = "all",
-        misses: _MissLikelihood | None = None,
+        misses: FovealObservationModel | None = None,
     ) -> None:
         super().__init__()
         check(prior > 0, "prior", "a positive number", prior)

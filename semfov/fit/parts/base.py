@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Observer, Semantic
-from semfov.fit.detector_settings import FitDetectorConfig
+from semfov.fit.settings import FitConfig, FitDetectorConfig
 from semfov.gaze.policies import Policy
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
@@ -23,6 +23,8 @@ from semfov.runs.looking import Looking
 from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
+
+_Config = TypeVar("_Config", bound=FitConfig)
 
 _FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
@@ -51,31 +53,20 @@ class PartInputs:
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.config, self.run = config.sized(len(run.scenes)), run
         self.components = len(run.scenes.classes) + 1
-        self.holdout = self.config.holdout or 5
-        self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
+        self.absent = 2 if self.components <= _FEW else None
+        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
+        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
+        self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
+        """The protocol of the searches and explorations that are compared."""
+        self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
+        self.judged: Sequence[int] = self.held_out[: self.config.judged]
+        """The held-out photographs on which searches and explorations are compared."""
         self.results: dict[str, PartResult] = {}
 
-    @property
-    def common(self) -> dict[str, Any]:
-        """Settings that all parts but the one for large pictures have in common."""
-        names = ("data", "detector", "sensor", "columns", "rows", "seed", "out")
-        return {name: getattr(self.config, name) for name in names}
-
-    @property
-    def absent(self) -> int | None:
-        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
-        return 2 if self.components <= _FEW else None
-
-    @property
-    def judged(self) -> Sequence[int]:
-        """Indices of the held-out photographs on which searches and explorations are compared."""
-        return self.held_out[: self.config.judged]
-
-    @property
-    def protocol(self) -> ProtocolConfig:
-        """The protocol of these searches and explorations."""
-        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
-        return ProtocolConfig(shifts=shifts, seed=self.config.seed)
+    def settings(self, kind: type[_Config], **own: Any) -> _Config:
+        """The settings of a part: those of the whole fit by their names, except its `own`."""
+        names = {each.name for each in fields(kind)} & {each.name for each in fields(self.config)}
+        return kind(**{name: getattr(self.config, name) for name in names} | own)
 
     def model(self, name: str) -> FolderModel | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""

@@ -82,12 +82,12 @@ class WindowsFit(PartFit):
 
     def mosaics(self, photographs: int) -> FitZoomConfig:
         """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
-        own, held_out = self.config, -(-photographs // self.inputs.holdout)
+        own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
         training = min(photographs - held_out, _FOR_MOSAICS)
         return FitZoomConfig(
             data=own.data,
             detector=own.detector,
-            holdout=self.inputs.holdout,
+            holdout=own.holdout or 5,
             mosaics=max(1, training // 5),
             far=max(1, training // 60),
             crowded=max(1, training // 10),

@@ -17,7 +17,6 @@ from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Static, Uniform
-from semfov.gaze.acquisition.templates import TemplateAttention
 
 __all__ = [
     "AcquisitionFunction",
@@ -38,7 +37,6 @@ __all__ = [
     "SaliencyPrior",
     "Static",
     "TargetPosterior",
-    "TemplateAttention",
     "TwoPeaks",
     "Uniform",
     "UpperConfidenceBound",

@@ -1,7 +1,5 @@
 """Exploration that looks where most additional cells are expected to be classified correctly."""
 
-from typing import Protocol
-
 from torch import Tensor
 
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
@@ -11,12 +9,8 @@ from semfov.belief.observers.base import own
 from semfov.belief.observers.learned_map import MapBelief
 from semfov.errors import InputError, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.lookahead import LevelledModel, at_levels
-from semfov.gaze.acquisition.place import MissModel
-
-
-class SightedModel(LevelledModel, MissModel, Protocol):
-    """The part of an observation model that `ExpectedAccuracy` needs (`semfov.FovealObservationModel`)."""
+from semfov.gaze.acquisition.lookahead import at_levels
+from semfov.observation.foveal import FovealObservationModel
 
 
 class ExpectedAccuracy(AcquisitionFunction):
@@ -56,7 +50,7 @@ class ExpectedAccuracy(AcquisitionFunction):
     miss: Tensor
     named: Tensor
 
-    def __init__(self, model: SightedModel, grid: Grid) -> None:
+    def __init__(self, model: FovealObservationModel, grid: Grid) -> None:
         super().__init__()
         if model.miss_rate is None:
             raise InputError("model: expected an observation model with miss rates, got one without them")
@@ -107,7 +101,10 @@ class ExpectedGain(AcquisitionFunction):
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
         belief = own(belief, MapBelief, "belief")
-        return one_by_one(self._values, belief.probabilities, belief.closest, belief.looks)
-
-    def _values(self, probabilities: Tensor, closest: Tensor, looks: Tensor) -> Tensor:
-        return self.model.gain(probabilities, closest, looks, self.distance.to(closest)).sum(-1)
+        distance = self.distance.to(belief.closest)
+        return one_by_one(
+            lambda probabilities, closest, looks: self.model.gain(probabilities, closest, looks, distance).sum(-1),
+            belief.probabilities,
+            belief.closest,
+            belief.looks,
+        )

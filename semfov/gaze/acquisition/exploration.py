@@ -14,8 +14,9 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import check
-from semfov.gaze.acquisition.lookahead import LevelledModel, Lookahead, Outlook
+from semfov.gaze.acquisition.lookahead import Lookahead, Outlook
 from semfov.observation.dirichlet import kl_from_symmetric
+from semfov.observation.foveal import FovealObservationModel
 
 
 class KLDivergence(Lookahead):
@@ -50,7 +51,7 @@ class KLDivergence(Lookahead):
     """
 
     def __init__(
-        self, model: LevelledModel, grid: Grid, *, prior: float = 0.5, likelihoods: Tensor | None = None
+        self, model: FovealObservationModel, grid: Grid, *, prior: float = 0.5, likelihoods: Tensor | None = None
     ) -> None:
         super().__init__(model, grid, likelihoods=likelihoods)
         check(prior > 0, "prior", "a positive number", prior)
@@ -172,18 +173,21 @@ class UpperConfidenceBound(Lookahead):
     torch.Size([3])
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, kappa: float = 2.0) -> None:
+    def __init__(self, model: FovealObservationModel, grid: Grid, *, kappa: float = 2.0) -> None:
         super().__init__(model, grid)
         check(kappa >= 0, "kappa", "0 or more", kappa)
         self.kappa = kappa
 
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Increase of the bound."""
-        after = self._bound(outlook.next_mean.amax(-1), outlook.next_total)
-        return after - self._bound(outlook.mean.amax(-1), outlook.total)[..., None]
-
-    def _bound(self, peak: Tensor, total: Tensor) -> Tensor:
-        return peak + self.kappa * deviation(peak, total)
+        after, before = (
+            peak + self.kappa * deviation(peak, total)
+            for peak, total in (
+                (outlook.next_mean.amax(-1), outlook.next_total),
+                (outlook.mean.amax(-1), outlook.total),
+            )
+        )
+        return after - before[..., None]
 
 
 class ProbabilityOfImprovement(Lookahead):
@@ -212,7 +216,7 @@ class ProbabilityOfImprovement(Lookahead):
     tensor(1)
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, margin: float = 0.0) -> None:
+    def __init__(self, model: FovealObservationModel, grid: Grid, *, margin: float = 0.0) -> None:
         super().__init__(model, grid)
         check(0 <= margin < 1, "margin", "at least 0 and less than 1", margin)
         self.margin = margin
@@ -225,16 +229,10 @@ class ProbabilityOfImprovement(Lookahead):
 
 
 def divergence(outlook: Outlook) -> Tensor:
-    r"""Divergence of the predicted means from the present ones.
+    r"""Divergence of the predicted means from the present ones, in nats, `(..., X·Y, N)`.
 
     It is computed as :math:`\sum_k p_k ((1 + e_k) \ln(1 + e_k) - e_k)` with :math:`e_k = p'_k / p_k - 1`. No term of
     this sum is negative, so small divergences are not differences of large numbers.
-
-    Args:
-        outlook: present and predicted belief.
-
-    Returns:
-        `(..., X·Y, N)`, in nats.
     """
     growth = outlook.growth
     change = growth.log1p()
@@ -243,13 +241,7 @@ def divergence(outlook: Outlook) -> Tensor:
 
 
 def lead(mean: Tensor) -> Tensor:
-    """Margin of the most probable class: its probability minus the second largest one.
-
-    >>> lead(torch.tensor([0.2, 0.5, 0.3]))
-    tensor(0.2000)
-
-    Shapes: mean `(..., K+1)`.
-    """
+    """Margin of the most probable class of means `(..., K+1)`: its probability minus the second largest one."""
     first, place = mean.max(-1, keepdim=True)
     return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)
 

@@ -1,7 +1,6 @@
 """Acquisition functions of ideal searchers, which know how visible the target is from every fixation."""
 
 from abc import abstractmethod
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,18 +9,11 @@ from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.observation.separation import ScoringModel, visibility
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.separation import visibility
 
 # Where nothing is visible the answer is a guess: with this signal each of n equal cells is right with 1/n.
 _LEAST_SIGNAL = 1e-4
-
-
-class SignalModel(ScoringModel, Protocol):
-    """The part of an observation model that these functions need (`semfov.FovealObservationModel`)."""
-
-    def level(self, distance: Tensor) -> Tensor:
-        """Level of each distance, `(...)` from 0 to N - 1."""
-        ...
 
 
 class _SignalSearch(AcquisitionFunction):
@@ -29,14 +21,12 @@ class _SignalSearch(AcquisitionFunction):
 
     The prior of the target's place is its probability in every cell by the belief, scaled to sum to 1 over the cells
     not yet fixated: in a search that continues, no fixated cell held the target.
-
-    Shapes: target `(B,)`, signal `(..., f, x)`.
     """
 
     target: Tensor
     signal: Tensor
 
-    def __init__(self, target: int | Tensor, model: SignalModel, grid: Grid) -> None:
+    def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid) -> None:
         super().__init__()
         self.register_buffer("target", torch.as_tensor(target))
         level = model.level(grid.cell_distance)
@@ -113,7 +103,7 @@ class CorrectLocalisation(_SignalSearch):
     tensor(1)
     """
 
-    def __init__(self, target: int | Tensor, model: SignalModel, grid: Grid, *, nodes: int = 64) -> None:
+    def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid, *, nodes: int = 64) -> None:
         super().__init__(target, model, grid)
         check(nodes >= 8, "nodes", "8 or more", nodes)
         self.nodes = nodes
@@ -128,14 +118,7 @@ class CorrectLocalisation(_SignalSearch):
 
 
 def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
-    """Probability that the most probable cell after a look is that of the target; see `CorrectLocalisation`.
-
-    >>> even = torch.full((4,), 0.25)
-    >>> correct_localisation(even, torch.zeros(4)), correct_localisation(even, torch.full((4,), 9.0))
-    (tensor(0.2500), tensor(1.0000))
-
-    Shapes: place `(..., X·Y)`, signal `(..., X·Y)`.
-    """
+    """`CorrectLocalisation` for one fixation, from the prior of the place and d' `(..., X·Y)` → `(...)`."""
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
     weight = (-noise.square() / 2).softmax(0)
     d = signal.clamp(min=_LEAST_SIGNAL)

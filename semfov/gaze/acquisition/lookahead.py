@@ -1,41 +1,28 @@
-"""One-step lookahead: the belief about the whole map after the scores that are expected of a fixation."""
+"""One-step lookahead: the belief about the whole map after the scores that are expected of a fixation, or drawn."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
-from semfov.errors import check, check_shape
+from semfov.errors import InputError, check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.observation.foveal import FovealObservationModel
 from semfov.threads import one_thread_if_small
 
 _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, however many there are
 
 
-class LevelledModel(Protocol):
-    """The part of an observation model that the lookahead needs (`semfov.FovealObservationModel`)."""
-
-    def level(self, distance: Tensor) -> Tensor:
-        """Level of each distance, `(...)` from 0 to N - 1."""
-        ...
-
-    def expected_scores(self) -> Tensor:
-        """Expected scores `E[S | class k, level n]`, `(K+1, N, K+1)`."""
-        ...
-
-
 @dataclass(frozen=True)
 class Outlook:
-    """The present belief, and the belief after one more look from each level of distance.
+    """The present belief, and the belief after one more look from each of N levels of distance.
 
     The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
-    and N M in place of N below.
-
-    Shapes: beta `(..., X·Y, K+1)`, total `(..., X·Y)`, mean `(..., X·Y, K+1)`, evidence `(..., X·Y, N, K+1)`.
+    and N M in place of N. Evidence r is `(..., X·Y, N, K+1)`.
     """
 
     beta: Tensor
@@ -67,7 +54,7 @@ class Outlook:
 
 
 def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
-    r"""Simulate Kaplan's update of every cell with the scores expected at every level of distance.
+    r"""Simulate Kaplan's update of every cell `(..., X·Y, K+1)` with the expected scores `(K+1, N, K+1)`.
 
     .. math:: \bar S_n = \sum_k p_k \, E[S \mid k, n], \qquad p'_k = \frac{T p_k + p_k r_k}{T + 1}, \quad
               r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
@@ -76,17 +63,6 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     :math:`\bar S^x`, "which can then be applied with Kaplan's rule"). A measure F of the result is the plug-in
     :math:`F(\beta'(E[S]))`, which the paper calls expected. It is not the expectation :math:`E[F(\beta'(S))]`, because
     neither the update nor F is linear in the scores; `look_ahead_by_samples` computes that.
-
-    Args:
-        beta: `(..., X·Y, K+1)`, Dirichlet parameters.
-        expected: `(K+1, N, K+1)`, expected scores of each class at each level
-            (`FovealObservationModel.expected_scores`).
-
-    Returns:
-        The present and the expected belief.
-
-    Raises:
-        InputError: belief and expected scores have different numbers of classes.
     """
     components = beta.shape[-1]
     check(expected.shape[0] == components, "model", f"{components} classes, as the belief has", expected.shape[0])
@@ -104,18 +80,8 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     .. math:: k_m \sim p, \qquad \lambda_m = \lambda_{k_m n m}, \qquad E[F] \approx \frac1M \sum_m F(\beta'(\lambda_m))
 
     The classes are drawn at M equally spaced points of their cumulative distribution. These points move with the number
-    of visited cells, and are the same in all cells, so that cells with the same belief have the same value.
-
-    Args:
-        beta: `(..., X·Y, K+1)`, Dirichlet parameters.
-        likelihoods: `(K+1, N, M, K+1)`, from `semfov.gaze.acquisition.samples.sampled_likelihoods`.
-        visited: `(..., X·Y)` boolean, cells that were fixated.
-
-    Returns:
-        The present belief, and N M beliefs in place of N expected ones, the M of a level side by side.
-
-    Raises:
-        InputError: belief and likelihoods have different numbers of classes.
+    of visited cells `(..., X·Y)`, and are the same in all cells, so that cells with the same belief have the same
+    value. The likelihoods `(K+1, N, M, K+1)` are those of `sampled_likelihoods`.
     """
     components = beta.shape[-1]
     check_shape(likelihoods, "likelihoods", components, None, None, components)
@@ -131,9 +97,31 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     return Outlook(beta, total, mean, evidence)
 
 
-def _mean_over_samples(values: Tensor, likelihoods: Tensor) -> Tensor:
-    """Mean over the looks of each level; values `(..., N M)`, likelihoods `(K+1, N, M, K+1)` → `(..., N)`."""
-    return values.unflatten(-1, likelihoods.shape[1:3]).mean(-1)
+def sampled_likelihoods(
+    model: FovealObservationModel, samples: int, *, calibrated: bool = True, seed: int = 0
+) -> Tensor:
+    r"""Likelihoods `(K+1, N, M, K+1)` of M looks at an object of each class from each level of distance.
+
+    .. math:: S_{knm} \sim \mathrm{Dir}(\alpha_{kn}), \qquad \lambda_{knm} = P(C = \cdot \mid S_{knm}, n)
+
+    The model's Dirichlets must be densities of the scores, as after a fit by maximum likelihood. Likelihoods that are
+    not calibrated are the scores S themselves.
+    """
+    check(samples >= 1, "samples", "1 or more", samples)
+    if model.expected is not None:
+        raise InputError(
+            "model: expected an observation model whose Dirichlets are densities of the scores, such as "
+            "'yolox-nano-published', to draw looks from; got one that has expected scores of its own"
+        )
+    alpha = model.alpha.detach()
+    generator = np.random.default_rng(seed)
+    drawn = generator.standard_gamma(alpha.double().cpu().numpy()[:, :, None].repeat(samples, 2))
+    scores = torch.from_numpy(drawn / drawn.sum(-1, keepdims=True)).to(alpha)
+    if not calibrated:
+        return scores
+    # A border belongs to the level inside it; the last level has none, and is everything beyond.
+    outer = torch.cat([model.edges, model.edges.new_full((1,), torch.inf)])
+    return model.calibrate(scores, outer[None, :, None].expand(scores.shape[:-1])).detach()
 
 
 class Lookahead(AcquisitionFunction):
@@ -141,14 +129,12 @@ class Lookahead(AcquisitionFunction):
 
     The update of a cell depends on the fixation only through the level of the distance between them. Every cell is
     therefore updated N times instead of X·Y times, and `forward` looks up the level that applies to each fixation.
-
-    Shapes: likelihoods `(K+1, N, M, K+1)`.
     """
 
     levels: Tensor
     likelihoods: Tensor | None
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, likelihoods: Tensor | None = None) -> None:
+    def __init__(self, model: FovealObservationModel, grid: Grid, *, likelihoods: Tensor | None = None) -> None:
         super().__init__()
         self.model = model
         self.register_buffer("levels", model.level(grid.cell_distance))
@@ -167,7 +153,9 @@ class Lookahead(AcquisitionFunction):
                 cells = self.cell_values(look_ahead(maps, expected))
             else:
                 assert drawn is not None
-                cells = _mean_over_samples(self.cell_values(look_ahead_by_samples(maps, drawn, visited)), drawn)
+                # The values of the M looks of a level stand side by side.
+                cells = self.cell_values(look_ahead_by_samples(maps, drawn, visited))
+                cells = cells.unflatten(-1, drawn.shape[1:3]).mean(-1)
             return self.pool(at_levels(cells, self.levels))
 
         if beta.ndim == 2 or self.levels.ndim > 2:
@@ -186,8 +174,5 @@ class Lookahead(AcquisitionFunction):
 
 
 def at_levels(values: Tensor, levels: Tensor) -> Tensor:
-    """Select the value of every cell at its level of distance from each fixation.
-
-    Shapes: values `(..., X·Y, N)`, levels `(X·Y, X·Y)` → `(..., seen cell, fixation)`.
-    """
+    """Value `(..., seen cell, fixation)` of every cell `(..., X·Y, N)` at its level of distance from each fixation."""
     return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))

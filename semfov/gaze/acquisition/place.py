@@ -1,7 +1,6 @@
 """Acquisition functions of visual search that account for all cells within the fovea, and not the fixated one alone."""
 
 from abc import abstractmethod
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,28 +9,16 @@ from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
-
-
-class MissModel(Protocol):
-    """The part of an observation model that these functions need (`semfov.FovealObservationModel`)."""
-
-    miss_rate: Tensor | None
-
-    def level(self, distance: Tensor) -> Tensor:
-        """Level of each distance, `(...)` from 0 to N - 1."""
-        ...
+from semfov.observation.foveal import FovealObservationModel
 
 
 class _TargetVisibility(AcquisitionFunction):
-    """Base of the acquisition functions that use the probability of detecting the target from each fixation.
-
-    Shapes: target `(B,)`, visibility `(..., f, x)`.
-    """
+    """Base of the functions that use the probability of detecting the target from each fixation."""
 
     target: Tensor
     visibility: Tensor
 
-    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
+    def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid) -> None:
         super().__init__()
         if model.miss_rate is None:
             raise InputError("model: expected an observation model with miss rates, got one without them")

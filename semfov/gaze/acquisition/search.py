@@ -1,7 +1,5 @@
 """Acquisition functions of visual search that go by the probability of the target."""
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
@@ -9,15 +7,8 @@ from semfov.belief.belief import Belief, dirichlet_belief, pick
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.lookahead import LevelledModel, at_levels, look_ahead, look_ahead_by_samples
-
-
-class _ExpectingModel(Protocol):
-    """The part of an observation model that the prediction needs (`semfov.FovealObservationModel`)."""
-
-    def expected_scores(self) -> Tensor:
-        """Expected scores `E[S | class k, level n]`, `(K+1, N, K+1)`, level 0 at the fovea."""
-        ...
+from semfov.gaze.acquisition.lookahead import at_levels, look_ahead, look_ahead_by_samples
+from semfov.observation.foveal import FovealObservationModel
 
 
 class TargetPosterior(AcquisitionFunction):
@@ -69,7 +60,7 @@ class PredictedTargetPosterior(AcquisitionFunction):
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
         likelihoods: `(K+1, N, M, K+1)`, likelihoods of drawn looks
-            (`semfov.gaze.acquisition.samples.sampled_likelihoods`), of which those at level 0 count; None is the
+            (`semfov.gaze.acquisition.lookahead.sampled_likelihoods`), of which those at level 0 count; None is the
             published plug-in.
 
     >>> from semfov import DirichletBelief, FovealObservationModel
@@ -82,7 +73,9 @@ class PredictedTargetPosterior(AcquisitionFunction):
     target: Tensor
     likelihoods: Tensor | None
 
-    def __init__(self, target: int | Tensor, model: _ExpectingModel, *, likelihoods: Tensor | None = None) -> None:
+    def __init__(
+        self, target: int | Tensor, model: FovealObservationModel, *, likelihoods: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.model = model
         self.register_buffer("target", torch.as_tensor(target))
@@ -129,7 +122,7 @@ class NeighbourhoodPosterior(AcquisitionFunction):
     levels: Tensor
     kernel: Tensor
 
-    def __init__(self, target: int | Tensor, model: LevelledModel, grid: Grid, *, sigma: float = 0.7) -> None:
+    def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid, *, sigma: float = 0.7) -> None:
         super().__init__()
         check(sigma > 0, "sigma", "a positive number of cells", sigma)
         self.model = model

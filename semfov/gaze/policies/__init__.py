@@ -6,7 +6,6 @@ from semfov.gaze.policies.base import (
     ModelPolicy,
     Policy,
     SamplingPolicy,
-    Table,
     Task,
     named_policy,
     policy_names,
@@ -33,8 +32,8 @@ from semfov.gaze.policies.search import (
     NonPredictive,
     Predictive,
     Random,
+    SaliencyMaximum,
 )
-from semfov.gaze.policies.tables import SaliencyMaximum, TablePolicy, TemplateSearch
 
 __all__ = [
     "KL",
@@ -61,10 +60,7 @@ __all__ = [
     "SaliencyMaximum",
     "SamplingPolicy",
     "Surprise",
-    "Table",
-    "TablePolicy",
     "Task",
-    "TemplateSearch",
     "named_policy",
     "policy_names",
     "required_target",

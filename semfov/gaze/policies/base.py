@@ -2,26 +2,18 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, Self
+from typing import ClassVar, Literal, Self
 
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import InputError, lookup
-from semfov.gaze.acquisition.accuracy import SightedModel
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.gaze.acquisition.ideal import SignalModel
-from semfov.gaze.acquisition.samples import DrawnModel, sampled_likelihoods
+from semfov.gaze.acquisition.lookahead import sampled_likelihoods
+from semfov.observation.foveal import FovealObservationModel
 
 Task = Literal["search", "exploration"]
-
-Table = Literal["saliency", "attention"]
-"""What a policy can need of every scene: the saliency of its cells, or attention to every class in its cells."""
-
-
-class GazeModel(DrawnModel, SightedModel, SignalModel, Protocol):
-    """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +35,7 @@ class Means:
     semfov.errors.InputError: policy 'kl': expected an observation model in `Means.model`, got none
     """
 
-    model: GazeModel | None = None
+    model: FovealObservationModel | None = None
     map: MapEvidence | None = None
     fovea: float = 100 / 640
     prior: float = 0.5
@@ -55,13 +47,11 @@ class Policy(nn.Module, ABC):
     """Base of all policies: how to choose where to look, for any target on any grid.
 
     A subclass is registered under its `name` when it is defined, and settings can then refer to it by that name.
-    `needs_model` and `needs_map` declare what it is made from, and `make` takes that from `Means`. `table` declares
-    what it needs of every scene, and `in_scene` takes that.
+    `needs_model` and `needs_map` declare what it is made from, and `make` takes that from `Means`.
 
     Attributes:
         name: name in settings.
         tasks: tasks that the policy is for.
-        table: the table that it needs of every scene; None for most policies.
         needs_model: whether it is made from an observation model.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
         by_belief: whether its choice depends on the belief.
@@ -80,7 +70,6 @@ class Policy(nn.Module, ABC):
 
     name: ClassVar[str]
     tasks: ClassVar[tuple[Task, ...]]
-    table: ClassVar[Table | None] = None
     needs_model: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
     by_belief: ClassVar[bool] = True
@@ -116,30 +105,6 @@ class Policy(nn.Module, ABC):
             The acquisition function.
         """
 
-    def in_scene(
-        self, target: int | Tensor | None, grid: Grid, table: Tensor | None, cell: Tensor
-    ) -> AcquisitionFunction:
-        """Make the acquisition function of episodes in a scene, for the cells that they fixate.
-
-        Without a `table`, a policy makes the same as in any other scene with this grid.
-
-        Args:
-            target: class 1..K, a tensor `(B,)` with one for each episode, or None in an exploration.
-            grid: the cells.
-            table: the table that the policy declares: for `saliency` that of all cells seen from each cell,
-                `(X·Y, X·Y)`, or from anywhere, `(1, X·Y)`; for `attention` that to every class in all cells seen from
-                each cell, `(X·Y, K, X·Y)`.
-            cell: `(B,)`, the fixated cells.
-
-        Returns:
-            The acquisition function.
-
-        Raises:
-            InputError: the policy needs a table, and `table` is None.
-        """
-        made: AcquisitionFunction = self(target, grid)
-        return made
-
 
 class ModelPolicy(Policy):
     """Base of the policies that use an observation model: how well the detector sees at each distance from the fovea.
@@ -147,15 +112,24 @@ class ModelPolicy(Policy):
     Args:
         model: observation model.
 
+    Attributes:
+        function: acquisition function that `forward` makes, unless a subclass defines `forward`.
+
     >>> issubclass(POLICIES["predictive"], ModelPolicy), issubclass(POLICIES["random"], ModelPolicy)
     (True, False)
     """
 
     needs_model = True
+    function: ClassVar[type[AcquisitionFunction]]
 
-    def __init__(self, model: GazeModel) -> None:
+    def __init__(self, model: FovealObservationModel) -> None:
         super().__init__()
         self.model = model
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The acquisition function `function` of the model and the grid, in a search for the target."""
+        searched = (required_target(target, self.name),) if "search" in self.tasks else ()
+        return self.function(*searched, self.model, grid)
 
     @classmethod
     def make(cls, means: Means) -> Self:
@@ -182,10 +156,14 @@ class SamplingPolicy(ModelPolicy):
     by_samples = True
     likelihoods: Tensor | None
 
-    def __init__(self, model: GazeModel, samples: int | None = None, calibrated: bool = True) -> None:
+    def __init__(self, model: FovealObservationModel, samples: int | None = None, calibrated: bool = True) -> None:
         super().__init__(model)
         drawn = None if samples is None else sampled_likelihoods(model, samples, calibrated=calibrated)
         self.register_buffer("likelihoods", drawn, persistent=False)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The acquisition function `function` of the model, the grid and the drawn looks."""
+        return self.function(self.model, grid, likelihoods=self.likelihoods)
 
     @classmethod
     def make(cls, means: Means) -> Self:
@@ -207,8 +185,8 @@ def policy_names(task: Task) -> list[str]:
     Returns:
         The names in the order of registration.
 
-    >>> policy_names("search")[:3]
-    ['random', 'non-predictive', 'predictive']
+    >>> "predictive" in policy_names("search"), "kl" in policy_names("search")
+    (True, False)
     """
     return [name for name, kind in POLICIES.items() if task in kind.tasks]
 

@@ -21,7 +21,8 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.objects import ObjectEvidence
-from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy, SamplingPolicy
+from semfov.gaze.policies.base import Means, ModelPolicy, Policy, SamplingPolicy
+from semfov.observation.foveal import FovealObservationModel
 
 
 class KL(SamplingPolicy):
@@ -44,7 +45,7 @@ class KL(SamplingPolicy):
     tasks = ("exploration",)
 
     def __init__(
-        self, model: GazeModel, prior: float = 0.5, samples: int | None = None, calibrated: bool = True
+        self, model: FovealObservationModel, prior: float = 0.5, samples: int | None = None, calibrated: bool = True
     ) -> None:
         super().__init__(model, samples, calibrated)
         self.prior = prior
@@ -77,10 +78,7 @@ class Surprise(SamplingPolicy):
 
     name = "surprise"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The divergence from the present map."""
-        return BayesianSurprise(self.model, grid, likelihoods=self.likelihoods)
+    function = BayesianSurprise
 
 
 class Negentropy(SamplingPolicy):
@@ -100,10 +98,7 @@ class Negentropy(SamplingPolicy):
 
     name = "negative-entropy"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The decrease of the entropy."""
-        return NegativeEntropy(self.model, grid, likelihoods=self.likelihoods)
+    function = NegativeEntropy
 
 
 class Peaks(SamplingPolicy):
@@ -123,10 +118,7 @@ class Peaks(SamplingPolicy):
 
     name = "two-peaks"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The change of the margin."""
-        return TwoPeaks(self.model, grid, likelihoods=self.likelihoods)
+    function = TwoPeaks
 
 
 class ConfidenceBound(ModelPolicy):
@@ -144,10 +136,7 @@ class ConfidenceBound(ModelPolicy):
 
     name = "upper-confidence-bound"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The increase of the bounds."""
-        return UpperConfidenceBound(self.model, grid)
+    function = UpperConfidenceBound
 
 
 class Improvement(ModelPolicy):
@@ -165,10 +154,7 @@ class Improvement(ModelPolicy):
 
     name = "probability-of-improvement"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of improvement."""
-        return ProbabilityOfImprovement(self.model, grid)
+    function = ProbabilityOfImprovement
 
 
 class Accuracy(ModelPolicy):
@@ -186,10 +172,7 @@ class Accuracy(ModelPolicy):
 
     name = "expected-accuracy"
     tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The expected number of additional correct cells."""
-        return ExpectedAccuracy(self.model, grid)
+    function = ExpectedAccuracy
 
 
 class Closer(Policy):

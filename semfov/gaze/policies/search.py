@@ -10,11 +10,12 @@ from typing import ClassVar
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
-from semfov.gaze.acquisition.static import Uniform
+from semfov.gaze.acquisition.static import Static, Uniform
 from semfov.gaze.policies.base import ModelPolicy, Policy, SamplingPolicy, Task, required_target
 
 
@@ -32,6 +33,37 @@ class Random(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The same value for every cell."""
         return Uniform()
+
+
+class SaliencyMaximum(Policy):
+    """Look at the most salient cell of a scene, whatever the target and the belief (`semfov.acquisition.Static`).
+
+    Args:
+        saliency: `(X·Y,)` or `(B, X·Y)`, saliency of the cells; None where runs give it for every scene.
+
+    Raises:
+        InputError: the policy is used without the saliency of a scene.
+
+    >>> import torch
+    >>> policy = SaliencyMaximum(torch.tensor([0.4, 0.2]))
+    >>> policy(None, Grid(2, 1, (20, 10))).values
+    tensor([0.4000, 0.2000])
+    """
+
+    name = "saliency"
+    tasks: ClassVar[tuple[Task, ...]] = ("search", "exploration")
+    by_belief = False
+    saliency: Tensor | None
+
+    def __init__(self, saliency: Tensor | None = None) -> None:
+        super().__init__()
+        self.register_buffer("saliency", saliency, persistent=False)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The saliency of all cells."""
+        if self.saliency is None:
+            raise InputError("policy 'saliency': expected the saliency of a scene, got none")
+        return Static(self.saliency)
 
 
 class NonPredictive(Policy):
@@ -89,10 +121,7 @@ class Neighbourhood(ModelPolicy):
 
     name = "neighbourhood"
     tasks = ("search",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The predicted posterior of the target in the neighbourhood."""
-        return NeighbourhoodPosterior(required_target(target, self.name), self.model, grid)
+    function = NeighbourhoodPosterior
 
 
 class FovealHits(ModelPolicy):
@@ -111,10 +140,7 @@ class FovealHits(ModelPolicy):
     name = "foveal-hit"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of a detection."""
-        return FovealHit(required_target(target, self.name), self.model, grid)
+    function = FovealHit
 
 
 class InformationOnPlace(ModelPolicy):
@@ -133,10 +159,7 @@ class InformationOnPlace(ModelPolicy):
     name = "place-information"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The expected information about the place."""
-        return PlaceInformation(required_target(target, self.name), self.model, grid)
+    function = PlaceInformation
 
 
 class EntropyLimitMinimisation(ModelPolicy):
@@ -156,10 +179,7 @@ class EntropyLimitMinimisation(ModelPolicy):
     name = "entropy-limit"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The limit of the decrease of the entropy."""
-        return EntropyLimit(required_target(target, self.name), self.model, grid)
+    function = EntropyLimit
 
 
 class IdealObserver(ModelPolicy):
@@ -180,7 +200,4 @@ class IdealObserver(ModelPolicy):
     name = "ideal-observer"
     tasks = ("search",)
     by_place = True
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of a correct localisation."""
-        return CorrectLocalisation(required_target(target, self.name), self.model, grid)
+    function = CorrectLocalisation

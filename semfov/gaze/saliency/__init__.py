@@ -1,11 +1,21 @@
-"""Bottom-up saliency: where an image attracts the gaze, whatever the task. Baselines for comparison.
+"""Where an image attracts the gaze, whatever the task: a density fitted to people, and bottom-up saliency beside it.
 
 VOCUS2 is the baseline of Luzio, Bernardino and Moreno (2024, section IV-B), computed anew on the foveated view of every
 fixation. VOCUS2 builds on the model of Itti, Koch and Niebur; the paper has no figures for that model.
 """
 
 from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.itti import IttiKoch, itti_koch_saliency
+from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.gaze.saliency.vocus2 import VOCUS2, vocus2_saliency
 
-__all__ = ["VOCUS2", "IttiKoch", "cell_saliency", "itti_koch_saliency", "vocus2_saliency"]
+__all__ = [
+    "VOCUS2",
+    "FixationDensity",
+    "IttiKoch",
+    "OculomotorBias",
+    "cell_saliency",
+    "itti_koch_saliency",
+    "vocus2_saliency",
+]

@@ -32,7 +32,7 @@ _FLAT = 32
 def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     """Dyadic Gaussian pyramid (`cv2.pyrDown`).
 
-    >>> [tuple(level.shape[-2:]) for level in dyadic_pyramid(torch.rand(1, 3, 9, 12), 3)]
+    >>> [tuple(level.shape[-2:]) for level in _dyadic_pyramid(torch.rand(1, 3, 9, 12), 3)]
     [(9, 12), (5, 6), (3, 3), (2, 2)]
 
     Shapes: channels `(B, C, H, W)`.
@@ -59,7 +59,7 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     Returns:
         `(2n, 9, 9)` for n angles, float64, the even and the odd filter of each in turn.
 
-    >>> gabor_kernels([0.0]).shape
+    >>> _gabor_kernels([0.0]).shape
     torch.Size([2, 9, 9])
     """
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
@@ -75,7 +75,7 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
 def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
 
-    >>> orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
+    >>> _orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
     tensor(3)
 
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
@@ -108,7 +108,7 @@ def _promote(maps: Tensor) -> Tensor:
     Returns:
         The same shape, from 0 to 1.
 
-    >>> promote(torch.tensor([[4.0, 0.0, 0.0, 2.0]]))
+    >>> _promote(torch.tensor([[4.0, 0.0, 0.0, 2.0]]))
     tensor([[0.2500, 0.0000, 0.0000, 0.1250]])
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)

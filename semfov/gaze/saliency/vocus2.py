@@ -51,7 +51,7 @@ def _twin_pyramids(
     Raises:
         InputError: the channels are empty or of another shape, or a setting is out of range.
 
-    >>> [len(layer) for layer in twin_pyramids(torch.rand(1, 3, 9, 20))]
+    >>> [len(layer) for layer in _twin_pyramids(torch.rand(1, 3, 9, 20))]
     [2, 2, 2, 2]
     """
     check_shape(channels, "channels", None, None, None, None)
@@ -79,7 +79,7 @@ def _twin_pyramids(
 def _on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
     """Contrasts of bright on dark and of dark on bright.
 
-    >>> on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
+    >>> _on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
     (tensor([0., 2.]), tensor([2., 0.]))
     """
     return F.relu(centre - surround), F.relu(surround - centre)

@@ -7,7 +7,7 @@ sequences need `pip install semfov[human]`.
 
 from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
-from semfov.metrics.scanpath.maps import auc_judd, auc_shuffled
+from semfov.metrics.scanpath.maps import auc_borji, auc_judd, auc_shuffled, correlation, kullback_leibler, similarity
 from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
 from semfov.metrics.scanpath.performance import (
     found_at,
@@ -30,14 +30,17 @@ __all__ = [
     "MultiMatch",
     "ScanpathComparison",
     "auc",
+    "auc_borji",
     "auc_judd",
     "auc_shuffled",
     "cell_labels",
     "cluster_labels",
     "compare_scanpath",
+    "correlation",
     "edit_distance",
     "found_at",
     "information_gain",
+    "kullback_leibler",
     "log_density",
     "log_likelihood",
     "mean_performance",
@@ -48,5 +51,6 @@ __all__ = [
     "probability_mismatch",
     "scanpath_ratio",
     "sequence_score",
+    "similarity",
     "tfp_auc",
 ]

@@ -144,8 +144,9 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
 
     def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
         def whole(points: FixationValues, others: Sequence[FixationValues]) -> float:
-            density, ratio = _density(np.concatenate([inside(other) for other in others]), size)
-            x, y = ((inside(points) + 0.5) * ratio - 0.5).T
+            columns, rows = (max(1, round(side * _LONGEST / max(size))) for side in size)
+            density = people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
+            x, y = ((inside(points) + 0.5) * (np.array([columns, rows]) / np.array(size)) - 0.5).T
             return _mean(score(density, x, y).tolist())
 
         return whole
@@ -159,16 +160,14 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
     }
 
 
-def _density(points: FixationValues, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A map of 64 pixels along the longer side, a Gaussian around each point, and its pixels for each of the frame."""
-    shape = np.maximum(1, np.round(np.array(size) * _LONGEST / max(size)))
-    ratio = shape / np.array(size)
-    x, y = ((points + 0.5) * ratio - 0.5).T
-    columns, rows = (np.arange(side) for side in shape)
-    width = 2 * (_BLUR * _LONGEST) ** 2
+def people_density(points: FixationValues, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """A map of `(rows, columns)`, a Gaussian of 3 % of its longer side around each point; points `(n, 2)`."""
+    rows, columns = (np.arange(side) for side in shape)
+    x, y = ((points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5).T
+    width = 2 * (_BLUR * max(shape)) ** 2
     across = np.exp(-((columns[:, None] - x) ** 2) / width)
     down = np.exp(-((rows[:, None] - y) ** 2) / width)
-    return down @ across.T, ratio
+    return np.asarray(down @ across.T)
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -1,12 +1,14 @@
-"""How well a saliency map separates the pixels that people fixated from others, over a whole picture."""
+"""Saliency maps and densities over a whole picture, beside the pixels that people fixated, or their map."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
 from semfov.metrics.scanpath.conditional import looked_up, share_below
+
+_Array = NDArray[np.float64]
 
 
 def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
@@ -69,3 +71,111 @@ def auc_shuffled(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, other_x: Array
     others = np.sort(looked_up(saliency, other_x, other_y)[1])
     check(hits.size > 0 and others.size > 0, "x, other_x", "fixations of this picture and of others", "none")
     return float(share_below(others, hits).mean())
+
+
+def auc_borji(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, *, draws: int = 100, seed: int = 0) -> float:
+    """Area under the ROC of fixations against as many pixels drawn uniformly (Borji, Tavakoli, Sihite and Itti, 2013).
+
+    The mean of several draws; its expectation is the mean of `auc`.
+
+    Args:
+        saliency: `(H, W)`, the map.
+        x: `(n,)`, of all fixations, in pixels of the map.
+        y: `(n,)`, of the same fixations.
+        draws: number of draws.
+        seed: seed of the draws.
+
+    Returns:
+        From 0 to 1.
+
+    Raises:
+        InputError: the shapes do not fit together, a fixation lies outside, or there is none.
+
+    >>> auc_borji([[0.0, 1.0], [2.0, 3.0]], [1], [1], draws=2000).__round__(1)
+    0.9
+    """
+    values, own = looked_up(saliency, x, y)
+    check(own.size > 0 and draws > 0, "x, draws", "at least one", (own.size, draws))
+    drawn = np.random.default_rng(seed).choice(values.reshape(-1), (draws, own.size))
+    return float(np.mean([share_below(np.sort(each), own.reshape(-1)).mean() for each in drawn]))
+
+
+def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
+    """Linear correlation coefficient of two maps over their pixels, CC (Le Meur et al., 2007; Bylinskii et al., 2019).
+
+    Args:
+        first: `(..., H, W)`.
+        second: of the same shape.
+
+    Returns:
+        `(...)`, from -1 to 1; 0 where a map is constant.
+
+    Raises:
+        InputError: the shapes differ.
+
+    >>> correlation([[0.0, 1.0]], [[2.0, 4.0]])
+    array(1.)
+    """
+    one, other = (each - each.mean(-1, keepdims=True) for each in _pair(first, second))
+    spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
+    return np.asarray(np.where(spread > 0, (one * other).sum(-1) / np.where(spread > 0, spread, 1), 0.0))
+
+
+def similarity(first: ArrayLike, second: ArrayLike) -> _Array:
+    r"""Intersection of two densities, SIM (Judd, Durand and Torralba, 2012): :math:`\sum_u \min(p(u), q(u))`.
+
+    Args:
+        first: `(..., H, W)`, not negative; it is normalised.
+        second: of the same shape.
+
+    Returns:
+        `(...)`, from 0 to 1.
+
+    Raises:
+        InputError: the shapes differ, or a map has negative values or none above 0.
+
+    >>> similarity([[1.0, 0.0]], [[1.0, 1.0]])
+    array(0.5)
+    """
+    return np.asarray(np.minimum(*_densities(first, second)).sum(-1))
+
+
+def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
+    r"""Kullback-Leibler divergence of a model's density from that of people: :math:`\sum_u q(u) \ln (q(u) / p(u))`.
+
+    Without the small constants that some programs add (Bylinskii et al., 2019, section 3.2).
+
+    Args:
+        people: `(..., H, W)`, q, not negative; it is normalised.
+        model: p, of the same shape.
+
+    Returns:
+        `(...)`, in nats; infinite where the model has 0 and people do not.
+
+    Raises:
+        InputError: the shapes differ, or a map has negative values or none above 0.
+
+    >>> float(kullback_leibler([[1.0, 0.0]], [[1.0, 1.0]]).round(3))
+    0.693
+    """
+    q, p = _densities(people, model)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(q > 0, q * (np.log(q) - np.log(p)), 0.0).sum(-1))
+
+
+def _pair(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
+    """Two maps of one shape, flat."""
+    one, other = (np.asarray(each, dtype=np.float64) for each in (first, second))
+    check(one.shape == other.shape and one.ndim >= 2 and one.size > 0, "maps", "two of one shape (..., H, W)",
+          (one.shape, other.shape))  # fmt: skip
+    return one.reshape(*one.shape[:-2], -1), other.reshape(*other.shape[:-2], -1)
+
+
+def _densities(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
+    """Two maps as densities."""
+    pair = _pair(first, second)
+    for each in pair:
+        good = bool((each >= 0).all() and np.isfinite(each).all() and (each.sum(-1) > 0).all())
+        check(good, "maps", "finite numbers of 0 or more, not all 0", f"from {each.min():g} to {each.max():g}")
+    one, other = (each / each.sum(-1, keepdims=True) for each in pair)
+    return one, other

@@ -103,6 +103,7 @@ COMMANDS = {
             (("--detector.name", "yolov3-tinny"), "did you mean 'yolov3-tiny'"),
         ),
     ),
+    "eval.ivsn": Command(),
     "eval.explore": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--protocol.starts", "2", "--protocol.shifts", "3",
                   "--policies", "[random-raw, vocus2-raw]"),
@@ -209,8 +210,8 @@ COMMANDS = {
         files=("hits.json", "report.md"),
         parts="cache/samples/*/*.safetensors",
     ),
-    "train.fit_templates": Command(workers=False),
-    "train.fit_humanlike": Command(
+    "eval.ivsn.fit": Command(workers=False),
+    "eval.human habits": Command(
         settings=(*NETWORK, *GRID, "--root", "HERE/people", "--fixations", "HERE/people.json",
                   "--policies", "[closer-look-raw, vocus2-raw]"),
         files=(MODEL, "bits.json", "report.md"),

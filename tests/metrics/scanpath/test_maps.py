@@ -9,17 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import mannwhitneyu, multivariate_normal
+from scipy.stats import entropy, mannwhitneyu, multivariate_normal
 
 from semfov.errors import InputError
 from semfov.metrics.scanpath import (
     auc,
+    auc_borji,
     auc_judd,
     auc_shuffled,
+    correlation,
     information_gain,
+    kullback_leibler,
     log_density,
     log_likelihood,
     nss,
+    similarity,
 )
 
 SHAPE = (12, 17)
@@ -235,6 +239,45 @@ def test_one_fixation_and_one_other_pixel_are_enough():
     assert auc_judd([[1.0, 0.0]], [1], [0]) == 0.5
     assert auc_shuffled([[0.0, 1.0]], [1], [0], [0], [0]) == 1
     assert auc_shuffled([[0.0, 1.0]], [0], [0], [1], [0]) == 0
+
+
+def test_correlation_equals_numpy():
+    rng = np.random.default_rng(3)
+    first, second = rng.random((2, 4, *SHAPE))
+    expected = [np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(first, second, strict=True)]
+    np.testing.assert_allclose(correlation(first, second), expected)
+    assert correlation(np.ones(SHAPE), first[0]) == 0
+    with pytest.raises(InputError, match="maps"):
+        correlation(first, second[:, :-1])
+
+
+def test_kl_divergence_equals_scipy():
+    first, second = np.random.default_rng(4).random((2, *SHAPE)) + 0.01
+    assert kullback_leibler(first, second) == pytest.approx(entropy(first.ravel(), second.ravel()))
+    assert kullback_leibler(first, 7 * first) == pytest.approx(0)
+    hole = second.copy()
+    hole[0, 0] = 0
+    assert kullback_leibler(first, hole) == np.inf
+    first[0, 0] = 0
+    assert np.isfinite(kullback_leibler(first, hole))
+    with pytest.raises(InputError, match="maps"):
+        kullback_leibler(-first, second)
+
+
+def test_similarity_is_one_minus_the_total_variation():
+    first, second = np.random.default_rng(5).random((2, *SHAPE))
+    distance = np.abs(first / first.sum() - second / second.sum()).sum() / 2
+    assert similarity(first, second) == pytest.approx(1 - distance)
+    assert similarity(first, 3 * first) == pytest.approx(1)
+
+
+def test_the_expectation_of_auc_borji_is_the_mean_auc():
+    rng = np.random.default_rng(6)
+    saliency, x, y = rng.random(SHAPE), rng.integers(17, size=30), rng.integers(12, size=30)
+    mean = auc(saliency, x, y).mean()
+    # The standard deviation of a draw is below .08, that of the mean of 400 below .004.
+    assert auc_borji(saliency, x, y, draws=400) == pytest.approx(mean, abs=0.016)
+    assert auc_borji(saliency, x, y, seed=1) == auc_borji(saliency, x, y, seed=1)
 
 
 NAN = float("nan")

@@ -1,0 +1,204 @@
+"""Fit the evidence for photographs: whether one holds a class, before and after closer looks, and what an object is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from semfov.belief.target_evidence import Thresholds
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.fit.searches import TargetSearch
+from semfov.fit.verification import (
+    VerificationResult,
+    choose_confirm,
+    examine,
+    fit,
+    verification_report,
+    verify,
+)
+from semfov.fit.windows_certainty import fit_certainty, logistic_regression
+from semfov.runs.progress import track
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.window_looking import right_boxes
+from semfov.zoom.closer import PhotographPlaces, WindowLook, candidates, look_closely
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Glance, Glances, LiveGlances, overview
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge_with_facts
+from semfov.zoom.photograph import PhotographEvidence
+from semfov.zoom.slices import usual_slices
+
+_FOLDS = 5
+_ABSENT = 6
+"""Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
+_FALSE_ALARMS = 0.01
+"""Maximum share of absent targets that may be reported as found; it determines the threshold."""
+
+_AREA = 0.2
+"""Classes that cover a larger share of a photograph are not searched for."""
+
+
+class Limits(Protocol):
+    """Settings of the fit (see `FitZoomConfig`)."""
+
+    @property
+    def photographs(self) -> int:
+        """Number of photographs to look at."""
+        ...
+
+    @property
+    def worth(self) -> float:
+        """Least worth of a closer look."""
+        ...
+
+    @property
+    def surest(self) -> float:
+        """Upper limit of the probability from which on a target counts as found."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the choice of classes."""
+        ...
+
+
+class WholeSearch(TargetSearch[WindowLook]):
+    """A search of a photograph after the look at the whole; objects `(M, 4)`, closer looks by their box."""
+
+    after = (1,)
+
+    def __init__(
+        self,
+        number: int,
+        target: int,
+        glances: Glances,
+        whole: Glance,
+        objects: Tensor,
+        model: PhotographEvidence,
+        *,
+        spare: bool = False,
+    ) -> None:
+        super().__init__(number, target, present=len(objects) > 0, spare=spare)
+        self.glances, self.whole, self.objects, self.model = glances, whole, objects, model
+        self.closely: dict[tuple[float, ...], Detections] = {}
+
+    def __len__(self) -> int:
+        return 1
+
+    @property
+    def best(self) -> float:
+        """Highest score of the target."""
+        return float(self.whole.show[self.target - 1])
+
+    def look(self, index: int, number: int) -> WindowLook:
+        """The look at the whole."""
+        presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
+        return WindowLook(candidates(self.whole), number, float(presence), self.best, 0.0)
+
+    def candidates(self) -> PhotographPlaces:
+        """Make the source of places to look at closely."""
+        return PhotographPlaces(self.target)
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`, once."""
+        key = tuple(box.tolist())
+        if key not in self.closely:
+            self.closely[key] = candidates(look_closely(self.glances, box))
+        return self.closely[key]
+
+    def right(self, box: Tensor) -> bool:
+        """Whether the centre of a box `(4,)` lies in an annotated box of the class."""
+        centre = (box[:2] + box[2:]) / 2
+        return bool(((self.objects[:, :2] <= centre) & (centre <= self.objects[:, 2:])).all(-1).any())
+
+    def last(self, index: int, room: float) -> bool:
+        """No other look follows."""
+        return True
+
+    def outcome(self, index: int, thresholds: Thresholds) -> int:
+        """No decision without closer looks."""
+        return 0
+
+    def found(self, index: int) -> bool:
+        """Never asked for."""
+        raise NotImplementedError
+
+
+def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: Limits) -> str:
+    """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
+
+    Each of the first photographs is searched for up to two classes that it holds and for others that it does not.
+    Returns the report in Markdown.
+    """
+    canvas = eye.detector.input_size
+    single = [n for n in range(len(pictures)) if Lattice.over(pictures.annotation(n).size, canvas).levels == 1]
+    if not single:
+        return "None, since no photograph is shown at more than half its size by one look.\n"
+    count, held = len(pictures), torch.zeros(len(pictures), model.classes, dtype=torch.bool)
+    for index in range(count):
+        held[index, pictures.annotation(index).labels - 1] = True
+    evidence = PhotographEvidence(model.classes).eval().requires_grad_(False)
+    evidence.usual.copy_(_usual(held.sum(0), count))
+    searches: list[WholeSearch] = []
+    facts, right = [], []
+    for number, index in enumerate(track(single[: config.photographs], "looking at photographs", "photograph")):
+        annotation = pictures.annotation(index)
+        glances = LiveGlances(eye, eye.open(pictures[index].image))
+        with torch.inference_mode():
+            looks = glances.see([overview(glances.lattice), *usual_slices(glances.lattice)])
+        usual = choose_classes(pictures, index, annotation, 2, _AREA, config.seed)
+        # The same draw with more absent classes begins with the same ones.
+        for place, target in enumerate(choose_classes(pictures, index, annotation, 2, _AREA, config.seed, _ABSENT)):
+            boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
+            searches.append(WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
+        for some in (looks[:1], looks):
+            found, about = merge_with_facts(some, glances.lattice)
+            hits = right_boxes(found, annotation)
+            facts.append(about[hits >= 0])
+            right.append(hits[hits >= 0] > 0)
+    certainty = fit_certainty(torch.cat(facts), torch.cat(right))
+    evidence.certainty = replace(certainty, strength=1.0)  # looks at all slices leave nothing to expect
+    _fit_whole(evidence, [each for each in searches if not each.spare], held, count)
+    text = _fit_closer(evidence, searches, config)
+    model.photograph = evidence
+    model.metadata["photograph"] = {"photographs": len(single[: config.photographs]), "frequencies": count}
+    return text
+
+
+def _usual(held: Tensor, count: int) -> Tensor:
+    """Log odds that a photograph holds each class, half a photograph for and against added."""
+    return ((held + 0.5) / (count + 1)).double().logit()
+
+
+def _fit_whole(evidence: PhotographEvidence, searches: Sequence[WholeSearch], held: Tensor, count: int) -> None:
+    """Fit the probability after the look at the whole, with frequencies in the other photographs; held `(P, K)`."""
+    total = held.sum(0)
+    best = torch.tensor([search.best for search in searches], dtype=torch.float64)
+    present = torch.tensor([search.present for search in searches])
+    number = torch.tensor([int(total[search.target - 1]) for search in searches])
+    usual = _usual(number - present.long(), count - 1)
+    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), usual], -1), present)
+    evidence.whole.weight.copy_(torch.tensor([weights]))
+    evidence.whole.bias.fill_(offset)
+
+
+def _fit_closer(evidence: PhotographEvidence, searches: Sequence[WholeSearch], config: Limits) -> str:
+    """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
+    closer = examine(searches, _FOLDS)
+    if closer is None:
+        return "None, since there are no places that hold the target, or none that do not.\n"
+    chosen = [fit(closer, closer.fold != fold) for fold in range(_FOLDS)]
+    limits = Thresholds(1.0, config.worth, config.worth)
+    decisions = list(verify(searches, chosen, limits, None))
+    confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
+    fitted = fit(closer, closer.fold >= 0)
+    fitted.thresholds = Thresholds(confirm, config.worth, config.worth)
+    evidence.verification = fitted
+    result = VerificationResult(fitted, chosen, closer, decisions)
+    return verification_report(result, f"{len({each.picture for each in searches})} photographs")[0]

@@ -1,0 +1,420 @@
+"""The density of people's fixations, read out of the feature maps that a detector computes anyway."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import FeatureMaps
+from semfov.detection.placement import Placement
+from semfov.errors import InputError, check, check_shape
+from semfov.gaze.saliency.oculomotor import OculomotorBias
+from semfov.io.compatibility import check_same_detector
+from semfov.io.pretrained import Pretrained
+from semfov.io.schema import Array, Field, Pair, Schema, Text
+from semfov.io.schema import Number as JsonNumber
+from semfov.io.storage import checksum
+from semfov.sensor.lines import constant
+
+CELLS = 52
+"""Cells along the longer side of a picture in which densities are computed."""
+
+_HALF = torch.float16
+
+
+class FixationDensity(Pretrained):
+    r"""Log density of the next fixation of people who view a picture freely, from the feature maps of a detector.
+
+    .. math:: \ln p(u \mid f_1 \ldots f_n) = g_n \, m(u) + h_n \, w \, c(u) + o(u \mid f_1 \ldots f_n) - \ln Z
+
+    m is the map: 1 × 1 convolutions of the feature maps, joined bilinearly on the picture, two more of few channels,
+    and a Gaussian blur; the mean of several such readouts. c is the log density of the centre bias. With a scanpath,
+    o are the oculomotor biases (`OculomotorBias`), and g and h depend on the number of fixations; without one, o is 0,
+    and g and h are 1. The form is that of DeepGaze II and III (Kümmerer, Wallis, Gatys and Bethge, 2017; Kümmerer,
+    Bethge and Wallis, 2022), with the features of a detector that runs anyway in place of a network of its own.
+
+    The shipped models (`from_pretrained`) are fitted by maximum likelihood to fixations of 3 to 5 seconds of free
+    viewing of photographs by adults (`train.fit_gaze`). They are not for tasks, such as search.
+
+    Args:
+        layers: number of channels of each feature map, by the name that `Detector.features` gives it.
+        readouts: number of readouts whose mean is the map.
+        units: number of channels of a readout.
+        centre: `(rows, columns)`, log density of the centre bias; None for none.
+        metadata: JSON values to keep with the model; `detector` holds those settings of the detector that the feature
+            maps depend on.
+
+    Shape:
+        - features: maps `(B, C, h, w)` by name
+        - output: `(B, H, W)`, natural logarithms that sum to one as densities
+
+    Raises:
+        InputError: there is no layer, or a number is below 1.
+
+    >>> model = FixationDensity({"backbone8": 3, "head16": 5})
+    >>> maps = {"backbone8": torch.rand(1, 3, 30, 40), "head16": torch.rand(1, 5, 15, 20)}
+    >>> density = model(maps, (60, 80))
+    >>> density.shape, round(density.exp().sum().item(), 4)
+    (torch.Size([1, 60, 80]), 1.0)
+    """
+
+    kind: ClassVar[str] = "fixation-density"
+    title: ClassVar[str] = "model of where people look"
+    shipped: ClassVar[Path] = Path(__file__).parent.parent / "models" / "fixations"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "read": Field(("U", "C"), _HALF),
+            "shift": Field(("U",), low=-1e4, high=1e4),
+            "mix": Field(("R", "N", "N"), _HALF),
+            "mix_shift": Field(("R", "N"), low=-1e4, high=1e4),
+            "out": Field(("R", "N"), low=-1e4, high=1e4),
+            "blur": Field((), low=-10, high=5),
+            "centre": Field(("Y", "X"), low=-1e3, high=0),
+            "centre_weight": Field((), low=-1e2, high=1e2),
+            "oculomotor.saccade": Field((7, 13), low=-1e2, high=1e2),
+            "oculomotor.turn": Field((3, 13), low=-1e2, high=1e2),
+            "oculomotor.back": Field((4, 6), low=-1e2, high=1e2),
+            "oculomotor.gain": Field((2, 12), low=-1e2, high=1e2),
+            "start": Field((2, 2), low=0, high=1),
+            "duration": Field(("D", 2), low=0, high=1e2),
+            "pause": Field((), low=0, high=1e4),
+        },
+        {"layers": Array(Pair((Text(), JsonNumber(low=1, high=1e6, whole=True))), least=1)},
+    )
+    start: Tensor
+    duration: Tensor
+    pause: Tensor
+    centre: Tensor
+
+    def __init__(
+        self,
+        layers: Mapping[str, int],
+        *,
+        readouts: int = 1,
+        units: int = 16,
+        centre: Tensor | None = None,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        check(len(layers) > 0, "layers", "at least one feature map", "none")
+        check(min(readouts, units, *layers.values()) >= 1, "readouts, units, layers", "at least 1", (readouts, units))
+        self.layers = dict(layers)
+        self.metadata = dict(metadata or {})
+        channels = sum(layers.values())
+        self.read = nn.Parameter(torch.randn(readouts * units, channels) / channels**0.5)
+        self.shift = nn.Parameter(torch.zeros(readouts * units))
+        self.mix = nn.Parameter(torch.randn(readouts, units, units) * 0.6 / units**0.5)
+        self.mix_shift = nn.Parameter(torch.zeros(readouts, units))
+        self.out = nn.Parameter(torch.randn(readouts, units) * 0.6 / units**0.5)
+        self.blur = nn.Parameter(torch.zeros(()))  # logarithm of the standard deviation in cells
+        self.centre_weight = nn.Parameter(torch.ones(()))
+        self.oculomotor = OculomotorBias()
+        flat = torch.zeros(1, 1)
+        self.register_buffer("centre", flat if centre is None else centre.detach().clone())
+        # Of the first fixation: mean and standard deviation of x and y, in widths and heights. Then for the fixations
+        # in order, mean and standard deviation of the logarithm of the duration in ms, and the pause between two in ms.
+        self.register_buffer("start", torch.tensor([[0.5, 0.5], [0.12, 0.12]]))
+        self.register_buffer("duration", torch.tensor([[5.3, 0.55]]))
+        self.register_buffer("pause", torch.tensor(40.0))
+
+    @classmethod
+    def for_detector(cls, detector: Detector) -> Self:
+        """The model that is shipped for a detector.
+
+        Args:
+            detector: the detector.
+
+        Returns:
+            The model, in `eval` mode.
+
+        Raises:
+            InputError: none is shipped for it; the message has the command that fits one.
+        """
+        model = cls.if_shipped(detector.name)
+        if model is None:
+            names = ", ".join(sorted(path.stem for path in cls.shipped.glob("*.safetensors")))
+            raise InputError(
+                f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
+                f"fixations with `python -m train.fit_gaze --detector.name {detector.name}`"
+            )
+        model.check_compatible(detector)
+        return model
+
+    def check_compatible(self, detector: Detector) -> None:
+        """Raise `InputError` for another detector than the model was fitted for; warn where a setting differs.
+
+        Args:
+            detector: the detector whose feature maps are read.
+        """
+        fitted, settings = self.metadata.get("detector", {}), detector.settings()
+        check_same_detector(fitted, {name: settings.get(name) for name in fitted}, self.title)
+
+    def forward(
+        self,
+        features: FeatureMaps | Mapping[str, Tensor],
+        size: tuple[int, int] | None = None,
+        scanpath: Tensor | None = None,
+        *,
+        without: Sequence[str] = (),
+    ) -> Tensor:
+        """Log density of the next fixation over the pixels of the picture.
+
+        Args:
+            features: `Detector.features` of the pictures, or maps by name that cover the whole picture.
+            size: `(height, width)` of the picture in pixels; None takes that of `features`, or of its finest map.
+            scanpath: `(B, n, 2)`, fixations so far in pixels of the picture, the last one last, NaN before a shorter
+                path; None for the density of all fixations.
+            without: terms to leave out: `map`, `centre bias`, `oculomotor biases`.
+
+        Returns:
+            `(B, H, W)`, natural logarithms.
+
+        Raises:
+            InputError: a feature map is missing or has another number of channels, or there is no such term.
+        """
+        size = _size_of(features) if size is None else size
+        terms = self.terms(features, size, scanpath)
+        for name in without:
+            check(name in ("map", "centre bias", "oculomotor biases"), "without", "terms of the model", repr(name))
+        kept = [term for name, term in terms.items() if name not in without]
+        total = torch.stack(kept).sum(0) if kept else torch.zeros_like(terms["map"])
+        if total.shape[-2:] != size:
+            total = F.interpolate(total[:, None], size, mode="bilinear", align_corners=False)[:, 0]
+        return total - total.flatten(1).logsumexp(1)[:, None, None]
+
+    def terms(
+        self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Terms of the log density by name, up to a constant.
+
+        Args:
+            features: as for `forward`.
+            size: `(height, width)` of the picture in pixels.
+            scanpath: as for `forward`.
+
+        Returns:
+            `map`, `centre bias`, and with a scanpath `oculomotor biases`, each `(B, rows, columns)` over 52 cells along
+            the longer side.
+        """
+        terms = {"map": self.map(features, size), "centre bias": self.centre_bias(size)[None]}
+        if scanpath is not None:
+            return self.given(terms, size, scanpath)
+        terms["centre bias"] = terms["centre bias"].expand_as(terms["map"])
+        return terms
+
+    def map(self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int]) -> Tensor:
+        """The map m over the cells of pictures.
+
+        Args:
+            features: as for `forward`.
+            size: `(height, width)` of the pictures in pixels.
+
+        Returns:
+            `(B, rows, columns)`.
+        """
+        return self.readouts(features, size).mean(1)
+
+    def readouts(
+        self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
+    ) -> Tensor:
+        """The readouts, whose mean is the map.
+
+        Args:
+            features: as for `forward`.
+            size: `(height, width)` of the pictures in pixels.
+            read: weights of the channels in place of the model's own, for its fit.
+
+        Returns:
+            `(B, R, rows, columns)`.
+
+        Raises:
+            InputError: a feature map is missing or has another number of channels.
+        """
+        maps = features.maps if isinstance(features, FeatureMaps) else features
+        rows, columns = cells_of(size)
+        joined: dict[tuple[int, int], Tensor] = {}
+        weights = (self.read if read is None else read).split([*self.layers.values()], 1)
+        for (name, channels), weight in zip(self.layers.items(), weights, strict=True):
+            if name not in maps:
+                raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
+            each = maps[name].to(weight)
+            check_shape(each, f"features[{name!r}]", None, channels, None, None)
+            shape = (int(each.shape[-2]), int(each.shape[-1]))
+            value = torch.matmul(weight, each.flatten(2)).unflatten(-1, shape)
+            joined[shape] = joined[shape] + value if shape in joined else value
+        hidden = self.shift[:, None, None]
+        for shape, value in joined.items():
+            for axis, (start, end) in enumerate(_placed(features, shape)):
+                if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
+                    line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
+                    value = value @ line.mT if axis else line @ value
+            hidden = hidden + value
+        units = self.mix.shape[-1]
+        hidden = F.relu(hidden).flatten(2).unflatten(1, (-1, units))
+        hidden = F.relu(self.mix @ hidden + self.mix_shift[..., None])
+        value = (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, (rows, columns))
+        sigma = self.blur.exp()
+        return _gaussian(rows, sigma) @ value @ _gaussian(columns, sigma).mT
+
+    def centre_bias(self, size: tuple[int, int]) -> Tensor:
+        """The weighted log density of the centre bias.
+
+        Args:
+            size: `(height, width)` of the picture in pixels.
+
+        Returns:
+            `(rows, columns)`.
+        """
+        centre = self.centre.to(self.read)[None, None]
+        cells = F.interpolate(centre, cells_of(size), mode="bilinear", align_corners=False)[0, 0]
+        return self.centre_weight * cells
+
+    def given(
+        self,
+        terms: Mapping[str, Tensor],
+        size: tuple[int, int],
+        scanpath: Tensor,
+        corner: tuple[int, int, int] = (0, 0, 1),
+    ) -> dict[str, Tensor]:
+        """The terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
+
+        Args:
+            terms: map and centre bias `(B, rows, columns)` or `(1, rows, columns)`.
+            size: `(height, width)` of the picture in pixels.
+            scanpath: as for `forward`.
+            corner: first row, first column and step of the cells that are kept.
+
+        Returns:
+            The terms of `terms` with a scanpath.
+        """
+        longer = max(size)
+        path = (scanpath.to(self.read) + 0.5) / longer
+        rows, columns = cells_of(size)
+        top, left, step = corner
+        x = (torch.arange(left, columns, step).to(path) + 0.5) * (size[1] / columns / longer)
+        y = (torch.arange(top, rows, step).to(path) + 0.5) * (size[0] / rows / longer)
+        places = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1).flatten(0, 1)
+        gains = self.oculomotor.gains((~path[..., 0].isnan()).sum(1))
+        bias = self.oculomotor(path, places).unflatten(-1, (len(y), len(x)))
+        return {
+            "map": gains[:, 0, None, None] * terms["map"][:, top::step, left::step],
+            "centre bias": gains[:, 1, None, None] * terms["centre bias"][:, top::step, left::step],
+            "oculomotor biases": bias,
+        }
+
+    @torch.no_grad()
+    def sample(
+        self,
+        terms: Mapping[str, Tensor],
+        size: tuple[int, int],
+        start: Tensor,
+        fixations: int,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw scanpaths, one fixation after the other, each from the density after those before.
+
+        Args:
+            terms: `terms` of one picture without a scanpath.
+            size: `(height, width)` of the picture in pixels.
+            start: `(n, 2)`, first fixations in pixels of the picture.
+            fixations: number of fixations of each scanpath, the first included.
+            generator: random generator of the draws.
+
+        Returns:
+            `(n, fixations, 2)`, in pixels of the picture, anywhere in the drawn cells.
+
+        >>> model = FixationDensity({"backbone8": 3})
+        >>> terms = model.terms({"backbone8": torch.rand(1, 3, 6, 8)}, (60, 80))
+        >>> model.sample(terms, (60, 80), torch.full((5, 2), 30.0), 4).shape
+        torch.Size([5, 4, 2])
+        """
+        rows, columns = cells_of(size)
+        cell = torch.tensor([size[1] / columns, size[0] / rows]).to(start)
+        path = start[:, None]
+        for _ in range(fixations - 1):
+            log = torch.stack([*self.given(terms, size, path).values()]).sum(0)
+            drawn = log.flatten(1).double().softmax(1).multinomial(1, generator=generator)[:, 0]
+            corner = torch.stack([drawn % columns, drawn // columns], 1).to(start)
+            within = torch.rand(corner.shape, generator=generator).to(start)
+            path = torch.cat([path, ((corner + within) * cell - 0.5)[:, None]], 1)
+        return path
+
+    def extra_repr(self) -> str:
+        """Its layers and readouts."""
+        return f"layers={self.layers}, readouts={self.mix.shape[0]}, units={self.mix.shape[1]}"
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Tensors that are saved; the weights of the convolutions in half precision."""
+        tensors = super()._tensors()
+        return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
+
+    def _stated(self) -> dict[str, Any]:
+        """The layers that the weights belong to."""
+        return self._record()
+
+    def digest(self) -> str:
+        """Checksum of everything that results depend on."""
+        return checksum(self._tensors(), {"kind": self.kind, **self._record()})
+
+    def _record(self) -> dict[str, Any]:
+        return {"layers": [[name, channels] for name, channels in self.layers.items()]}
+
+    @classmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        readouts, units = tensors["mix"].shape[:2]
+        model = cls(dict(record["layers"]), readouts=readouts, units=units, metadata=record["metadata"])
+        expected = str(tuple(model.read.shape))
+        check(tensors["read"].shape == model.read.shape, "read", expected, tuple(tensors["read"].shape))
+        model.centre, model.duration = tensors["centre"], tensors["duration"]
+        model.to(tensors["shift"].dtype)
+        model.load_state_dict({name: value.to(tensors["shift"].dtype) for name, value in tensors.items()})
+        return model
+
+
+def cells_of(size: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
+    longer = max(size)
+    return max(1, round(CELLS * size[0] / longer)), max(1, round(CELLS * size[1] / longer))
+
+
+def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
+    """`(height, width)` of the pictures, or of the finest of maps that cover them."""
+    if isinstance(features, FeatureMaps):
+        return features.placement.size[1], features.placement.size[0]
+    return max((int(each.shape[-2]), int(each.shape[-1])) for each in features.values())
+
+
+def _placed(
+    features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First and last edge of the picture on a feature map, in rows and in columns of the map."""
+    if not isinstance(features, FeatureMaps):
+        return (0, shape[0]), (0, shape[1])
+    placement: Placement = features.placement
+    edges = []
+    for side, length in ((1, shape[0]), (0, shape[1])):
+        pixels = features.canvas[side] / length
+        start = placement.offset[side] / pixels
+        edges.append((start, start + placement.size[side] * placement.scale[side] / pixels))
+    return edges[0], edges[1]
+
+
+@constant
+def _interpolation(
+    cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Bilinear interpolation at the centres of cells between two edges of a line of pixels, `(cells, length)`."""
+    centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
+    place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
+    pixels = torch.arange(length, device=device, dtype=dtype)
+    return (1 - (place[:, None] - pixels).abs()).clamp(min=0)
+
+
+def _gaussian(cells: int, sigma: Tensor) -> Tensor:
+    """Blur of a line of cells by a Gaussian, whose weights within the line sum to 1, `(cells, cells)`."""
+    place = torch.arange(cells, device=sigma.device, dtype=sigma.dtype)
+    return (-(place[:, None] - place).square() / (2 * sigma.square())).softmax(-1)

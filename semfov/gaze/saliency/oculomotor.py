@@ -1,0 +1,127 @@
+"""Oculomotor biases: where the eye goes next after a scanpath, whatever is in the picture."""
+
+import torch
+from torch import Tensor, nn
+
+from semfov.errors import check, check_shape
+
+_LENGTHS = (0.0, 0.015, 0.03, 0.05, 0.075, 0.105, 0.145, 0.2, 0.27, 0.36, 0.5, 0.7, 1.0)
+"""Distances, in longer sides of the picture, between which the tables are interpolated."""
+_NEAR = (0.0, 0.02, 0.04, 0.07, 0.11, 0.16, 0.24)
+"""The same for refixation; from the last one on it has no effect."""
+_DIRECTIONS = 7
+_TURNS = 3
+_AGES = 4
+_NUMBERS = 12
+_MEMORY = 8
+"""Number of earlier fixations that refixation depends on, the latest ones."""
+
+
+class OculomotorBias(nn.Module):
+    r"""Log bias of the next fixation for saccade length and direction, for turns and for refixation.
+
+    .. math:: o(u \mid f_1 \ldots f_n) = \sum_k s_k(r) \, \phi_k(\theta) + \sum_k t_k(r) \cos(k\tau)
+              + \sum_{i<n} b_{n-i}(\|u - f_i\|)
+
+    r and θ are length and direction of the saccade from the last fixation :math:`f_n` to u, and τ is the turn from the
+    saccade before. The last sum is over the eight fixations before the last one. φ are 1, cos θ, sin θ, cos 2θ,
+    sin 2θ, cos 4θ and sin 4θ. The functions s, t and b are tables, interpolated linearly, in longer sides of the
+    picture; b differs by the age of a fixation up to four. Gains of the map and of the centre bias depend on the number
+    n of fixations so far.
+
+    The form follows DeepGaze III (Kümmerer, Bethge and Wallis, 2022), whose part is a network on distances and
+    differences to the last four fixations; tables can be read.
+
+    Shape:
+        - path: `(B, n, 2)`, `(x, y)` of the fixations so far in longer sides of the picture, the last one last; NaN
+          before the first one of a shorter path
+        - places: `(N, 2)`, in the same units
+        - output: `(B, N)`
+
+    >>> OculomotorBias()(torch.rand(2, 3, 2), torch.rand(5, 2)).shape
+    torch.Size([2, 5])
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.saccade = nn.Parameter(torch.zeros(_DIRECTIONS, len(_LENGTHS)))
+        self.turn = nn.Parameter(torch.zeros(_TURNS, len(_LENGTHS)))
+        self.back = nn.Parameter(torch.zeros(_AGES, len(_NEAR) - 1))
+        self.gain = nn.Parameter(torch.ones(2, _NUMBERS))
+
+    def forward(self, path: Tensor, places: Tensor) -> Tensor:
+        """Log bias of every place as the next fixation, up to a constant.
+
+        Args:
+            path: `(B, n, 2)`, fixations so far.
+            places: `(N, 2)`.
+
+        Returns:
+            `(B, N)`.
+        """
+        check_shape(path, "path", None, None, 2)
+        check_shape(places, "places", None, 2)
+        check(path.shape[1] > 0, "path", "at least one fixation", tuple(path.shape))
+        lengths, near = path.new_tensor(_LENGTHS), path.new_tensor(_NEAR)
+        last = path[:, -1]
+        ahead = places - last[:, None]
+        length = _norm(ahead)
+        across, down = (ahead / length[..., None].clamp(min=1e-9)).unbind(-1)
+        double = across.square() - down.square(), 2 * across * down
+        quadruple = double[0].square() - double[1].square(), 2 * double[0] * double[1]
+        directions = torch.stack([torch.ones_like(across), across, down, *double, *quadruple], -2)
+        bias = (_interpolated(self.saccade, lengths, length) * directions).sum(-2)
+        if path.shape[1] == 1:
+            return bias
+        before = path[:, -2]
+        step = torch.where(before.isnan(), 0.0, last - before)
+        unit = step / _norm(step)[:, None].clamp(min=1e-9)
+        along = across * unit[:, None, 0] + down * unit[:, None, 1]
+        turns = torch.stack([along, 2 * along.square() - 1, 4 * along**3 - 3 * along], -2)
+        known = (~before[:, :1].isnan()).to(bias)
+        bias = bias + known * (_interpolated(self.turn, lengths, length) * turns).sum(-2)
+        earlier = path[:, :-1].flip(1)[:, :_MEMORY]
+        seen = ~earlier[..., 0].isnan()
+        distance = _norm(places[:, None] - torch.where(seen[..., None], earlier, 0.0)[:, None])
+        ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
+        tables = torch.cat([self.back, self.back.new_zeros(_AGES, 1)], 1)[ages]
+        return bias + (_rowwise(tables, near, distance) * seen[:, None]).sum(-1)
+
+    def gains(self, number: Tensor) -> Tensor:
+        """Gains of the map and of the centre bias.
+
+        Args:
+            number: `(B,)`, number of fixations so far, from 1.
+
+        Returns:
+            `(B, 2)`.
+        """
+        return self.gain.t()[(number - 1).clamp(0, _NUMBERS - 1)]
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    """Lengths of vectors `(..., 2)`, with a gradient of 0 at 0."""
+    square = vectors.square().sum(-1)
+    positive = square > 0
+    return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
+
+
+def _position(knots: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """The knot below each distance, and the share of the way to the next one."""
+    low = (torch.bucketize(distance.detach(), knots, right=True) - 1).clamp(0, len(knots) - 2)
+    return low, ((distance - knots[low]) / (knots[low + 1] - knots[low])).clamp(0, 1)
+
+
+def _interpolated(tables: Tensor, knots: Tensor, distance: Tensor) -> Tensor:
+    """Values of tables `(T, K)` at distances `(B, N)`: `(B, T, N)`."""
+    low, share = _position(knots, distance)
+    values = tables.t()
+    return (values[low] + (values[low + 1] - values[low]) * share[..., None]).movedim(-1, -2)
+
+
+def _rowwise(tables: Tensor, knots: Tensor, distance: Tensor) -> Tensor:
+    """Values of tables `(T, K)`, each at its own distances `(B, N, T)`: `(B, N, T)`."""
+    low, share = _position(knots, distance)
+    row = torch.arange(len(tables), device=tables.device)
+    below = tables[row, low]
+    return below + (tables[row, low + 1] - below) * share

@@ -1,0 +1,113 @@
+"""Active perception of a camera or a video: one look at every frame, and evidence that fades between frames."""
+
+from typing import Any, get_args
+
+from semfov.agents.episode import Episode, without_none
+from semfov.agents.fovea import RATE, FoveaAgent, FoveaEpisode
+from semfov.agents.picture import open_picture
+from semfov.agents.windows import WINDOW_RATE, ZoomAgent
+from semfov.data.inputs import Color, ImageLike
+from semfov.errors import check, lookup
+from semfov.paths import Moment
+
+__all__ = ["LivePerception"]
+
+
+class LivePerception:
+    """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
+
+    The first frame decides (`how="auto"`): frames that are at least four times as long as the detector's input are
+    looked at by windows (`semfov.agents.WindowEpisode`), others by a fovea (`semfov.agents.FoveaEpisode`).
+
+    Args:
+        fovea: the part of an agent that looks by a fovea.
+        windows: the part of the agent that looks at windows.
+        target: class 1..K to search for; None explores.
+        targets: classes 1..K whose objects are all to be found, which windows do; none: of all classes.
+        how: the kind of look, `fovea`, `windows` or `auto`.
+        rate: rate at which evidence fades, per frame; None takes 0.1 for a fovea and 0.03 for windows.
+        start: first cell of a fovea; None draws one at random.
+        seed: seed of the generator that draws the start and breaks ties.
+        confirm: least probability for `found`; None takes that of the model.
+        give_up: probability below which a look is not worth a frame; None takes that of the model.
+        closer: largest number of closer looks in ln 2 / rate frames; None takes 2 for a fovea, and 100 for windows.
+        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+
+    Attributes:
+        how: the kind of look; `auto` before the first frame.
+
+    Raises:
+        InputError: an argument does not fit the kind of look.
+
+    Example::
+
+        live = ActivePerception.recommended().live("cup")
+        for frame in frames:
+            moment = live.step(frame)
+            print(moment.describe())
+    """
+
+    def __init__(
+        self,
+        fovea: FoveaAgent,
+        windows: ZoomAgent,
+        target: int | None = None,
+        targets: tuple[int, ...] = (),
+        *,
+        how: str = "auto",
+        rate: float | None = None,
+        start: int | None = None,
+        seed: int = 0,
+        confirm: float | None = None,
+        give_up: float | None = None,
+        closer: int | None = None,
+        color: Color = "rgb",
+    ) -> None:
+        check(how != "head", "how", "'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, "
+              "and for a panoramic frame search or find_all of semfov.Panorama(frame)", how)  # fmt: skip
+        several = "for all objects of several classes use how='windows', and for one of them a class without a list"
+        check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
+        self.how = "windows" if targets else how
+        self._start, self._canvas = start, windows.eye.detector.input_size
+        evidence = windows.evidence
+        self._photographs = start is None and evidence is not None and evidence.photograph is not None
+        settings: dict[str, Any] = {
+            "color": lookup(color, get_args(Color), "order of channels"),
+            **without_none(confirm=confirm, give_up=give_up, closer=closer),
+        }
+        self._episodes: dict[str, Episode[Any]] = {
+            "fovea": FoveaEpisode(
+                fovea, target, rate=RATE if rate is None else rate, start=start, seed=seed, **settings
+            ),
+            "windows": windows.episode(target, targets, rate=WINDOW_RATE if rate is None else rate, **settings),
+        }
+        self._check_start()
+
+    def step(self, frame: ImageLike) -> Moment:
+        """Look at the next frame.
+
+        Args:
+            frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
+
+        Returns:
+            What is known at this frame: a `FoveaMoment` or a `WindowMoment`.
+
+        Raises:
+            InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
+            DataError: the file of the frame cannot be read.
+        """
+        picture = open_picture(frame)
+        check(not picture.scene, "frame", "a picture; search and find_all take scenes", type(frame).__name__)
+        if self.how == "auto":
+            self.how = picture.kind("auto", self._canvas, photographs=self._photographs)
+            self._check_start()
+        return self._episodes[self.how].step(frame)
+
+    def describe(self) -> str:
+        """What is done in a few words."""
+        return self._episodes["windows"].describe()
+
+    def _check_start(self) -> None:
+        """Raise `InputError` for a first cell where there are no cells."""
+        fits = self._start is None or self.how != "windows"
+        check(fits, "start", "None for frames that are looked at by windows, or how='fovea'", self._start)

@@ -1,0 +1,35 @@
+"""A predicted density of fixations beside the fixations of people in the same picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from semfov.data.fixations.record import Fixations, warn_outside
+from semfov.metrics.scanpath.beside import people_density
+from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
+from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity
+from semfov.paths.gaze import GazePrediction
+
+
+def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> dict[str, float]:
+    """Measures of a density against all fixations of people but their first ones, and against their blurred density.
+
+    Maps have the cells of the prediction.
+    """
+    records = warn_outside("people", [each.resized(prediction.size) for each in people])
+    points = np.concatenate([each.points[1:][each.inside[1:]] for each in records])
+    cells = prediction.cells.double().numpy()
+    ratio = np.array(cells.shape[::-1]) / np.array(prediction.size)
+    x, y = ((points + 0.5) * ratio - 0.5).T
+    theirs = people_density(points, prediction.size, cells.shape)
+    return {
+        "NSS": float(nss(cells, x, y).mean()),
+        "AUC": float(auc(cells, x, y).mean()),
+        "AUC Judd": auc_judd(cells, x, y),
+        "log likelihood": float(log_likelihood(np.log(cells), x, y).mean()),
+        "CC": float(correlation(cells, theirs)),
+        "SIM": float(similarity(cells, theirs)),
+        "KL": float(kullback_leibler(theirs, cells)),
+    }

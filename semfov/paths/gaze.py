@@ -1,0 +1,333 @@
+"""The record of where people look in a picture: a density with its terms, and scanpaths drawn from it."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.data.fixations import Fixations, write_table
+from semfov.detection.detector import Detector
+from semfov.errors import check, check_number, check_whole
+from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.io.files import write_bytes
+from semfov.paths.stimulus import reduced_copy
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_REACH = 0.05
+"""Distance, in longer sides of the picture, within which probability belongs to a peak."""
+
+_LONGEST = 100
+"""Largest number of fixations of a drawn scanpath."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class GazePrediction:
+    """Where people look in a picture that they view freely, without a task.
+
+    Attributes:
+        model: the model.
+        terms: its terms for this picture (`FixationDensity.terms`).
+        size: `(width, height)` of the picture in pixels.
+        photograph: `(3, h, w)`, bytes, the reduced picture.
+        source: file of the picture; None if it does not come from a file.
+
+    Example::
+
+        gaze = agent.gaze("poster.jpg")
+        gaze.peaks()[0]  # where most fixations are expected
+        gaze.scanpaths(15, seconds=3.0)
+        gaze.report("poster.html")
+    """
+
+    model: FixationDensity
+    terms: Mapping[str, Tensor]
+    size: tuple[int, int]
+    photograph: Tensor
+    source: str | None = None
+
+    @classmethod
+    def of(cls, detector: Detector, image: Tensor, *, source: str | None = None) -> Self:
+        """Predict where people look in a picture, from one pass of a detector.
+
+        Args:
+            detector: the detector, for which a model is shipped.
+            image: `(3, H, W)`, RGB in [0, 1].
+            source: file of the picture.
+
+        Returns:
+            The prediction.
+
+        Raises:
+            InputError: no model is shipped for the detector.
+        """
+        model = FixationDensity.for_detector(detector)
+        with torch.no_grad():
+            features = detector.features(image[None], [*model.layers])
+            terms = model.to(image).terms(features, (image.shape[-2], image.shape[-1]))
+        size = features.placement.size
+        return cls(model.cpu(), {name: each.cpu() for name, each in terms.items()}, size, reduced_copy(image), source)
+
+    @cached_property
+    def density(self) -> Tensor:
+        """Probability of a fixation in each pixel of the picture, `(H, W)`, with sum 1."""
+        return self._over_pixels(self._log()).exp()
+
+    @cached_property
+    def cells(self) -> Tensor:
+        """Probability of a fixation in each cell, `(rows, columns)`, 52 along the longer side, with sum 1."""
+        log = self._log()
+        return (log - log.logsumexp((0, 1))).exp()
+
+    @property
+    def entropy(self) -> float:
+        """Entropy of the density over the cells, in bits; at most the logarithm of their number."""
+        return float(-torch.xlogy(self.cells, self.cells).sum() / math.log(2))
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """What each term adds: divergence in bits of the density from the one without the term, by its name."""
+        whole, parts = self.cells.log(), {}
+        for name in self.terms:
+            rest = sum((term[0] for other, term in self.terms.items() if other != name), torch.zeros_like(whole))
+            parts[name] = float((self.cells * (whole - rest + rest.logsumexp((0, 1)))).sum() / math.log(2))
+        return parts
+
+    def peaks(self, count: int = 5) -> list[dict[str, float]]:
+        """The places where most fixations are expected, the most likely first.
+
+        Args:
+            count: largest number of places.
+
+        Returns:
+            For each place `x` and `y` in pixels of the picture, and `share`, the probability of a fixation within 5 %
+            of the longer side around it. Places are at least twice as far apart.
+
+        Raises:
+            InputError: `count` is out of range.
+        """
+        check_whole(count, "count", 1, 100)
+        rows, columns = self.cells.shape
+        width, height = self.size
+        x = (torch.arange(columns) + 0.5) * (width / columns)
+        y = (torch.arange(rows) + 0.5) * (height / rows)
+        places = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+        near = torch.cdist(places, places) <= _REACH * max(self.size)
+        share = near.to(self.cells) @ self.cells.flatten()
+        free = torch.ones(len(places), dtype=torch.bool)
+        found: list[dict[str, float]] = []
+        while len(found) < count and bool(free.any()):
+            best = int(torch.where(free, share, -1.0).argmax())
+            at = places[best].tolist()
+            found.append({"x": at[0] - 0.5, "y": at[1] - 0.5, "share": float(share[best])})
+            free &= torch.cdist(places[best][None], places)[0] > 2 * _REACH * max(self.size)
+        return found
+
+    def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
+        """Draw scanpaths of viewers.
+
+        First fixations, durations and pauses are drawn from the distributions of the people of the fit.
+
+        Args:
+            people: number of viewers.
+            seconds: time for which each views the picture.
+            seed: seed of all draws.
+
+        Returns:
+            A record for each viewer, in pixels of the picture, with durations.
+
+        Raises:
+            InputError: an argument is out of range.
+        """
+        check_whole(people, "people", 1, 10_000)
+        check_number(seconds, "seconds", 0.1, 60.0)
+        generator = torch.Generator().manual_seed(seed)
+        model, (width, height) = self.model, self.size
+        side = torch.tensor([width, height])
+        drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
+        mean, spread = model.start.cpu().float()
+        start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
+        start = torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
+        most = min(_LONGEST, math.ceil(seconds * 1000 / 60) + 1)
+        spans = model.duration.cpu().float()
+        spans = torch.cat([spans, spans[-1:].expand(max(most - len(spans), 0), -1)])[:most]
+        times = (spans[:, 0] + spans[:, 1] * torch.randn(people, most, generator=generator)).exp()
+        ends = (times + model.pause.cpu().float()).cumsum(1)
+        lengths = ((ends < seconds * 1000).sum(1) + 1).clamp(max=most)
+        paths = model.sample(self.terms, (height, width), start, int(lengths.max()), generator)
+        name = self.name
+        return [
+            Fixations(
+                name,
+                f"viewer {number + 1}",
+                path[:length].double().numpy(),
+                self.size,
+                time[:length].double().round().numpy(),
+            )
+            for number, (path, length, time) in enumerate(zip(paths, lengths.tolist(), times, strict=True))
+        ]
+
+    @property
+    def name(self) -> str:
+        """Name of the picture's file, or its size."""
+        return Path(self.source).name if self.source else f"{self.size[0]} × {self.size[1]} px"
+
+    @property
+    def image(self) -> Tensor:
+        """The reduced picture, `(3, h, w)` in [0, 1]."""
+        return self.photograph.float() / 255
+
+    def given(self, scanpaths: Sequence[Fixations], number: int) -> Tensor:
+        """Mean density over the cells of the next fixation of viewers after `number` fixations, `(rows, columns)`.
+
+        Args:
+            scanpaths: their scanpaths; those that are shorter are left out.
+            number: number of fixations so far, at least 1.
+
+        Returns:
+            The density; that of all fixations where no scanpath is long enough.
+        """
+        long_enough = [each.resized(self.size).points[:number] for each in scanpaths if len(each) >= number]
+        points = [torch.from_numpy(each) for each in long_enough]
+        if not points:
+            return self.cells
+        with torch.no_grad():
+            given = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
+        return torch.stack([*given.values()]).sum(0).flatten(1).softmax(1).mean(0).view_as(self.cells)
+
+    def compare(self, people: Sequence[Fixations]) -> dict[str, float]:
+        """Compare the density with fixations of people in the same picture, all but the first of each person.
+
+        Args:
+            people: their fixations, in any size of the picture.
+
+        Returns:
+            By name: `NSS`, `AUC`, `AUC Judd`, `log likelihood` in bits above uniform, and against the density of the
+            people, blurred by 3 % of the longer side, `CC`, `SIM` and `KL` in nats. Fixations outside are left out.
+
+        Raises:
+            InputError: there are no fixations, they are of several pictures, or their frame has other proportions.
+        """
+        check(len(people) > 0, "people", "fixations of at least one person", "none")
+        pictures = sorted({each.picture for each in people})
+        check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
+        width, height = self.size
+        for each in people:
+            same = abs(each.size[0] * height - each.size[1] * width) <= max(width, height) + max(each.size)
+            check(same, "people", f"fixations in a frame with the proportions of {width} × {height}", each.size)
+        from semfov.metrics.scanpath.density import compare_density
+
+        return compare_density(self, people)
+
+    def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
+        """Draw the density over the picture, with its peaks.
+
+        Args:
+            ax: axes to draw in; None makes a new figure.
+            options: `scanpaths`, to draw over it.
+
+        Returns:
+            The figure.
+        """
+        from semfov.viz.gaze import plot_gaze
+
+        return plot_gaze(self, ax=ax, **options)
+
+    def report(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> Path:
+        """Write an HTML page with the density, contours and scanpaths, a single file that loads nothing from elsewhere.
+
+        Args:
+            path: the file.
+            people: number of viewers whose scanpaths are drawn.
+            seconds: time for which each views the picture.
+            seed: seed of all draws.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: the file does not end in `.html` or `.htm`, or an argument is out of range.
+            DataError: the file cannot be written.
+        """
+        from semfov.report.gaze import DrawnGaze, write_gaze_page
+
+        drawn = DrawnGaze(self, tuple(self.scanpaths(people, seconds=seconds, seed=seed)))
+        return write_gaze_page(path, f"semfov: where people look in {self.name}", [drawn])
+
+    def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
+        """Write drawn scanpaths as a table that `semfov.data.fixations.read_table` reads.
+
+        Args:
+            path: the file.
+            people: number of viewers.
+            seconds: time for which each views the picture.
+            seed: seed of all draws.
+        """
+        write_table(path, self.scanpaths(people, seconds=seconds, seed=seed))
+
+    def save_density(self, path: str | PathLike[str]) -> Path:
+        """Write the density over the pixels: `.npy`, `.tif` with 32-bit numbers, or `.png` with the picture.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: the file has another suffix.
+            DataError: the file cannot be written.
+        """
+        path = Path(path)
+        kind = path.suffix.lower()
+        check(kind in (".npy", ".tif", ".tiff", ".png"), "path", "a file that ends in .npy, .tif or .png", path)
+        content = io.BytesIO()
+        if kind == ".npy":
+            np.save(content, self.density.numpy(), allow_pickle=False)
+        elif kind == ".png":
+            self.plot().savefig(content, format="png", dpi=150)
+        else:
+            from PIL import Image
+
+            Image.fromarray(self.density.float().numpy()).save(content, format="TIFF")
+        write_bytes(path, content.getvalue())
+        return path
+
+    def describe(self) -> str:
+        """Describe the prediction in one line."""
+        first = self.peaks(1)[0]
+        return (
+            f"{first['share']:.0%} of fixations within {_REACH:.0%} of ({first['x']:.0f}, {first['y']:.0f}); "
+            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits"
+        )
+
+    def __repr__(self) -> str:
+        """The description, and the places where most fixations are expected."""
+        lines = [
+            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {peak['share']:.0%}"
+            for number, peak in enumerate(self.peaks(), 1)
+        ]
+        return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
+
+    def _log(self) -> Tensor:
+        """Log density over the cells, up to a constant."""
+        return torch.stack([term[0] for term in self.terms.values()]).sum(0)
+
+    def _over_pixels(self, log: Tensor) -> Tensor:
+        """Log density over the pixels from one over the cells."""
+        size = self.size[::-1]
+        over = F.interpolate(log[None, None], size, mode="bilinear", align_corners=False)[0, 0]
+        return over - over.logsumexp((0, 1))

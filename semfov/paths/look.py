@@ -1,0 +1,103 @@
+"""One look of a record: where it was, what it detected, and what it showed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.large import LargePicture
+from semfov.data.reduction import reduction_for
+from semfov.detection.detections import Detections
+
+Box = tuple[float, float, float, float]
+"""`(x1, y1, x2, y2)`."""
+
+
+@dataclass(frozen=True)
+class RecordedLook:
+    """One look of a record, in pixels of the picture.
+
+    Attributes:
+        number: number of the look, from 0.
+        fixation: `(x, y)`, the fixated point.
+        region: `(x1, y1, x2, y2)`, the part of the picture that the look shows.
+        detections: its detections, a batch of one.
+        seconds: time at its end, on the clock of the episode; None if it is not known.
+        value: value for which it was chosen; None if it was not chosen by a value.
+        more: what looks of this kind have beside, as plain values: further columns of `Record.rows`.
+
+    Example::
+
+        for look in agent.search("kitchen.jpg", "cup"):
+            print(look.number, look.fixation, look.seconds)
+    """
+
+    number: int
+    fixation: tuple[float, float]
+    region: Box
+    detections: Detections
+    seconds: float | None = None
+    value: float | None = None
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+
+class LookView(NamedTuple):
+    """What a look showed: pixels `(3, h, w)`, and in pixels of a frame of this size boxes `(L, 4)` and the gaze."""
+
+    pixels: Tensor
+    size: tuple[int, int]
+    boxes: Tensor
+    gaze: tuple[float, float]
+
+
+def whole_pixels(box: Sequence[float], size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """A region in whole pixels, with at least one pixel, inside a picture of `(width, height)`."""
+    x1, y1 = (min(max(round(low), 0), most - 1) for low, most in zip(box[:2], size, strict=True))
+    x2, y2 = (min(max(round(high), low + 1), most) for high, low, most in zip(box[2:], (x1, y1), size, strict=True))
+    return x1, y1, x2, y2
+
+
+def read_region(source: LargePicture, region: Sequence[float], size: tuple[int, int], across: int) -> Tensor:
+    """Pixels `(3, h, w)` in [0, 1] of a region of a picture of `size`; one wider than `across` is read coarsely."""
+    scale = [there / here for there, here in zip(source.size, size, strict=True)] * 2
+    frame = whole_pixels([n * by for n, by in zip(region, scale, strict=True)], source.size)
+    return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255
+
+
+def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]:
+    """Columns of a table on a fixated cell: its place, its probability `(cells,)`, and the most probable cell."""
+    row, column = divmod(cell, grid.columns)
+    return {
+        **{"cell": cell, "column": column, "row": row},
+        "probability": None if belief is None else float(belief[cell]),
+        "highest": None if belief is None else float(belief.max()),
+        "highest_cell": None if belief is None else int(belief.argmax()),
+    }
+
+
+def detections_in_words(detections: Detections, classes: Sequence[str], most: int = 3, score: float = 0.0) -> str:
+    """Name the most confident detections of a look.
+
+    Args:
+        detections: detections of one image, the most confident first.
+        classes: names of the classes, background first.
+        most: largest number of detections that are named.
+        score: least confidence of the detections that count.
+
+    Returns:
+        The text.
+
+    >>> import torch
+    >>> cups = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.1, 0.9], [0.4, 0.6]]]), torch.ones(1, 2).bool())
+    >>> detections_in_words(cups, ("background", "cup"), most=1), detections_in_words(cups, ("", "cup"), score=0.95)
+    ('cup 0.90 and 1 more', 'nothing')
+    """
+    columns = (detections.labels, detections.confidence, detections.mask)
+    looks = zip(*(column.flatten().tolist() for column in columns), strict=True)
+    sure = [f"{classes[label]} {confidence:.2f}" for label, confidence, real in looks if real and confidence >= score]
+    more = f" and {len(sure) - most} more" if len(sure) > most else ""
+    return ", ".join(sure[:most]) + more or "nothing"

@@ -1,0 +1,115 @@
+"""A page of where people look in pictures, with a slider over the fixations of drawn viewers."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.data.fixations import Fixations
+from semfov.io.files import write_text
+from semfov.paths.gaze import GazePrediction
+from semfov.report.episode import Data, jpeg_uri
+from semfov.report.page import colour_steps, json_script, page_path
+from semfov.viz.gaze import MASSES
+from semfov.viz.style import COLOURS, overlay_colours
+
+_FOLDER = Path(__file__).parent
+_WIDTH, _QUALITY = 960, 80
+_MOST_STEPS = 12
+"""Largest number of fixations of the slider."""
+
+
+@dataclass(frozen=True)
+class DrawnGaze:
+    """A prediction with the scanpaths that are drawn from it."""
+
+    prediction: GazePrediction
+    scanpaths: tuple[Fixations, ...]
+
+
+def write_gaze_page(path: str | PathLike[str], title: str, drawn: Sequence[DrawnGaze]) -> Path:
+    """Write the page of one or several pictures; the path must end in `.html` or `.htm`."""
+    path = page_path(Path(path))
+    data = {
+        "pictures": [_picture(each) for each in drawn],
+        "heat": colour_steps(overlay_colours()),
+        "colours": list(COLOURS),
+    }
+    contents = {
+        "title": escape(title),
+        "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
+        "program": (_FOLDER / "gaze.js").read_text(encoding="utf-8"),
+        "data": json_script(data),
+        "facts": "".join(_facts(each.prediction, number) for number, each in enumerate(drawn)),
+    }
+    template = (_FOLDER / "gaze.html").read_text(encoding="utf-8")
+    write_text(path, re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template))
+    return path
+
+
+def _picture(drawn: DrawnGaze) -> Data:
+    """The data of a picture: maps before and after each fixation, contours and scanpaths."""
+    prediction = drawn.prediction
+    steps = min(max(map(len, drawn.scanpaths)), _MOST_STEPS)
+    maps = [prediction.cells, *(prediction.given(drawn.scanpaths, number) for number in range(1, steps + 1))]
+    return {
+        "name": prediction.name,
+        "size": list(prediction.size),
+        "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
+        "cells": list(prediction.cells.shape),
+        "maps": [_quantised(each) for each in maps],
+        "contours": [_contours(each, prediction.size) for each in maps],
+        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in drawn.scanpaths],
+    }
+
+
+def _quantised(cells: Tensor) -> str:
+    """A map relative to its largest value, a byte for each cell, as base64."""
+    values = (cells / cells.max() * 255).round().byte().numpy()
+    return base64.b64encode(values.tobytes()).decode()
+
+
+def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
+    """SVG paths around the smallest regions that hold given shares of all fixations, in pixels of the picture."""
+    from contourpy import contour_generator
+
+    values: NDArray[np.float64] = cells.double().numpy()
+    rows, columns = values.shape
+    x = (np.arange(-1, columns + 1) + 0.5) * size[0] / columns
+    y = (np.arange(-1, rows + 1) + 0.5) * size[1] / rows
+    # An edge of zeros closes the contours at the border of the picture.
+    made = contour_generator(x.clip(0, size[0]), y.clip(0, size[1]), np.pad(values, 1))
+    ordered = np.sort(values.reshape(-1))[::-1]
+    levels = [ordered[min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)] for mass in MASSES]
+    lines: list[list[NDArray[np.float64]]] = [made.lines(level) for level in levels]  # type: ignore[misc]
+    return [
+        "".join("M" + "L".join(f"{px:.0f},{py:.0f}" for px, py in line.tolist()) + "Z" for line in several)
+        for several in lines
+    ]
+
+
+def _facts(prediction: GazePrediction, number: int) -> str:
+    """What is known of a picture without the script: entropy, terms, and places in order."""
+    bits = ", ".join(f"{name} {value:.2f}" for name, value in prediction.parts.items())
+    rows = "".join(
+        f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{peak['share']:.1%}</td></tr>"
+        for place, peak in enumerate(prediction.peaks(), 1)
+    )
+    return (
+        f'<section class="facts-of" id="facts-{number}"><h2>{escape(prediction.name)}</h2>'
+        f'<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
+        f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
+        '<div class="wide" tabindex="0" role="region" aria-label="Places">'
+        '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
+        f'<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 %</th></tr></thead><tbody>{rows}'
+        "</tbody></table></div></section>"
+    )

@@ -1,0 +1,130 @@
+"""The command `semfov gaze`: what it prints and writes."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn import functional as F
+
+from semfov import Detector
+from semfov.cli.main import main
+from semfov.data.fixations import by_picture, read_table
+from semfov.detection import Candidates
+from semfov.gaze.saliency import FixationDensity
+
+
+class Colours(Detector):
+    """Its only feature map is the picture itself."""
+
+    def propose(self, canvas):
+        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
+
+    def propose_with_features(self, canvas, layers=None):
+        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 8)}
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Runs the command with a model for `Colours`; returns code, output and errors."""
+    detector = Colours("colours", ("cup",), (416, 416), stride=32).eval()
+    torch.manual_seed(0)
+    model = FixationDensity({"backbone8": 3}, metadata={"detector": detector.settings()})
+    monkeypatch.setattr(FixationDensity, "shipped", tmp_path / "models")
+    model.save(tmp_path / "models/colours.safetensors")
+    monkeypatch.setattr("semfov.cli.gaze.check_detector", lambda name: None)
+    monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: detector)
+
+    def call(*words):
+        code = main(["gaze", *map(str, words)])
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, size in enumerate([(120, 90), (80, 100)]):
+        pixels = np.random.default_rng(number).integers(256, size=(size[1], size[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+    return folder
+
+
+def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
+    table, page = tmp_path / "gaze.csv", tmp_path / "gaze.html"
+    code, out, err = run(photos, "--people", 4, "--seconds", 1.5, "--out", table, "--report", page)
+    assert (code, err) == (0, "")
+    assert out.count("entropy") == out.count("4 viewers drawn") == 2
+    assert str(table) in out
+    assert str(page) in out
+    people = by_picture(read_table(table))
+    assert {name: len(some) for name, some in people.items()} == {"0.png": 4, "1.png": 4}
+    assert {each.size for each in people["1.png"]} == {(80, 100)}
+    html = page.read_text()
+    assert "0.png" in html
+    assert "Where most fixations are expected" in html
+    assert "<script src" not in html
+    assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_the_seed_repeats_the_table(run, photos, tmp_path):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        assert run(photos, "--people", 2, "--seed", seed, "--out", tmp_path / f"{name}.csv")[0] == 0
+    first, second, third = ((tmp_path / f"{name}.csv").read_text() for name in "abc")
+    assert first == second != third
+
+
+@pytest.mark.parametrize("name", ["density.npy", "density.tif", "map.png"])
+def test_the_density_of_one_picture(run, photos, tmp_path, name):
+    code, _, err = run(photos / "0.png", "--out", tmp_path / name)
+    assert (code, err) == (0, "")
+    if name == "density.npy":
+        density = np.load(tmp_path / name)
+        assert density.shape == (90, 120)
+        assert density.sum() == pytest.approx(1, abs=1e-4)
+
+
+def test_a_folder_gets_scanpaths_and_heat_maps(run, photos, tmp_path):
+    assert run(photos, "--out", tmp_path / "new")[0] == 0
+    assert sorted(each.name for each in (tmp_path / "new").iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
+
+
+def test_a_damaged_picture_of_several_is_skipped(run, photos, tmp_path):
+    (photos / "2.png").write_bytes(b"no picture")
+    code, out, err = run(photos, "--out", tmp_path / "gaze.csv")
+    assert code == 1
+    assert "skipped" in err
+    assert "2.png" in err
+    assert out.count("entropy") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--out", "gaze.pdf"], "a folder, or a file .csv"),
+        (["--out", "density.npy"], "a .csv file or a folder for several pictures"),
+        (["--report", "gaze.pdf"], ".html"),
+        (["--people", "0"], "people"),
+    ],
+)
+def test_wrong_options_are_told_before_a_look(run, photos, words, told):
+    code, out, err = run(photos, *words)
+    assert code != 0
+    assert told in err
+    assert "entropy" not in out
+
+
+def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
+    other = Colours("other", ("cup",), (416, 416), stride=32).eval()
+    monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: other)
+    code, _, err = run(photos / "0.png")
+    assert code == 1
+    assert "train.fit_gaze" in err
+    assert "colours" in err
+
+
+def test_without_a_picture_it_takes_an_embedded_scene(run):
+    code, out, _ = run("--people", 2)
+    assert code == 0
+    assert "embedded scene" in out

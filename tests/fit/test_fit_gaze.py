@@ -1,0 +1,184 @@
+"""The fit of where people look, on fixations that were drawn from a known density."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from torch.nn import functional as F
+
+from semfov import Detector, saliency
+from semfov.data.fixations import Fixations, write_osie
+from semfov.detection import Candidates
+from semfov.fit.gaze import (
+    describe_viewing,
+    events_of,
+    fit_map,
+    fit_oculomotor,
+    folds,
+    log_centre,
+    maps_of,
+    people_score,
+    score,
+    summary_of,
+    viewed,
+)
+from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.metrics.scanpath import auc, log_likelihood, nss
+from train.fit_gaze import main
+
+SIZE = (60, 80)
+
+
+class Colours(Detector):
+    """Its only feature map is the picture itself, in pixels of 8."""
+
+    def propose(self, canvas):
+        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
+
+    def propose_with_features(self, canvas, layers=None):
+        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 2)}
+
+
+def picture(seed):
+    """A grey picture with red and blue discs, and the place of the red one, which people look at."""
+    generator = torch.Generator().manual_seed(seed)
+    image = 0.5 * torch.ones(3, *SIZE)
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
+    places = torch.rand(2, 2, generator=generator) * torch.tensor([56.0, 36.0]) + 12
+    for channel, place in zip((0, 2), places, strict=True):
+        inside = (x - place[0]) ** 2 + (y - place[1]) ** 2 < 64
+        image[:, inside] = 0.1
+        image[channel, inside] = 0.9
+    return image, places[0].numpy()
+
+
+def people(seed, place, count=6):
+    rng, times = np.random.default_rng(seed), np.full(8, 200.0)
+    points = (np.clip(place + 3 * rng.standard_normal((8, 2)), 0, (79, 59)) for _ in range(count))
+    return [Fixations(f"{seed}.png", str(number), each, (80, 60), times) for number, each in enumerate(points)]
+
+
+@pytest.fixture(scope="module")
+def group():
+    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
+    shown = [(seed, *picture(seed)) for seed in range(24)]
+    (made,) = viewed(detector, [(image, people(seed, place)) for seed, image, place in shown], None)
+    return made
+
+
+def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
+    torch.manual_seed(0)
+    fitted, held = folds(len(group), 4, 0)
+    counts = group.counts()
+    model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([counts[torch.as_tensor(fitted)]]))
+    losses = []
+    done = lambda epoch, loss: losses.append(loss)  # noqa: E731
+    fit_map(model, [group], [counts], [fitted], epochs=60, rate=0.02, dropout=0.0, done=done)
+    assert losses[-1] < losses[0] - 1
+    base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
+    maps = maps_of(model, group, held)
+    baseline = score(base, group, torch.zeros_like(maps), held, conditional=False)
+    scores = summary_of(score(model, group, maps, held, conditional=False), baseline)
+    assert scores["gain"] > 1.5
+    assert scores["NSS"] > 3
+    fit_oculomotor(model, [group], [maps_of(model, group, fitted)], [fitted], epochs=15, rate=0.1)
+    after = summary_of(score(model, group, maps, held, conditional=True), baseline)
+    assert after["gain"] > scores["gain"] - 0.05
+    describe_viewing(model, [group])
+    assert float(model.duration[0, 0]) == pytest.approx(math.log(200), abs=1e-5)
+    assert float(model.pause) == pytest.approx((3000 - 1600) / 8)
+
+
+def test_scores_equal_the_measures_of_scanpaths(group):
+    """Of a picture whose cells are the bins, so that nothing is summed."""
+    torch.manual_seed(1)
+    model = saliency.FixationDensity({"backbone8": 3}, centre=torch.randn(39, 52)).requires_grad_(False)
+    maps = torch.randn(1, *cells_of(SIZE))
+    scored = score(model, group, maps, [2], conditional=False, raster=(52, 39))[0]
+    log = (maps[0] + model.centre_bias(SIZE)).double()
+    log = log - log.logsumexp((0, 1))
+    cell = events_of(group.paths[2], SIZE, cells_of(SIZE)).cell.numpy()
+    x, y = cell % 52, cell // 52
+    expected = [nss(log.exp(), x, y).mean(), auc(log, x, y).mean(), log_likelihood(log, x, y).mean()]
+    np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-4)
+
+
+def test_people_are_scored_by_the_others(group):
+    """Twin: the density of the others of one person by `scipy.ndimage.gaussian_filter`, far from the border."""
+    scored = people_score(group, [5], torch.zeros(39, 52), share=0.05)[0]
+    bits = []
+    for person, path in enumerate(group.paths[5]):
+        counts = np.zeros((30, 40))
+        for other, theirs in enumerate(group.paths[5]):
+            if other != person:
+                np.add.at(counts, tuple(((theirs[1:].numpy()[:, ::-1] + 0.5) / 2).astype(int).T), 1)
+        density = gaussian_filter(counts, 1.0, mode="constant", truncate=6)
+        density = 0.95 * density / density.sum() + 0.05 / 1200
+        bits += [math.log2(1200 * density[int((y + 0.5) / 2), int((x + 0.5) / 2)]) for x, y in path[1:].tolist()]
+    assert float(scored[2]) == pytest.approx(np.mean(bits), abs=0.05)
+
+
+def test_oculomotor_biases_recover_a_known_saccade_length():
+    """People whose saccades are all of one length, in any direction: the fitted bias peaks there."""
+    rng = np.random.default_rng(0)
+    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
+    shown = []
+    for seed in range(12):
+        some = []
+        for n in range(6):
+            path = [np.array([40.0, 30.0])]
+            while len(path) < 8:
+                angle = rng.uniform(0, 2 * math.pi)
+                new = path[-1] + 20 * np.array([math.cos(angle), math.sin(angle)])
+                if (new >= 0).all() and new[0] < 80 and new[1] < 60:
+                    path.append(new)
+            some.append(Fixations(f"{seed}", str(n), np.array(path), (80, 60)))
+        shown.append((torch.full((3, *SIZE), 0.5), some))
+    (group,) = viewed(detector, shown, None)
+    model = saliency.FixationDensity({"backbone8": 3})
+    pictures = [list(range(12))]
+    fit_oculomotor(model, [group], [torch.zeros(12, *cells_of(SIZE))], pictures, epochs=30, rate=0.2)
+    path = torch.tensor([[[0.5, 0.4]]])
+    places = torch.tensor([[0.5, 0.4]]) + torch.tensor([0.05, 0.15, 0.25, 0.36, 0.5])[:, None] * torch.tensor(
+        [0.6, -0.8]
+    )
+    assert int(model.oculomotor(path, places)[0].argmax()) == 2
+
+
+def test_folds_hold_out_each_picture_once():
+    held = [folds(11, 3, fold)[1] for fold in range(3)]
+    assert sorted(each for some in held for each in some) == list(range(11))
+    for fold in range(3):
+        fitted, out = folds(11, 3, fold)
+        assert sorted(fitted + out) == list(range(11))
+
+
+@pytest.mark.slow
+def test_a_run_writes_a_model_and_a_report(tmp_path, monkeypatch, capsys):
+
+    (tmp_path / "pictures").mkdir()
+    everyone = []
+    for seed in range(6):
+        image, place = picture(seed)
+        pixels = (image * 255).byte().permute(1, 2, 0).numpy()
+        Image.fromarray(np.kron(pixels, np.ones((2, 2, 1), np.uint8))).save(tmp_path / "pictures" / f"{seed}.png")
+        everyone += [each.resized((160, 120)) for each in people(seed, place, 2)]
+    write_osie(tmp_path / "fixations.json", everyone)
+    detector = Colours("colours", ("none",), (160, 120), stride=4).eval()
+    monkeypatch.setattr("train.gaze.load_detector", lambda name, **options: detector)
+    run = ["--fixations", f"[{tmp_path / 'fixations.json'}]", "--pictures", f"[{tmp_path / 'pictures'}]"]
+    run += ["--sizes", "['160,120']", "--folds", "2", "--epochs", "2", "--units", "4", "--out", str(tmp_path / "out")]
+    assert main(run) == 0, capsys.readouterr().err
+    model = saliency.FixationDensity.from_pretrained(tmp_path / "out/colours.safetensors")
+    assert model.layers == {"backbone8": 3}
+    assert model.metadata["training"]["pictures"] == 6
+    model.check_compatible(detector)
+    rows = json.loads((tmp_path / "out/folds.json").read_text())
+    report = (tmp_path / "out/report.md").read_text()
+    mean = sum(row["map"]["NSS"] * row["pictures"] for row in rows) / 6
+    assert f"{mean:.3f}" in report
+    assert sum(row["pictures"] for row in rows) == 6

@@ -1,0 +1,144 @@
+"""The record of where people look: density, terms, places and drawn scanpaths."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov import InputError
+from semfov.data.fixations import Fixations, read_table
+from semfov.gaze.saliency import FixationDensity
+from semfov.metrics.scanpath import auc, correlation, nss
+from semfov.paths import GazePrediction
+from tests.small import rand
+
+
+def bump(x, y, rows=39, columns=52, width=2.0):
+    across, down = torch.arange(columns) - x, torch.arange(rows)[:, None] - y
+    return torch.exp(-(across**2 + down**2) / (2 * width**2))
+
+
+@pytest.fixture
+def gaze():
+    torch.manual_seed(0)
+    model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
+    model.oculomotor.saccade.normal_(0, 0.5)
+    model.pause.fill_(50.0)
+    log = (0.02 + 3 * bump(10, 8) + bump(40, 30)).log()
+    terms = {"map": log[None], "centre bias": -rand(1, 39, 52)}
+    return GazePrediction(model, terms, (104, 78), (rand(3, 78, 104) * 255).byte(), "folder/poster.png")
+
+
+def test_the_density_sums_to_one_and_follows_the_terms(gaze):
+    assert gaze.density.shape == (78, 104)
+    assert float(gaze.density.sum()) == pytest.approx(1, abs=1e-5)
+    assert float(gaze.cells.sum()) == pytest.approx(1, abs=1e-5)
+    total = gaze.terms["map"][0] + gaze.terms["centre bias"][0]
+    torch.testing.assert_close(gaze.cells, total.flatten().softmax(0).view(39, 52))
+    p = gaze.cells.double()
+    assert gaze.entropy == pytest.approx(float(-(p * p.log2()).sum()), abs=1e-4)
+
+
+def test_parts_are_divergences_from_the_density_without_a_term(gaze):
+    p = gaze.cells.double()
+    for name, rest in (("map", "centre bias"), ("centre bias", "map")):
+        q = gaze.terms[rest][0].double().flatten().softmax(0).view(39, 52)
+        assert gaze.parts[name] == pytest.approx(float((p * (p / q).log2()).sum()), abs=1e-4)
+
+
+def test_places_are_the_peaks_in_order(gaze):
+    first, second, *others = gaze.peaks(6)
+    assert (first["x"], first["y"]) == pytest.approx((20.5, 16.5), abs=2)
+    assert (second["x"], second["y"]) == pytest.approx((80.5, 60.5), abs=2)
+    shares = [each["share"] for each in (first, second, *others)]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) < 1
+    near = (torch.arange(104) - first["x"]) ** 2 + (torch.arange(78)[:, None] - first["y"]) ** 2 <= 5.2**2
+    assert first["share"] == pytest.approx(float(gaze.density[near].sum()), rel=0.1)
+    with pytest.raises(InputError, match="count"):
+        gaze.peaks(0)
+
+
+def test_scanpaths_last_as_long_as_people_view(gaze):
+    paths = gaze.scanpaths(200, seconds=3.0, seed=4)
+    assert len(paths) == 200
+    for each in paths:
+        assert each.size == (104, 78)
+        assert each.picture == "poster.png"
+        assert each.inside.all()
+        assert (each.durations[:-1] + 50).sum() < 3000.5 + len(each)
+    # Durations are log-normal: their mean is exp(µ + σ²/2), here 233 ms.
+    mean = math.exp(5.3 + 0.55**2 / 2)
+    durations = np.concatenate([each.durations[:3] for each in paths if len(each) >= 3])
+    assert durations.mean() == pytest.approx(mean, rel=0.12)
+    assert np.mean([len(each) for each in paths]) == pytest.approx(3000 / (mean + 50), rel=0.2)
+    assert len(gaze.scanpaths(3, seconds=0.1)) == 3
+
+
+def test_the_seed_repeats_scanpaths(gaze):
+    again = gaze.scanpaths(4, seed=1), gaze.scanpaths(4, seed=1)
+    assert all(np.array_equal(a.points, b.points) for a, b in zip(*again, strict=True))
+    other = gaze.scanpaths(4, seed=2)
+    assert not all(np.array_equal(a.points, b.points) for a, b in zip(again[0], other, strict=True))
+
+
+@pytest.mark.parametrize(("name", "value"), [("people", 0), ("seconds", 0.0), ("seconds", 1e9)])
+def test_wrong_numbers_are_named(gaze, name, value):
+    with pytest.raises(InputError, match=name):
+        gaze.scanpaths(**{name: value})
+
+
+def test_the_next_fixation_of_viewers_is_the_mean_of_their_densities(gaze):
+    paths = gaze.scanpaths(5, seed=3)
+    mean = gaze.given(paths, 2)
+    each = torch.stack([gaze.given([path], 2) for path in paths if len(path) >= 2])
+    torch.testing.assert_close(mean, each.mean(0))
+    assert float(mean.sum()) == pytest.approx(1, abs=1e-5)
+    torch.testing.assert_close(gaze.given(paths, 90), gaze.cells)
+
+
+def test_files_hold_what_was_predicted(gaze, tmp_path):
+    gaze.to_csv(tmp_path / "paths.csv", people=3, seed=5)
+    for stored, drawn in zip(read_table(tmp_path / "paths.csv"), gaze.scanpaths(3, seed=5), strict=True):
+        np.testing.assert_allclose(stored.points, drawn.points)
+        np.testing.assert_allclose(stored.durations, drawn.durations)
+    np.testing.assert_array_equal(np.load(gaze.save_density(tmp_path / "density.npy")), gaze.density.numpy())
+    with Image.open(gaze.save_density(tmp_path / "density.tif")) as image:
+        np.testing.assert_array_equal(np.array(image), gaze.density.numpy())
+    with Image.open(gaze.save_density(tmp_path / "map.png")) as image:
+        assert image.size[0] > 300
+    with pytest.raises(InputError, match=r"\.npy, \.tif or \.png"):
+        gaze.save_density(tmp_path / "density.pdf")
+
+
+def test_comparison_equals_the_measures(gaze):
+    points = [np.array([[50.0, 40.0], [20.0, 17.0], [81.0, 60.0]]), np.array([[5.0, 5.0], [22.0, 15.0]])]
+    people = [Fixations("a.png", str(n), each, (104, 78)) for n, each in enumerate(points)]
+    scores = gaze.compare(people)
+    later = np.concatenate([each[1:] for each in points])
+    x, y = ((later + 0.5) / 2 - 0.5).T
+    cells = gaze.cells.double().numpy()
+    assert scores["NSS"] == pytest.approx(nss(cells, x, y).mean())
+    assert scores["AUC"] == pytest.approx(auc(cells, x, y).mean())
+    column, row = np.arange(52), np.arange(39)[:, None]
+    around = [(column - a) ** 2 + (row - b) ** 2 for a, b in zip(x, y, strict=True)]
+    theirs = np.exp(-np.array(around) / (2 * 1.56**2)).sum(0)
+    assert scores["CC"] == pytest.approx(float(correlation(cells, theirs)), abs=1e-6)
+    doubled = [each.resized((208, 156)) for each in people]
+    assert gaze.compare(doubled)["NSS"] == pytest.approx(scores["NSS"])
+
+
+def test_frames_of_other_proportions_are_refused(gaze):
+    square = Fixations("a.png", "1", np.array([[5.0, 5.0], [7.0, 8.0]]), (100, 100))
+    with pytest.raises(InputError, match="proportions of 104 × 78"):
+        gaze.compare([square])
+    with pytest.raises(InputError, match="at least one person"):
+        gaze.compare([])
+
+
+def test_words(gaze):
+    assert "entropy" in gaze.describe()
+    assert repr(gaze).count("\n") == len(gaze.peaks())
+    assert gaze.plot() is not None
