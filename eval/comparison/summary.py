@@ -17,11 +17,12 @@ from semfov.io.code import commit
 from semfov.io.files import inside, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
+from semfov.io.tables import csv_text
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.setup import observation_name
-from semfov.runs.tables import csv_text, percent
+from semfov.runs.tables import percent
 from semfov.version import __version__
 
 _Value = TypeVar("_Value", float, FloatArray)
