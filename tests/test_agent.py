@@ -17,6 +17,7 @@ from semfov.gaze.policies import KL, NonPredictive, Predictive, Random
 from semfov.io.state import without_settings
 from semfov.sensor import foveate
 from tests.small import Coloured
+from tests.small import agent as one_agent
 
 SIZE = (160, 120)
 
@@ -425,7 +426,7 @@ def test_all_objects_are_found_by_the_fovea(agent, image):
 
 
 def test_agents_and_streams_are_printed_in_one_line():
-    agent = small.agent(small.Coloured(("red", "wine glass")))
+    agent = one_agent(Coloured(("red", "wine glass")))
     text = repr(agent)
     assert ("\n" in text, len(text) < 160) == (False, True)
     assert "coloured, 2 classes" in text
