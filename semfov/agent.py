@@ -207,6 +207,16 @@ class ActivePerception(nn.Module):
         self.eye.detector._apply(fn, recurse)
         return self
 
+    def __repr__(self) -> str:
+        """The detector, the sensor and the parts that were fitted, in one line."""
+        detector, fitted = self.eye.detector, ["windows"] if self.windows is not None else []
+        fitted += ["closer looks"] if self.verification is not None else []
+        return (
+            f"{type(self).__name__}: {detector.settings()['name']}, {len(detector.classes)} classes, "
+            f"{type(self.eye.sensor).__name__}, {self.columns} × {self.rows} cells; "
+            f"fitted for {' and '.join(fitted) or 'neither windows nor closer looks'}"
+        )
+
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
@@ -576,8 +586,8 @@ class ActivePerception(nn.Module):
         """Open the picture, choose the kind of look, and check the limits that suit it."""
         opened = open_picture(picture, color)
         kind = self._kind_of(opened, how, every=every, foveal=foveal or shifts is not None)
-        only_for(kind, "fovea", "passes", shifts=shifts)
-        only_for(kind, "head", "seconds", duration=duration)
+        only_for(kind, "fovea", "passes=", shifts=shifts)
+        only_for(kind, "head", "seconds=", duration=duration)
         return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}
 
     def _check_parts(self) -> None:

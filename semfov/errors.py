@@ -16,7 +16,17 @@ Name = TypeVar("Name", bound=str)
 
 
 def printable(text: str) -> str:
-    """Text in which control characters, and bytes of names that are not UTF-8, are escaped; lines stay."""
+    r"""Escape control characters, and bytes of names that are not UTF-8; lines stay.
+
+    Args:
+        text: a text, such as the name of a file.
+
+    Returns:
+        The text that a terminal may show.
+
+    >>> printable("a" + chr(27) + "[2J.jpg")
+    'a\\x1b[2J.jpg'
+    """
     steering = ("Cc", "Cf", "Cs")  # controls, marks of direction and lone surrogates
     return "".join(
         ascii(each)[1:-1] if unicodedata.category(each) in steering and each not in "\n\t" else each for each in text
@@ -63,7 +73,8 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
 def values_known(*tensors: Tensor) -> bool:
     """Tell whether the values of tensors can be read.
 
-    They cannot while a graph is traced or under a transform of `torch.func`. Checks of values are left out there.
+    They cannot while a graph is traced, under a transform of `torch.func`, or on the device `meta`. Checks of values
+    are left out there.
 
     Args:
         tensors: tensors of any shape.
@@ -76,7 +87,7 @@ def values_known(*tensors: Tensor) -> bool:
     >>> torch.func.vmap(lambda row: torch.tensor(values_known(row)))(torch.ones(2, 3))
     tensor([False, False])
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or any(tensor.is_meta for tensor in tensors):
         return False
     try:
         for tensor in tensors:

@@ -107,6 +107,10 @@ class LivePerception:
         """What is done in a few words."""
         return self._episodes["windows"].describe()
 
+    def __repr__(self) -> str:
+        """What is done, and the kind of look."""
+        return f"{type(self).__name__}: {self.describe()}, how={self.how!r}"
+
     def _check_start(self) -> None:
         """Raise `InputError` for a first cell where there are no cells."""
         fits = self._start is None or self.how != "windows"

@@ -400,7 +400,7 @@ def test_the_kind_of_look_follows_from_the_picture(agent):
     assert agent.kind_of_look(large.permute(1, 2, 0).numpy()) == "windows"
     assert agent.kind_of_look(large, "fovea") == "fovea"
     assert agent.search(large, "red", how="fovea", shifts=1).image.shape == large.shape
-    with pytest.raises(InputError, match=r"shifts: expected None .* use passes, or how='fovea'"):
+    with pytest.raises(InputError, match=r"shifts: expected None .* use passes=, or how='fovea'"):
         agent.search(large, "red", shifts=2)
     with pytest.raises(InputError, match="unknown kind of look 'zoom'"):
         agent.search(small, "red", how="zoom")
@@ -422,3 +422,12 @@ def test_all_objects_are_found_by_the_fovea(agent, image):
     alone = agent.find_all(image, "green", how="fovea", passes=6).objects
     assert set(alone.labels.tolist()) == {2}
     assert any(box == pytest.approx([130, 100, 140, 110], abs=6) for box in alone.boxes.tolist())
+
+
+def test_agents_and_streams_are_printed_in_one_line():
+    agent = small.agent(small.Coloured(("red", "wine glass")))
+    text = repr(agent)
+    assert ("\n" in text, len(text) < 160) == (False, True)
+    assert "coloured, 2 classes" in text
+    live = agent.live("red", how="fovea")
+    assert repr(live) == "LivePerception: searching for “red”, how='fovea'"

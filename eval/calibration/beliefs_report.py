@@ -15,9 +15,10 @@ from eval.calibration.cell_figure import plot_cell_reliability
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
+from semfov.io.tables import csv_text
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.scene_run import ResultRecord, gather
-from semfov.runs.tables import csv_text, table
+from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
 _Sums = dict[tuple[str, int, str], BinarySums]

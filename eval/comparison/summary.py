@@ -15,12 +15,14 @@ import torch
 
 from semfov.io.code import commit
 from semfov.io.files import inside, write_text
+from semfov.io.state import without_settings
 from semfov.io.storage import checksum
+from semfov.io.tables import csv_text
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import ResultRecord, gather
 from semfov.runs.setup import observation_name
-from semfov.runs.tables import csv_text, percent
+from semfov.runs.tables import percent
 from semfov.version import __version__
 
 _Value = TypeVar("_Value", float, FloatArray)
@@ -164,7 +166,9 @@ def manifest(run: PolicyLooking, program: str, seconds: dict[str, float]) -> str
         "saliency_keys": {name: store.key for name, store in run.saliency_stores.items()},
         "scenes_sha256": run.scenes.fingerprint,
         "eye": run.eye.settings(),
-        "model_sha256": None if run.models.observation is None else checksum(run.models.observation.state_dict()),
+        "model_sha256": None
+        if run.models.observation is None
+        else checksum(without_settings(run.models.observation.state_dict())),
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
     }

@@ -195,14 +195,14 @@ class DecisionRun(PolicyLooking):
         )
         decision = path.decision
         assert decision is not None
-        found = decision.outcome == "found" and decision.box is not None
+        box = decision.box if decision.outcome == "found" else None
         return {
             "outcome": decision.outcome,
             "probability": decision.probability,
             "place": decision.place,
             "looks": path.passes,
             "closer": len(path.closer),
-            "right_place": bool(search.goal[cell_of(decision.box, grid)]) if found else None,
+            "right_place": None if box is None else bool(search.goal[cell_of(box, grid)]),
             "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
             "landing": None,
             "landing_seen": None,

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import closing, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from tqdm import tqdm
@@ -22,7 +22,7 @@ from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
-from semfov.cli.results import ResultsFile, kind_of
+from semfov.cli.results import STDOUT, ResultsFile, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.sources import embedded_picture
@@ -67,7 +67,7 @@ class PictureJob(ABC):
         """What outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
         agent, folder = self.agent, self.options.models
         return {
-            "options": {name: value for name, value in self.options.plain().items() if name not in WHERE},
+            "options": {name: value for name, value in self.options.plain().items() if name not in (*WHERE, "quiet")},
             "eye": agent.eye.settings(),
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
@@ -112,7 +112,7 @@ class PictureJob(ABC):
         how: How = "auto" if isinstance(picture, World) else options.how
         arguments: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
         arguments |= {"shifts": options.shifts, "duration": options.duration}
-        if not self.several and sys.stderr.isatty():
+        if not self.several and not options.quiet and sys.stderr.isatty():
             bar = tqdm(desc=Path(source.name).name, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
             arguments["on_look"] = lambda record: bar.update(record.passes - bar.n)
         return arguments
@@ -139,6 +139,7 @@ class _PictureFiles:
     """Files that a command writes about its pictures: results, figures and a page."""
 
     job: PictureJob
+    stream: TextIO
     results: ResultsFile | None = None
     folder: Path | None = None
     written: list[Path] = field(default_factory=list)
@@ -152,9 +153,10 @@ class _PictureFiles:
             return
         kind = kind_of(out)
         file = out if kind is not None else out / "results.json"
-        self.results = ResultsFile(file, kind or ".json", searched=self.job.title.startswith("search"))
+        searched = self.job.title.startswith("search")
+        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream)
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
-        if self.job.several:
+        if self.job.several and out != STDOUT:
             key = digest_of([self.job.depends_on(), package_digest()])[:32]
             versions = [source.version() for source in self.job.sources]
             folder = file.with_name(f"{file.name}.unfinished")
@@ -187,7 +189,7 @@ class _PictureFiles:
         written = self.written
         if self.results is not None:
             self.results.write()
-            written = [self.results.path, *written]
+            written = [*([] if self.results.path == STDOUT else [self.results.path]), *written]
         if self.episodes:
             episodes = [self.episodes[number] for number in sorted(self.episodes)]
             written = [*written, write_page(self.job.options.report, f"semfov: {self.job.title}", episodes)]
@@ -197,8 +199,8 @@ class _PictureFiles:
             shutil.rmtree(self.finished.folder.parent, ignore_errors=True)
 
 
-def look_at_pictures(job: PictureJob) -> int:
-    """Look at all pictures, print the outcomes, and write the files that the options name.
+def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
+    """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream.
 
     A picture that cannot be read is reported and left out, unless it is the only one. With a file of results, a command
     that was stopped continues.
@@ -207,7 +209,7 @@ def look_at_pictures(job: PictureJob) -> int:
     sources, several = job.sources, job.several
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")
-    outputs = _PictureFiles(job)
+    outputs = _PictureFiles(job, stream)
     skipped, complete, endings = 0, False, Counter[str]()
     before = outputs.before()
     if before:

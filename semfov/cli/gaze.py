@@ -16,6 +16,7 @@ from semfov.data.inputs import as_image
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import SemfovError, check
+from semfov.io.files import check_writable
 from semfov.paths.gaze import GazePrediction
 from semfov.report.gaze import DrawnGaze, write_gaze_page
 from semfov.report.page import page_path
@@ -32,7 +33,7 @@ def predict_gaze(options: GazeOptions) -> int:
         kind not in _DENSITIES or len(sources) < 2, "out", "a .csv file or a folder for several pictures", options.out
     )
     if options.report is not None:
-        page_path(options.report)
+        check_writable(page_path(options.report))
     check_detector(options.detector)
     loaded: dict[str, Any] = {} if options.weights is None else {"weights": options.weights}
     detector = load_detector(options.detector, **loaded)
@@ -42,7 +43,9 @@ def predict_gaze(options: GazeOptions) -> int:
         sources = [PictureSource("embedded scene", scene=scene)]
     drawn: list[DrawnGaze] = []
     skipped = 0
-    for source in tqdm(sources, unit="picture", leave=False, disable=len(sources) == 1 or not sys.stderr.isatty()):
+    for source in tqdm(
+        sources, unit="picture", leave=False, disable=len(sources) == 1 or options.quiet or not sys.stderr.isatty()
+    ):
         try:
             image = as_image(str(source.file), argument="picture") if source.scene is None else source.scene.image
             prediction = GazePrediction.of(detector, image, source=None if source.file is None else str(source.file))

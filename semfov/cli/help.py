@@ -40,10 +40,11 @@ _LOOKS = """\
   --seconds S          longest time for a picture; the first limit that is reached ends it"""
 
 _OUTPUT = """\
-  --out FILE           results as .json, .csv, .geojson, or for COCO .coco.json, written while it runs
+  --out FILE           .json, .jsonl, .csv, .geojson, or for COCO .coco.json, written as it runs; - is standard output
   --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
                        also views,belief, and in a search belief_bars
   --report PAGE.html   a page in which to step through the looks; --looks prints them
+  --quiet              errors and warnings alone
   --workers N          processes that look at several pictures; --scheduler tcp://HOST:8786 for those of a Dask cluster
 
 A picture of several that cannot be read is reported and skipped; the exit code is then 1. If the command is stopped,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
@@ -51,6 +52,17 @@ def options_of(name: str) -> type[Any]:
 
 
 def _run(name: str, options: Any) -> int | None:
+    """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
+    stream = sys.stdout
+    if getattr(options, "quiet", False):
+        with open(os.devnull, "w") as nothing, redirect_stdout(nothing):
+            return _subcommand(name, options, stream)
+    beside = str(getattr(options, "out", None)) == "-"
+    with redirect_stdout(sys.stderr if beside else stream):
+        return _subcommand(name, options, stream)
+
+
+def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
     """Run a subcommand; what it needs is imported now."""
     if name == "fit":
         from semfov.fit.detector import fit_folder
@@ -71,7 +83,7 @@ def _run(name: str, options: Any) -> int | None:
         return list_detectors(options)
     from semfov.cli.search import look_at
 
-    return look_at(options)
+    return look_at(options, stream)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -38,6 +38,7 @@ class AgentOptions(Settings):
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
         seed: seed of the random start, of ties and of the embedded scene.
+        quiet: print errors and warnings alone.
     """
 
     agent: Literal["recommended", "published", "raw"] = "recommended"
@@ -47,6 +48,7 @@ class AgentOptions(Settings):
     sensor: SensorName | None = None
     start: str | None = None
     seed: Seed = 0
+    quiet: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class PictureOptions(AgentOptions):
         shifts: largest number of gaze shifts of a fovea (none: 30 for a search, 20 otherwise, without limit of passes).
         seconds: longest time in seconds for each picture on this machine.
         duration: longest time in seconds that eye and head move in a scene (none: 30).
-        out: file of results, `.json`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and results.
+        out: file of results, `.json`, `.jsonl`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and
+            results; `-` writes JSON lines to standard output, and everything else to standard error.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
             where), `belief_bars` (of a search) and `animation`; `none` draws nothing (not given: all but `belief_bars`,
             if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are
@@ -192,6 +195,7 @@ class GazeOptions(Settings):
         out: file of scanpaths, `.csv`; of the density of one picture, `.npy`, `.tif` or `.png`; or a folder for
             scanpaths and a heat map of each picture.
         report: HTML page to write, in which to step through the fixations.
+        quiet: print errors and warnings alone.
     """
 
     pictures: tuple[str, ...] = ()
@@ -202,6 +206,7 @@ class GazeOptions(Settings):
     seed: Seed = 0
     out: Path | None = None
     report: Path | None = None
+    quiet: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,27 +1,31 @@
-"""Files of results: JSON, CSV, GeoJSON and COCO, written while pictures are looked at."""
+"""Files of results: JSON, JSON lines, CSV, GeoJSON and COCO, written while pictures are looked at."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from semfov.cli.text import found_place
 from semfov.data.classes import canonical_name
 from semfov.errors import check
 from semfov.io.files import write_text
+from semfov.io.tables import csv_text
 from semfov.paths import GazeRecord
+from semfov.paths.conversion import COLUMNS
 
-_RESULT_KINDS = (".coco.json", ".json", ".csv", ".geojson")
+_RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
 """Ends of the names of files of results."""
 
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
 
+STDOUT = Path("-")
+"""Standard output in place of a file of results, which takes JSON lines."""
+
 _DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", "x1", "y1", "x2", "y2", "passes", "seconds")
+
+_OBJECTS = ("picture", "width", "height", *COLUMNS, "expected", "expected_error")
 
 
 def kind_of(path: Path) -> str | None:
@@ -30,6 +34,8 @@ def kind_of(path: Path) -> str | None:
     >>> kind_of(Path("boxes.json")), kind_of(Path("boxes.coco.json")), kind_of(Path("runs/one"))
     ('.json', '.coco.json', None)
     """
+    if path == STDOUT:
+        return ".jsonl"
     name = path.name.lower()
     kind = next((kind for kind in _RESULT_KINDS if name.endswith(kind)), None)
     fits = kind is not None or not path.suffix or path.is_dir()
@@ -41,7 +47,8 @@ def result_row(
     record: GazeRecord, name: str, seconds: float, kind: str | None, file: Path | None = None
 ) -> dict[str, Any]:
     """Make the entry of a picture in a file of results."""
-    row: dict[str, Any] = {"picture": {**_summary(name, record, seconds), "objects": record.object_rows()}}
+    picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+    row: dict[str, Any] = {"picture": {key: value for key, value in picture.items() if key not in ("looks", "summary")}}
     if kind == ".geojson":
         collection = record.to_geojson(source=file)
         row["coordinates"] = collection["coordinates"]
@@ -58,30 +65,52 @@ def result_row(
 
 
 class ResultsFile:
-    """A file of results that is complete for the pictures so far, whenever the command ends."""
+    """A file of results that is complete for the pictures so far, whenever the command ends.
 
-    def __init__(self, path: Path, kind: str, *, searched: bool) -> None:
+    JSON lines are written one by one, to the stream if one is given; the other kinds as a whole, atomically.
+    """
+
+    def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO) -> None:
         self.path, self.kind, self.searched = path, kind, searched
         self._rows: dict[int, dict[str, Any]] = {}
         self._skipped: dict[int, dict[str, str]] = {}
         self._due = 0.0
+        self._stream = stream if path == STDOUT else None
+        if kind == ".jsonl" and self._stream is None:
+            write_text(path, "")
 
     def add(self, number: int, row: dict[str, Any]) -> None:
         """Add a picture."""
         self._rows[number] = row
-        if time.monotonic() >= self._due:
+        if self.kind == ".jsonl":
+            self._line(row["picture"])
+        elif time.monotonic() >= self._due:
             self.write()
 
     def skip(self, number: int, name: str, reason: str) -> None:
         """Add a picture that could not be read, and the reason."""
         self._skipped[number] = {"picture": name, "error": reason}
+        if self.kind == ".jsonl":
+            self._line(self._skipped[number])
 
     def write(self) -> None:
         """Write the file, atomically."""
+        if self.kind == ".jsonl":
+            return
         began = time.monotonic()
         write_text(self.path, self._text())
         took = time.monotonic() - began
         self._due = began + took / _SHARE
+
+    def _line(self, values: dict[str, Any]) -> None:
+        """Write a line now."""
+        line = json.dumps(values, ensure_ascii=False) + "\n"
+        if self._stream is not None:
+            self._stream.write(line)
+            self._stream.flush()
+            return
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(line)
 
     def _text(self) -> str:
         rows = [self._rows[number] for number in sorted(self._rows)]
@@ -107,29 +136,22 @@ class ResultsFile:
         return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
     def _csv(self, pictures: list[dict[str, Any]]) -> str:
-        text = io.StringIO()
-        if self.searched:
-            rows, names = pictures, list(_DECISIONS)
-        else:
-            rows = [{"picture": each["picture"], **row} for each in pictures for row in each["objects"]]
-            names = list(rows[0]) if rows else ["picture", "class", "score", "x1", "y1", "x2", "y2"]
-        table = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-        return text.getvalue()
+        rows = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
+        columns = _DECISIONS if self.searched else _OBJECTS
+        return csv_text([columns, *([row.get(name) for name in columns] for row in rows)])
 
 
-def _summary(name: str, record: GazeRecord, seconds: float) -> dict[str, Any]:
-    """Values of a picture as a whole: its size, the decision with its place, passes and seconds."""
-    width, height = record.size
-    row: dict[str, Any] = {"picture": name, "width": width, "height": height, "target": record.target_name}
-    if record.decision is not None:
-        point, box = found_place(record, record.decision) if record.decision.outcome == "found" else (None, None)
-        row |= {"outcome": record.decision.outcome, "probability": record.decision.probability}
-        row |= dict(zip("xy", point or (None, None), strict=True))
-        row |= dict(zip(("x1", "y1", "x2", "y2"), box or [None] * 4, strict=True))
-    figures = {"least": record.least, "expected": record.expected, "passes": record.passes}
-    return {**row, **figures, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row for each object, and one without an object for each class that has none, or for a picture without any."""
+    rows = picture["objects"]
+    seen = {row["class"] for row in rows}
+    missing = [name for name in picture["targets"] if name not in seen] or ([] if rows else [None])
+    whole = {name: picture[name] for name in ("picture", "width", "height")}
+    numbers = picture["expected"], picture["expected_error"]
+    return [
+        {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_OBJECTS[-2:], numbers, strict=True)}}
+        for row in [*rows, *({"class": name} for name in missing)]
+    ]
 
 
 def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, get_args
+from typing import Any, TextIO, get_args
 
 from semfov.agents.picture import PictureLike
 from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
-from semfov.cli.results import kind_of
+from semfov.cli.results import STDOUT, kind_of
 from semfov.cli.sources import PictureSource, start_beside
 from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check
+from semfov.io.files import check_writable
 from semfov.paths import GazeRecord
 from semfov.report.page import page_path
 
@@ -46,7 +48,8 @@ class _SearchJob(PictureJob):
         foveal = len(weights) > 1 or self.start is not None or shared.get("shifts") is not None
         kind = agent.kind_of_look(picture, shared["how"], foveal=foveal)
         if kind != "fovea" and len(weights) > 1:
-            print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}")
+            print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}",
+                  file=sys.stderr)  # fmt: skip
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
         start = start_beside(agent, source, options.seed) if beside else self.start
@@ -101,18 +104,18 @@ _JOBS: dict[type[PictureOptions], Callable[[Any], PictureJob]] = {
 }
 
 
-def look_at(options: PictureOptions) -> int:
+def look_at(options: PictureOptions, stream: TextIO) -> int:
     """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
-    return look_at_pictures(_JOBS[type(options)](options))
+    return look_at_pictures(_JOBS[type(options)](options), stream)
 
 
 def _check(options: PictureOptions) -> Any:
     """Check what can be checked before anything is loaded; returns the first cell."""
-    if options.out is not None:
-        kind_of(options.out)
+    if options.out is not None and options.out != STDOUT:
+        check_writable(options.out, folder=kind_of(options.out) is None)
     if options.report is not None:
-        page_path(options.report)
-    check(not options.draw or options.out is not None, "draw", "--out FOLDER beside --draw", "none")
+        check_writable(page_path(options.report))
+    check(not options.draw or options.out not in (None, STDOUT), "draw", "--out FOLDER beside --draw", "none")
     return start_of(options.start)
 
 

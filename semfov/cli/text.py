@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 
 from semfov.decision import Decision
+from semfov.detection.objects import box_text
 from semfov.paths import GazeRecord, Scanpath, detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.semantic import named_regions
@@ -35,23 +36,10 @@ def _decision_text(record: GazeRecord, decision: Decision) -> str:
     if decision.outcome != "found":
         where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
         return f"{name} {where}, {probability}"
-    point, box = found_place(record, decision)
-    edges = f", box {_box_text(box)}" if box is not None else ""
+    point, box = record.found_at, decision.box
+    edges = f", box {box_text(box.tolist())}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
     return f"found {name}{where}{edges}, {probability}"
-
-
-def found_place(
-    record: GazeRecord, decision: Decision
-) -> tuple[tuple[float, float] | None, tuple[float, float, float, float] | None]:
-    """Middle and box of what was found, in picture pixels; the middle of the cell where there is no box; → `(x, y)`."""
-    if decision.box is not None:
-        x1, y1, x2, y2 = (float(edge) for edge in decision.box)
-        return ((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1, x2, y2)
-    if isinstance(record, Scanpath) and decision.cell is not None:
-        x, y = record.grid.centres[decision.cell].tolist()
-        return (x, y), None
-    return None, None
 
 
 def _objects_lines(record: GazeRecord) -> list[str]:
@@ -59,21 +47,11 @@ def _objects_lines(record: GazeRecord) -> list[str]:
     rows = record.object_rows()
     lines = [
         f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
-        f"box {_box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' if row['confirmed'] else ''}"
+        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' if row['confirmed'] else ''}"
         for row in rows[:_OBJECTS_LISTED]
     ]
     more = len(rows) - _OBJECTS_LISTED
     return [*lines, f"  and {more} more (--out FILE.json writes all)"] if more > 0 else lines
-
-
-def _box_text(box: Sequence[float]) -> str:
-    """Corners of a box in whole pixels.
-
-    >>> _box_text((380.2, 190.0, 443.9, 276.4))
-    '380,190–444,276'
-    """
-    x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
-    return f"{x1},{y1}–{x2},{y2}"
 
 
 def _regions_lines(scanpath: Scanpath) -> list[str]:
@@ -97,7 +75,7 @@ def looks_text(record: GazeRecord) -> str:
         [
             str(look.number),
             f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
-            "the whole picture" if record.is_whole(look.region) else _box_text(look.region),
+            "the whole picture" if record.is_whole(look.region) else box_text(look.region),
             detections_in_words(look.detections, record.classes, score=CONFIDENT),
             "" if look.value is None else f"{look.value:.3f}",
             "" if look.seconds is None else f"{look.seconds:.2f}",
@@ -105,12 +83,10 @@ def looks_text(record: GazeRecord) -> str:
         for look in record
     ]
     head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
-    if not any(row[-1] for row in rows):  # windows have no times
-        rows, head = [row[:-1] for row in rows], head[:-1]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
-        lines.append(f"  closer look {number} at {_box_text(close_up.box.tolist())}: {chance}")
+        lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
     return "\n".join(lines)
 
 

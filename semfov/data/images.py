@@ -77,8 +77,9 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
         try:
             with open_pillow(path) as image:
-                _check_pixels(image.size, name)
                 check_proportion(image, path)
+                _check_pixels(image.size, name)
+                wide = image.mode in _SIXTEEN_BITS
                 array = _pixels(image, name, upright=oriented)
         except DataError:
             raise
@@ -95,7 +96,19 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"{name}: truncated, damaged or of an unsupported kind ({reason}); replace it") from error
+    if wide:
+        warn_of_range(float(array.min()) * 65535, float(array.max()) * 65535, path)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
+
+
+def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
+    """Warn of a picture of 16 bits with less than a quarter of their range, of which little is seen."""
+    if 0 < most - least < 65535 / 4:
+        warnings.warn(
+            f"image {Path(path)}: values from {least:.0f} to {most:.0f} of 16 bits, whose white is 65535, show little; "
+            "scale them to 8 bits, such as (image - low) / (high - low) between two percentiles",
+            stacklevel=3,
+        )
 
 
 @contextmanager
@@ -108,7 +121,7 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, Image.open(file, formats=[n for n in FORMATS if n in Image.OPEN]) as image:
         if image.format == "TIFF":
-            tags = image.tag_v2
+            tags: Any = getattr(image, "tag_v2", {})
             side = (tags[322], tags[323]) if 322 in tags else (image.width, tags.get(278, image.height))
             bits = tags.get(258, (1,))
             size = math.prod(side) * max(tags.get(277, 1), len(bits)) * max(bits) // 8
@@ -121,8 +134,8 @@ def check_proportion(image: Any, path: str | PathLike[str]) -> None:
     """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
     pixels, size = math.prod(image.size), Path(path).stat().st_size
     if pixels > _SMALL and pixels > _MOST_A_BYTE * size:
-        got = f"{pixels:,} pixels in {size:,} bytes"
-        raise DataError(f"image {Path(path)}: expected a file in proportion, got {got}; replace it")
+        expected, got = f"at most {MAX_PIXELS:,} pixels, in proportion to the file", f"{pixels:,} in {size:,} bytes"
+        raise DataError(f"image {Path(path)}: expected {expected}, got {got}; replace it")
 
 
 def check_tile(size: int, stored: int, name: str) -> None:

@@ -5,7 +5,7 @@ import warnings
 import weakref
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from os import PathLike
@@ -27,6 +27,7 @@ from semfov.data.images import (
     over_white,
     read_image,
     turned,
+    warn_of_range,
 )
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.reduction import (
@@ -53,10 +54,15 @@ _TILED = (".tif", ".tiff")
 _PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
 _WHITE_IS_ZERO, _PALETTE, _YCBCR = 0, 3, 6  # photometric interpretations of a TIFF
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a fourth channel
+_SEEN = 64  # side of the windows in which the range of a picture of 16 bits is looked at
 _JPEG = 7
 _WIDTH, _HEIGHT, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES = 256, 257, 259, 262, 274, 277
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
-_INFLATERS = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+_INFLATERS: dict[int, Callable[[], Any]] = {
+    8: zlib.decompressobj,
+    32946: zlib.decompressobj,
+    34925: lzma.LZMADecompressor,
+}
 """Decoders of compressions whose data may inflate a thousandfold, by their numbers in a TIFF."""
 
 
@@ -231,6 +237,8 @@ class _TiffPicture(LargePicture):
         self.size = shape[1], shape[0]
         if max(self.size) > MOST_SIDE:
             raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {shape[1]} × {shape[0]}")
+        if page.dtype == np.uint16:
+            _warn_of_range(self)
 
     @property
     def has_overviews(self) -> bool:
@@ -311,6 +319,8 @@ class _RasterPicture(LargePicture):
         named = [meanings.index(name) + 1 for name in ("red", "green", "blue") if name in meanings]
         self._bands = named if len(named) == 3 else [1, 2, 3] if self._file.count >= 3 else [1]
         self.size = self._file.width, self._file.height
+        if "uint16" in kinds:
+            _warn_of_range(self)
         self._has_overviews = bool(self._file.overviews(self._bands[0]))
 
     @cached_property
@@ -399,6 +409,18 @@ def _tiff(path: str | PathLike[str]) -> LargePicture:
         return _RasterPicture(path)
     except DataError:
         return tiff
+
+
+def _warn_of_range(picture: LargePicture) -> None:
+    """Warn if nine windows over a picture of 16 bits have few of their values."""
+    (width, height), values = picture.size, []
+    with suppress(DataError):  # what cannot be decoded is refused where it is read
+        for place in range(9):
+            x, y = (length * (1 + 2 * n) // 6 for length, n in zip((width, height), divmod(place, 3), strict=True))
+            values.append(picture.pixels((x, y, min(x + _SEEN, width), min(y + _SEEN, height))))
+        least, most = min(each.min() for each in values), max(each.max() for each in values)
+        assert picture.path is not None
+        warn_of_range(257.0 * least, 257.0 * most, picture.path)
 
 
 def _is_converted(path: str | PathLike[str]) -> bool:

@@ -31,6 +31,11 @@ class FeatureMaps:
         canvas: `(width, height)` of the canvas in pixels.
         placement: placement of the images on the canvas.
         detections: the selected boxes, in image pixels.
+
+    Example::
+
+        features = semfov.load_detector("yolox-nano").features(images)
+        features.maps["backbone8"], features.detections
     """
 
     maps: Mapping[str, Tensor]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -22,11 +22,13 @@ LEAST = 0.3
 FAINTEST = 0.05
 """Score from which on boxes are merged into candidates."""
 
+_PRINTED = 20  # largest number of objects in the text form
+
 _BORDER = 2 / 416
 """Boxes that come this near to a border of their window, in longer sides of the window, are cut by it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Objects:
     """Objects of a picture, most confident first.
 
@@ -35,6 +37,7 @@ class Objects:
         scores: `(M,)`, score of the class.
         labels: `(M,)`, classes 1..K.
         passes: `(M,)`, number of the look that each box comes from; the first one is 0.
+        classes: names of the classes, background first, for the text form; none where only numbers are known.
 
     >>> objects = Objects(torch.zeros(2, 4), torch.tensor([0.9, 0.2]), torch.tensor([1, 3]), torch.tensor([0, 4]))
     >>> len(objects), len(objects.above(0.5)), len(objects.of([3]))
@@ -45,9 +48,22 @@ class Objects:
     scores: Tensor
     labels: Tensor
     passes: Tensor
+    classes: tuple[str, ...] = field(default=(), compare=False)
 
     def __len__(self) -> int:
         return len(self.boxes)
+
+    def __repr__(self) -> str:
+        """The number of objects, and a line for each of the most confident ones."""
+        rows = zip(
+            *(each[:_PRINTED].tolist() for each in (self.labels, self.scores, self.boxes, self.passes)), strict=True
+        )
+        lines = [
+            f"{self.classes[label] if self.classes else f'class {label}'} {score:.2f}, box {box_text(box)}, look {look}"
+            for label, score, box, look in rows
+        ]
+        more = [f"and {len(self) - _PRINTED} more"] if len(self) > _PRINTED else []
+        return "\n  ".join([f"{len(self)} object{'s' if len(self) != 1 else ''}", *lines, *more])
 
     @classmethod
     def none(cls) -> Objects:
@@ -83,7 +99,17 @@ class Objects:
 
     def __getitem__(self, index: Tensor) -> Objects:
         """Some of the objects."""
-        return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index])
+        return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
+
+
+def box_text(box: Sequence[float]) -> str:
+    """Corners of a box in whole pixels.
+
+    >>> box_text((380.2, 190.0, 443.9, 276.4))
+    '380,190–444,276'
+    """
+    x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
+    return f"{x1},{y1}–{x2},{y2}"
 
 
 def merge_boxes(

@@ -125,7 +125,7 @@ def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Sel
         over = _overlaps(corners[rivals], corners[block], selection.iou)
         if selection.per_class:
             over &= kinds[rivals, None] == kinds[block]
-        beaten = over[: len(survivors)].any(0)
+        beaten: NDArray[np.bool_] = over[: len(survivors)].any(axis=0)  # type: ignore[assignment]
         for number, row in enumerate(over[len(survivors) :]):
             if not beaten[number]:
                 beaten[number + 1 :] |= row[number + 1 :]

@@ -84,8 +84,8 @@ def viewed(
             features = detector.features(image[None], layers)
             half = {name: each.half() for name, each in features.maps.items()}
             size = features.placement.size
-            paths = [each.resized(size) for each in people if len(each) > 1]
-            kept.setdefault((features.placement, features.canvas), []).append((replace(features, maps=half), paths))
+            moved = [each.resized(size) for each in people if len(each) > 1]
+            kept.setdefault((features.placement, features.canvas), []).append((replace(features, maps=half), moved))
     groups = []
     for several in kept.values():
         first = several[0][0]

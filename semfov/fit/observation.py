@@ -24,6 +24,7 @@ from semfov.fit.parts.base import IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.code import commit
 from semfov.io.files import write_text
+from semfov.io.tables import csv_text
 from semfov.metrics.calibration import Calibration, calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
@@ -32,7 +33,7 @@ from semfov.observation.statistics import DirichletStatistics
 from semfov.runs.looking import Looking
 from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells, collect_samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
-from semfov.runs.tables import csv_text, table
+from semfov.runs.tables import table
 from semfov.runs.zoom_samples import MosaicSampler
 from semfov.version import __version__
 from semfov.viz import plot_reliability

@@ -91,6 +91,18 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
         raise DataError(f"{name}: expected a file, got {got}")
 
 
+def check_writable(path: Path, *, folder: bool = False) -> None:
+    """Check that a file, or files of a folder, can be written later, without making anything now."""
+    place = next((each for each in (path, *path.parents) if each.exists()), Path())
+    if place == path and not folder:
+        check_regular(path)
+        place = path.parent
+    if not place.is_dir():
+        raise DataError(f"cannot write {path}: {place} is not a folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise DataError(f"cannot write {path}: no permission to write in {place}")
+
+
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode())

@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import fields as fields_of
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from semfov.data.large import LargePicture
 from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
-from semfov.errors import InputError, check
+from semfov.errors import InputError
 from semfov.paths.conversion import Conversion
 from semfov.paths.endings import FIXATIONS, Ending
 from semfov.paths.files import Format
@@ -29,14 +29,9 @@ from semfov.paths.look import LookView, RecordedLook, read_region, whole_pixels
 from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
 
 if TYPE_CHECKING:
-    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_Table = Literal["looks", "objects"]
-"""Tables of a record."""
-
-_COLUMNS = ["object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look"]
 _NAMED = 5  # largest number of objects that the text form names
 
 
@@ -103,6 +98,10 @@ class Record(Conversion):
         """Number of looks, the first included."""
         return len(self.looks)
 
+    def __getitem__(self, number: int) -> RecordedLook:
+        """The look of a number, as iteration gives it; -1 is the last one."""
+        return self.looks[number]
+
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
@@ -127,6 +126,17 @@ class Record(Conversion):
     def decided_by(self) -> str:
         """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
         return "probability"
+
+    @property
+    def found_at(self) -> tuple[float, float] | None:
+        """`(x, y)` in picture pixels of the found target: the middle of its box, or else of its cell; None for none."""
+        decision, grid = self.decision, getattr(self, "grid", None)
+        if decision is not None and decision.outcome == "found" and decision.box is not None:
+            x1, y1, x2, y2 = decision.box.tolist()
+            return (x1 + x2) / 2, (y1 + y2) / 2
+        if decision is None or decision.outcome != "found" or decision.cell is None or not isinstance(grid, Grid):
+            return None
+        return tuple(grid.centres[decision.cell].tolist())
 
     @property
     def image(self) -> Tensor | None:
@@ -191,6 +201,11 @@ class Record(Conversion):
         return {self.classes[label]: float(counts[label]) for label in labels}
 
     @property
+    def expected_error(self) -> dict[str, float]:
+        """Standard deviation of the expected number by the name of the class; 0 without a model of it."""
+        return dict.fromkeys(self.expected, 0.0)
+
+    @property
     def _sought(self) -> tuple[int, ...]:
         """Classes that were searched for; none stands for all."""
         return self.targets or (() if self.target is None else (self.target,))
@@ -211,7 +226,8 @@ class Record(Conversion):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        return confirm(self.candidates.of(self._sought), self._confirmed_places, self.least)
+        objects, sure = confirm(self.candidates.of(self._sought), self._confirmed_places, self.least)
+        return replace(objects, classes=self.classes), sure
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say from which score on.
@@ -424,6 +440,24 @@ class Record(Conversion):
             )
         return rows
 
+    def to_dict(self) -> dict[str, Any]:
+        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values.
+
+        Returns:
+            Values by name; None for the box of what was not found, and for errors that no probabilities tell.
+        """
+        (width, height), decision = self.size, self.decision
+        values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}
+        values["targets"] = [self.classes[label] for label in self._sought]
+        if decision is not None:
+            box = decision.box.tolist() if decision.outcome == "found" and decision.box is not None else [None] * 4
+            values |= {"outcome": decision.outcome, "probability": decision.probability}
+            edges = (*(self.found_at or (None, None)), *box)
+            values |= dict(zip(("x", "y", "x1", "y1", "x2", "y2"), edges, strict=True))
+        error = self.expected_error if self.measure == "probability" else dict.fromkeys(self.expected)
+        values |= {"least": self.least, "expected": self.expected, "expected_error": error, "passes": self.passes}
+        return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
+
     def save(self, path: str | PathLike[str]) -> None:
         """Write the record to a safetensors file, atomically.
 
@@ -431,6 +465,7 @@ class Record(Conversion):
             path: the file.
 
         Raises:
+            InputError: the name is that of a table, a page, a picture or a film.
             DataError: the file cannot be written.
         """
         self._format.write(path, self._base(), *self._contents())
@@ -470,28 +505,6 @@ class Record(Conversion):
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Make the other attributes from the tensors and JSON values of a file."""
-
-    def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
-        """A table of the record as a pandas data frame.
-
-        Args:
-            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
-
-        Returns:
-            One row for each look or object.
-
-        Raises:
-            InputError: there is no such table, or pandas is not installed.
-        """
-        check(table in get_args(_Table), "table", "looks or objects", table)
-        try:
-            import pandas
-        except ImportError:
-            raise InputError(
-                "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
-            ) from None
-        rows, columns = (self.rows(), None) if table == "looks" else (self.object_rows(), _COLUMNS)
-        return pandas.DataFrame(rows, columns=columns)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -1,4 +1,4 @@
-"""Conversion of the objects of a record to the formats of Supervision, torchvision, COCO and GeoJSON."""
+"""Conversion of a record to tables, and of its objects to the formats of other libraries and of maps."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from os import PathLike, fspath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from torch import Tensor
@@ -14,19 +14,27 @@ from torch import Tensor
 from semfov.data.classes import canonical_name
 from semfov.detection.exchange import category_ids, coco_results, named_detections
 from semfov.detection.objects import Objects
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.io.files import write_text
+from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
 
 if TYPE_CHECKING:
+    import pandas
     import supervision
+
+_Table = Literal["looks", "objects"]
+"""Tables of a record."""
+
+COLUMNS = ("object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look")
+"""Columns of the table of objects."""
 
 _PIXELS = "pixels of the picture: x to the right, y down"
 """What the coordinates of a GeoJSON file are whose picture has no georeference."""
 
 
 class Conversion(ABC):
-    """Conversion of objects with names of classes to a table, and to the formats of other libraries and of maps."""
+    """Conversion of looks and objects to tables, and of objects to the formats of other libraries and of maps."""
 
     classes: tuple[str, ...]
     source: str | None
@@ -40,6 +48,14 @@ class Conversion(ABC):
     @abstractmethod
     def confirmed(self) -> Tensor:
         """Which of them were confirmed."""
+
+    @abstractmethod
+    def rows(self) -> list[dict[str, Any]]:
+        """The looks as a table of plain values."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """The record as JSON values."""
 
     def object_rows(self) -> list[dict[str, Any]]:
         """The objects as a table of plain values, one row for each object, most confident first.
@@ -67,6 +83,68 @@ class Conversion(ABC):
                 zip(*(column.tolist() for column in columns), strict=True)
             )
         ]
+
+    def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
+        """A table of the record as a pandas data frame.
+
+        Args:
+            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
+
+        Returns:
+            One row for each look or object.
+
+        Raises:
+            InputError: there is no such table, or pandas is not installed.
+        """
+        rows, columns = self._table(table)
+        try:
+            import pandas
+        except ImportError:
+            raise InputError(
+                "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
+            ) from None
+        return pandas.DataFrame(rows, columns=columns)
+
+    def to_csv(self, path: str | PathLike[str] | None = None, table: _Table = "looks") -> str:
+        """A table of the record as CSV, with a header.
+
+        Args:
+            path: the file to write; None writes none.
+            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
+
+        Returns:
+            The text of the file.
+
+        Raises:
+            InputError: there is no such table.
+            DataError: the file cannot be written.
+
+        Example::
+
+            agent.find_all("harbour.tif", "person").to_csv("people.csv", "objects")
+        """
+        rows, columns = self._table(table)
+        return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
+
+    def to_json(self, path: str | PathLike[str] | None = None) -> str:
+        """The record as JSON: the values of `to_dict`.
+
+        Args:
+            path: the file to write; None writes none.
+
+        Returns:
+            The text of the file.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
+
+    def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:
+        """Rows and columns of a table."""
+        check(table in get_args(_Table), "table", "looks or objects", table)
+        rows = self.rows() if table == "looks" else self.object_rows()
+        return rows, list(COLUMNS if table == "objects" else dict.fromkeys(name for row in rows for name in row))
 
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
@@ -178,9 +256,15 @@ class Conversion(ABC):
                 for row, ring in zip(rows, corners, strict=True)
             ],
         }
-        if path is not None:
-            write_text(fspath(path), json.dumps(collection, allow_nan=False))
+        _written(json.dumps(collection, allow_nan=False), path)
         return collection
+
+
+def _written(text: str, path: str | PathLike[str] | None) -> str:
+    """The text, after it was written to a file if one is named."""
+    if path is not None:
+        write_text(path, text)
+    return text
 
 
 def coco_categories() -> list[dict[str, Any]]:

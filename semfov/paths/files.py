@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from os import PathLike
+from os import PathLike, fspath
+from pathlib import Path
 from typing import Any, get_args
 
 import torch
@@ -57,6 +58,19 @@ _SHARED = {
 _PLAIN = "target", "found", "least", "source", "ending"
 
 
+_OTHERS = {
+    ".csv": "record.to_csv",
+    ".json": "record.to_json",
+    ".geojson": "record.to_geojson",
+    ".xlsx": "record.to_frame().to_excel",
+    ".html": "record.report",
+    ".htm": "record.report",
+    ".gif": "record.animate",
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".pdf", ".svg"), "record.plot().savefig"),
+}
+"""Calls that write files with these ends of names."""
+
+
 def pair(of: Json) -> Pair:
     """Requirements of two values of one kind."""
     return Pair((of, of))
@@ -89,6 +103,9 @@ class Format:
         record: Mapping[str, Any],
     ) -> None:
         """Write a record to a file atomically."""
+        call = _OTHERS.get(Path(path).suffix.lower())
+        name = repr(fspath(path))
+        check(call is None, "path", "a file of a record, such as 'record.safetensors'", f"{name}; use {call}({name})")
         looks: tuple[Detections, ...] = fields["detections"]
         decision: Decision | None = fields["decision"]
         # The detections of all looks in a row, without padding; `lengths` separates them again.

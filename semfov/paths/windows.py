@@ -137,7 +137,7 @@ class ZoomPath(GazeRecord):
         `semfov.zoom.certainty`. It is 0 without probabilities.
         """
         if self.unseen is None:
-            return dict.fromkeys(self.expected, 0.0)
+            return super().expected_error
         return {name: variance**0.5 for name, (_, variance) in self._numbers().items()}
 
     def _numbers(self) -> dict[str, tuple[float, float]]:

@@ -90,9 +90,10 @@ def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
     made = contour_generator(x.clip(0, size[0]), y.clip(0, size[1]), np.pad(values, 1))
     ordered = np.sort(values.reshape(-1))[::-1]
     levels = [ordered[min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)] for mass in MASSES]
+    lines: list[list[NDArray[np.float64]]] = [made.lines(level) for level in levels]  # type: ignore[misc]
     return [
-        "".join("M" + "L".join(f"{px:.0f},{py:.0f}" for px, py in line) + "Z" for line in made.lines(level))
-        for level in levels
+        "".join("M" + "L".join(f"{px:.0f},{py:.0f}" for px, py in line.tolist()) + "Z" for line in several)
+        for several in lines
     ]
 
 

@@ -1,9 +1,7 @@
-"""Tables in Markdown and as CSV, and the figures in their cells."""
+"""Tables in Markdown, and the figures in their cells."""
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 
 def table(rows: list[list[str]]) -> list[str]:
@@ -13,13 +11,6 @@ def table(rows: list[list[str]]) -> list[str]:
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
     ]
     return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
-
-
-def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """A table as CSV; the first row holds the headings."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
 
 
 def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:

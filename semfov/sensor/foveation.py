@@ -129,14 +129,17 @@ class Foveation(Sensor):
         self.convention: Convention = convention
         given = isinstance(sigma, Tensor) and sigma.requires_grad
         check(not (given and learnable), "learnable", "False for a sigma that is learned outside", learnable)
-        self.given_sigma = sigma if given else None
+        self.given_sigma = sigma if isinstance(sigma, Tensor) and given else None
         log_sigma = None if given else torch.tensor(float(sigma)).log()
         self.log_sigma = None if log_sigma is None else nn.Parameter(log_sigma, requires_grad=learnable)
 
     @property
     def sigma(self) -> Tensor:
         """Width of the fovea in image pixels."""
-        return self.given_sigma if self.log_sigma is None else self.log_sigma.exp()
+        if self.log_sigma is not None:
+            return self.log_sigma.exp()
+        assert self.given_sigma is not None
+        return self.given_sigma
 
     def pyramid(self, image: ImageLike) -> Bands:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.

@@ -180,6 +180,8 @@ def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool
     step = (high - low) / count
     reach = step.clamp(min=1.0)
     middle = low + (torch.arange(count).to(low) + 0.5) * step
+    if not values_known(low, high):
+        return _weights_of_all(middle, reach, length, border=border), (0, length)
     around = float(reach.detach())
     first = int((low.detach() - around).floor())
     last = int((high.detach() + around).ceil()) + 1
@@ -192,3 +194,25 @@ def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool
         return weight.new_zeros(count, stop - start).index_add(1, place, weight), (start, stop)
     start, stop = min(max(first, 0), length), min(max(last, 0), length)
     return weight[:, start - first : max(stop, start) - first], (start, max(stop, start))
+
+
+def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool) -> Tensor:
+    """`_weights` `(count, length)` of all pixels of a picture, in a graph whose shapes do not depend on the window."""
+    place = middle - 0.5
+    weight = (1 - (place[:, None] - torch.arange(length).to(place)).abs() / reach).clamp(min=0)
+    fraction = place - place.floor()
+    total = _beyond(fraction, reach) + _beyond(1 - fraction, reach)
+    if border:
+        outside = []
+        for inwards in (place, length - 1 - place):
+            near, far = _beyond((inwards + 1).clamp(min=0), reach), total - _beyond((-inwards).clamp(min=0), reach)
+            outside.append(torch.where(inwards >= -1, near, far)[:, None])
+        pixel = torch.arange(length, device=place.device)
+        weight = weight + outside[0] * (pixel == 0) + outside[1] * (pixel == length - 1)
+    return weight / total[:, None]
+
+
+def _beyond(distance: Tensor, reach: Tensor) -> Tensor:
+    """Sum of the triangle 1 - d / reach over d = distance, distance + 1, … up to the reach."""
+    count = (reach - distance).floor().clamp(min=-1) + 1
+    return count - (count * distance + count * (count - 1) / 2) / reach

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.inputs import as_positions
-from semfov.errors import check, check_shape
+from semfov.errors import check, check_shape, values_known
 from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
@@ -95,8 +95,11 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     """A view `(C, h, w)` of a panorama `(C, H + 2, W + 2)` with the border of `go_around`; see `perspective`."""
     (wide, high), (columns, rows) = (source.shape[-1] - 2, source.shape[-2] - 2), size
     camera = Camera(pose, size)
-    shrink = wide / (2 * math.pi * float(camera.focal.detach()))
-    times = max(1, math.ceil(shrink - 1e-6)) if antialias else 1
+    times = 1
+    if antialias:
+        known = values_known(pose)
+        check(known, "antialias", "False where the pose is not known, as in vmap and torch.export", antialias)
+        times = max(1, math.ceil(wide / (2 * math.pi * float(camera.focal.detach())) - 1e-6))
     y, x = (
         (torch.arange(n * times, dtype=pose.dtype, device=pose.device) + 0.5) / times - 0.5 for n in (rows, columns)
     )

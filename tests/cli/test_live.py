@@ -45,7 +45,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     scene = embedded_picture(ActivePerception.recommended().classes[1:], "motorcycle", 0)
     places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
     path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
-    assert main(["live", str(path), "--target", "Motorbikes", "--out", str(tmp_path / "out")]) == 0
+    assert main(["live", str(path), "--target", "Motorbikes", "--how", "fovea", "--out", str(tmp_path / "out")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "most likely at" in line]
     assert len(lines) == len(places)
     assert "motorcycle: found" in lines[7]

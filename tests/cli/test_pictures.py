@@ -6,6 +6,7 @@ import os
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 from PIL import Image
@@ -31,7 +32,7 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
                         "--report", tmp_path / "page.html")  # fmt: skip
     assert code == 0
     found = re.search(
-        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, belief [01]\.\d\d\n"
+        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, belief: [01]\.\d\d\n"
         r"  \w.*\. \d+ passes in \d+\.\d s\.", printed.out,
     )  # fmt: skip
     assert found
@@ -241,6 +242,58 @@ def test_folders_have_pictures_of_all_formats_that_are_read_alone(tmp_path):
     assert all(read_image(path).shape == (3, 6, 8) for path in picture_files(tmp_path))
 
 
+def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_path):
+    """A picture without objects has a row for each class, one that cannot be read has none."""
+    Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "d.png")
+    (folder / "e.png").write_bytes(b"no picture")
+    code, _ = run("find", folder, "--target", "red,wine glass", "--out", tmp_path / "found.csv")
+    assert code == 1
+    table = pd.read_csv(tmp_path / "found.csv")
+    assert set(table.picture) == {str(folder / f"{name}.png") for name in "abcd"}
+    counts = table.groupby(["picture", "class"]).object.count().unstack()
+    assert counts["red"].tolist() == [1, 1, 1, 0]
+    assert counts["wine glass"].tolist() == [0, 0, 0, 0]
+    assert table.set_index(["picture", "class"]).expected.sum() == 3
+    assert table.expected_error.isna().all()  # a score tells no error
+    assert run("find", folder / "d.png", "--out", tmp_path / "none.csv")[0] == 0
+    none = pd.read_csv(tmp_path / "none.csv")
+    assert (none.columns.tolist(), len(none)) == (table.columns.tolist(), 1)
+
+
+def test_lines_of_json_are_written_as_pictures_are_done(run, folder, tmp_path):
+    file = tmp_path / "found.jsonl"
+    assert run("find", folder, "--target", "red", "--out", file)[0] == 0
+    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    assert [row["picture"] for row in rows] == [str(folder / f"{name}.png") for name in "abc"]
+    code, printed = run("find", folder, "--target", "red", "--out", "-")
+    assert code == 0
+    streamed = [json.loads(line) for line in printed.out.splitlines()]
+    assert [row["objects"] for row in streamed] == [row["objects"] for row in rows]
+    assert "3 pictures: 3 looked at" in printed.err
+    assert {path.name for path in tmp_path.iterdir()} == {"my photo.png", "photos", "found.jsonl"}
+
+
+def test_quiet_prints_nothing_but_results_and_errors(run, photo, tmp_path):
+    code, printed = run("search", photo, "--target", "red", "--quiet", "--report", tmp_path / "page.html")
+    assert (code, printed.out, printed.err) == (0, "", "")
+    _, printed = run("search", photo, "--target", "red", "--quiet", "--out", "-")
+    assert json.loads(printed.out)["outcome"] == "found"
+    assert printed.err == ""
+    code, printed = run("search", tmp_path / "missing.png", "--target", "red", "--quiet")
+    assert (code, printed.out) == (1, "")
+    assert "missing.png" in printed.err
+
+
+def test_files_that_cannot_be_written_are_told_before_the_first_look(run, photo, tmp_path, agent, monkeypatch):
+    monkeypatch.setattr(agent, "explore", lambda *_, **__: pytest.fail("it looked"))
+    (tmp_path / "page.html").mkdir()
+    for words in (("--report", tmp_path / "page.html"), ("--report", photo / "page.html"), ("--out", photo / "a.csv")):
+        code, printed = run("explore", photo, *words)
+        assert code == 1
+        assert "is not a folder" in printed.err or "expected a file, got a folder" in printed.err
+        assert not printed.out
+
+
 @pytest.fixture
 def folder(photo, tmp_path):
     """Three pictures, each with a red square at another place."""
@@ -392,7 +445,7 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
         printed.out,
     )
     assert "A closer look confirmed the target." in printed.out
-    assert re.search(r"^  look +at \(x, y\) +shows +detections +value$", printed.out, re.M)
+    assert re.search(r"^  look +at \(x, y\) +shows +detections +value +s$", printed.out, re.M)
     assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}
     (episode,) = episodes_of(tmp_path / "page.html")
@@ -407,7 +460,10 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):
-    for words, remedy in ((("--start", "5,5"), "use none, or --how fovea"), (("--shifts", 3), "or --how fovea")):
+    for words, remedy in (
+        (("--start", "5,5"), "use none, or --how fovea"),
+        (("--shifts", 3), "use --passes, or --how fovea"),
+    ):
         code, printed = run("search", large, "--target", "red", *words)
         assert code == 1
         assert remedy in printed.err

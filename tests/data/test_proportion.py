@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from semfov import as_image
+from semfov.data import large
 from semfov.data.images import read_image
 from semfov.data.large import open_large, picture_size
 from semfov.errors import DataError
@@ -40,7 +41,7 @@ def test_a_jpeg_that_claims_more_than_its_file_may_hold(tmp_path):
     path = claims(tmp_path / "a.jpg", 9000, 9000)
     tracemalloc.start()
     for read in (read_image, as_image, lambda path: open_large(path).size):
-        with pytest.raises(DataError, match=r"expected a file in proportion, got 81,000,000 pixels in [\d,]+ bytes"):
+        with pytest.raises(DataError, match=r"in proportion to the file, got 81,000,000 in [\d,]+ bytes"):
             read(path)
     assert tracemalloc.get_traced_memory()[1] < 5e6
     tracemalloc.stop()
@@ -173,3 +174,20 @@ def test_jpeg_2000_is_read_without_rasterio(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
     saved(tmp_path / "a.jp2")
     assert np.array_equal(whole(open_large(tmp_path / "a.jp2")), fovea(tmp_path / "a.jp2"))
+
+
+@pytest.mark.parametrize("reader", ["fovea", "windows", "raster"])
+def test_sixteen_bits_with_few_values_are_warned_of(tmp_path, reader, request):
+    """Of 12 bits and of reflectances; those that use their range are read without a word, and so are blank ones."""
+    tifffile = pytest.importorskip("tifffile")
+    if reader == "raster":
+        pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    read = {"fovea": read_image, "windows": open_large, "raster": large._RasterPicture}[reader]
+    grey = pixels(300, 400)[..., 0].astype(np.uint16)
+    for factor, said in ((12, r"values from \d+ to 30\d\d of 16 bits"), (257, None), (0, None)):
+        tifffile.imwrite(tmp_path / "a.tif", grey * factor, photometric="minisblack")
+        if said is None:
+            read(tmp_path / "a.tif")
+        else:
+            with pytest.warns(UserWarning, match=said):
+                read(tmp_path / "a.tif")

@@ -1,9 +1,12 @@
 """What all records share: looks, words, tables, drawings, files and notebooks."""
 
+import csv
 import dataclasses
+import io
 import json
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -178,6 +181,57 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     shown = record._repr_html_()
     assert shown.startswith("<")
     assert "cup" in shown or "cat" in shown
+
+
+@pytest.mark.parametrize("make", RECORDS)
+def test_every_record_is_written_as_tables_and_as_json(make, tmp_path):
+    """Read back by the modules csv and json, and by pandas."""
+    record = make()
+    for table, rows in (("looks", record.rows()), ("objects", record.object_rows())):
+        text = record.to_csv(tmp_path / "table.csv", table)
+        assert (tmp_path / "table.csv").read_text(encoding="utf-8") == text
+        read_back = list(csv.DictReader(io.StringIO(text)))
+        assert [list(row) for row in read_back] == [list(row) for row in rows]
+        assert [row["x"] for row in read_back] == [str(row["x"]) for row in rows]
+        if rows:
+            np.testing.assert_array_equal(pd.read_csv(tmp_path / "table.csv").y, [row["y"] for row in rows])
+    values = json.loads(record.to_json(tmp_path / "record.json"))
+    assert values == json.loads((tmp_path / "record.json").read_text(encoding="utf-8"))
+    assert values == json.loads(json.dumps(record.to_dict()))
+    assert [row["class"] for row in values["objects"]] == [row["class"] for row in record.object_rows()]
+    assert (len(values["looks"]), values["target"]) == (len(record), record.target_name)
+    if record.decision is not None and record.decision.box is not None:
+        box = [values[edge] for edge in ("x1", "y1", "x2", "y2")]
+        assert box == record.decision.box.tolist()
+        assert (values["x"], values["y"]) == record.found_at == ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+    with pytest.raises(InputError, match="table: expected looks or objects, got people"):
+        record.to_csv(table="people")
+
+
+@pytest.mark.parametrize("make", RECORDS)
+def test_a_look_is_taken_by_its_number(make):
+    record = make()
+    assert [record[number] for number in range(len(record))] == list(record)
+    assert record[-1] is record.looks[-1]
+    with pytest.raises(IndexError):
+        record[len(record)]
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [("people.csv", "to_csv"), ("a.JSON", "to_json"), ("a.html", "report"), ("a.png", r"plot\(\).savefig")],
+)
+def test_a_record_is_not_saved_under_the_name_of_another_file(name, call, tmp_path):
+    with pytest.raises(InputError, match=rf"path: .* use record\.{call}\('.*{name}'\)"):
+        scanpath().save(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_objects_are_printed_with_names_and_without_tensors():
+    path = zoom_path()
+    assert repr(path.objects) == "2 objects\n  cup 0.80, box 1,2–9,10, look 2\n  cup 0.70, box 2,4–18,20, look 2"
+    assert "class 1 0.70" in repr(path.candidates)
+    assert "tensor" not in repr(path.objects)
 
 
 def test_a_table_without_objects_has_its_columns():

@@ -21,8 +21,9 @@ from semfov.data.fixations import Fixations, by_picture, write_table
 from semfov.errors import DataError, check
 from semfov.io.code import commit
 from semfov.io.files import clean, sha256
+from semfov.io.tables import csv_text
 from semfov.runs.scene_run import finish, gather
-from semfov.runs.tables import csv_text, table
+from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz.style import save_figure
 

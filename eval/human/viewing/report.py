@@ -14,9 +14,10 @@ from eval.human.viewing.rows import MEASURES, PEOPLE, Half, Scored
 from eval.human.viewing.run import ViewingRun
 from eval.human.viewing.sequences import drawn_scanpaths
 from semfov.io.files import clean
+from semfov.io.tables import csv_text
 from semfov.metrics.averages import standard_error
 from semfov.runs.scene_run import gather
-from semfov.runs.tables import csv_text, table
+from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
 _Array = NDArray[np.float64]

@@ -17,6 +17,7 @@ from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Pair, Schema, Text
 from semfov.io.schema import Number as JsonNumber
+from semfov.io.storage import checksum
 from semfov.sensor.lines import constant
 
 CELLS = 52
@@ -144,7 +145,11 @@ class FixationDensity(Pretrained):
         return model
 
     def check_compatible(self, detector: Detector) -> None:
-        """Raise `InputError` for another detector than the model was fitted for; warn where a setting differs."""
+        """Raise `InputError` for another detector than the model was fitted for; warn where a setting differs.
+
+        Args:
+            detector: the detector whose feature maps are read.
+        """
         fitted, settings = self.metadata.get("detector", {}), detector.settings()
         check_same_detector(fitted, {name: settings.get(name) for name in fitted}, self.title)
 
@@ -202,13 +207,33 @@ class FixationDensity(Pretrained):
         return terms
 
     def map(self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int]) -> Tensor:
-        """The map m over the cells of pictures of `(height, width)`, `(B, rows, columns)`."""
+        """The map m over the cells of pictures.
+
+        Args:
+            features: as for `forward`.
+            size: `(height, width)` of the pictures in pixels.
+
+        Returns:
+            `(B, rows, columns)`.
+        """
         return self.readouts(features, size).mean(1)
 
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
     ) -> Tensor:
-        """All readouts `(B, R, rows, columns)`, whose mean is the map; with other weights `read` of the channels."""
+        """The readouts, whose mean is the map.
+
+        Args:
+            features: as for `forward`.
+            size: `(height, width)` of the pictures in pixels.
+            read: weights of the channels in place of the model's own, for its fit.
+
+        Returns:
+            `(B, R, rows, columns)`.
+
+        Raises:
+            InputError: a feature map is missing or has another number of channels.
+        """
         maps = features.maps if isinstance(features, FeatureMaps) else features
         rows, columns = cells_of(size)
         joined: dict[tuple[int, int], Tensor] = {}
@@ -236,7 +261,14 @@ class FixationDensity(Pretrained):
         return _gaussian(rows, sigma) @ value @ _gaussian(columns, sigma).mT
 
     def centre_bias(self, size: tuple[int, int]) -> Tensor:
-        """The weighted log density of the centre bias over the cells of a picture, `(rows, columns)`."""
+        """The weighted log density of the centre bias.
+
+        Args:
+            size: `(height, width)` of the picture in pixels.
+
+        Returns:
+            `(rows, columns)`.
+        """
         centre = self.centre.to(self.read)[None, None]
         cells = F.interpolate(centre, cells_of(size), mode="bilinear", align_corners=False)[0, 0]
         return self.centre_weight * cells
@@ -315,23 +347,17 @@ class FixationDensity(Pretrained):
         """Its layers and readouts."""
         return f"layers={self.layers}, readouts={self.mix.shape[0]}, units={self.mix.shape[1]}"
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """The layers that the weights belong to."""
-        return {"layers": self.layers}
-
-    def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """Raise `InputError` for weights of other layers."""
-        check(state["layers"] == self.layers, "state_dict", f"weights of {self.layers}", state["layers"])
-
     def _tensors(self) -> dict[str, Tensor]:
         """Tensors that are saved; the weights of the convolutions in half precision."""
-        tensors = {name: value for name, value in self.state_dict().items() if isinstance(value, Tensor)}
+        tensors = super()._tensors()
         return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
+
+    def _stated(self) -> dict[str, Any]:
+        """The layers that the weights belong to."""
+        return self._record()
 
     def digest(self) -> str:
         """Checksum of everything that results depend on."""
-        from semfov.io.storage import checksum
-
         return checksum(self._tensors(), {"kind": self.kind, **self._record()})
 
     def _record(self) -> dict[str, Any]:
@@ -341,11 +367,11 @@ class FixationDensity(Pretrained):
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         readouts, units = tensors["mix"].shape[:2]
         model = cls(dict(record["layers"]), readouts=readouts, units=units, metadata=record["metadata"])
-        check(tensors["read"].shape == model.read.shape, "read", tuple(model.read.shape), tuple(tensors["read"].shape))
+        expected = str(tuple(model.read.shape))
+        check(tensors["read"].shape == model.read.shape, "read", expected, tuple(tensors["read"].shape))
         model.centre, model.duration = tensors["centre"], tensors["duration"]
         model.to(tensors["shift"].dtype)
-        whole = {name: value.to(tensors["shift"].dtype) for name, value in tensors.items()}
-        model.load_state_dict({**whole, "_extra_state": model.get_extra_state()})
+        model.load_state_dict({name: value.to(tensors["shift"].dtype) for name, value in tensors.items()})
         return model
 
 

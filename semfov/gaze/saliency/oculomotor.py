@@ -50,7 +50,15 @@ class OculomotorBias(nn.Module):
         self.gain = nn.Parameter(torch.ones(2, _NUMBERS))
 
     def forward(self, path: Tensor, places: Tensor) -> Tensor:
-        """Log bias of every place as the next fixation, up to a constant."""
+        """Log bias of every place as the next fixation, up to a constant.
+
+        Args:
+            path: `(B, n, 2)`, fixations so far.
+            places: `(N, 2)`.
+
+        Returns:
+            `(B, N)`.
+        """
         check_shape(path, "path", None, None, 2)
         check_shape(places, "places", None, 2)
         check(path.shape[1] > 0, "path", "at least one fixation", tuple(path.shape))
@@ -80,7 +88,14 @@ class OculomotorBias(nn.Module):
         return bias + (_rowwise(tables, near, distance) * seen[:, None]).sum(-1)
 
     def gains(self, number: Tensor) -> Tensor:
-        """Gains `(B, 2)` of the map and of the centre bias after a number `(B,)` of fixations."""
+        """Gains of the map and of the centre bias.
+
+        Args:
+            number: `(B,)`, number of fixations so far, from 1.
+
+        Returns:
+            `(B, 2)`.
+        """
         return self.gain.t()[(number - 1).clamp(0, _NUMBERS - 1)]
 
 
