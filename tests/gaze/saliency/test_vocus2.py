@@ -168,6 +168,6 @@ def test_bad_settings(settings: dict[str, object]) -> None:
 
 def test_bad_image() -> None:
     with pytest.raises(InputError, match="image"):
-        VOCUS2()(torch.zeros(3, 8, 8))
+        VOCUS2()(torch.zeros(2, 3, 8, 8, 8))
     with pytest.raises(InputError, match="channels"):
         _twin_pyramids(torch.zeros(1, 3, 0, 8))
