@@ -118,6 +118,8 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
     got = type(image).__name__
     if image is None:
         got = "None (OpenCV returns None for a file that it cannot read); check the path"
+    elif isinstance(image, bytes | bytearray | memoryview):
+        got = f"{got} of a file; open them with PIL.Image.open(io.BytesIO(…))"
     elif isinstance(image, Sequence):
         got = f"a {got}; give pictures one by one"
     raise InputError(f"{argument}: expected {expected}, got {got}")

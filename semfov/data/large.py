@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ from semfov.data.reduction import (
     first_for,
     reduction_for,
 )
-from semfov.errors import DataError, SemfovError, check, check_pixels
+from semfov.errors import DataError, SemfovError, check, check_pixels, lookup
 from semfov.io.files import check_regular
 
 if TYPE_CHECKING:
@@ -368,7 +368,8 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
     if isinstance(source, LargePicture):
         return source
     if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.size and _by_rows(source.shape):
-        return _ArrayPicture(source[..., ::-1] if color == "bgr" and source.ndim == 3 else source)
+        swap = lookup(color, get_args(Color), "order of channels") == "bgr" and source.ndim == 3
+        return _ArrayPicture(source[..., ::-1] if swap else source)
     if not isinstance(source, str | PathLike):
         return _MemoryPicture(source, color=color)
     check_local(source, "picture")

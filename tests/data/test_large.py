@@ -109,6 +109,8 @@ def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
         open_large(3)
     with pytest.raises(InputError, match="picture: expected bytes, 16-bit numbers or floats"):
         open_large(np.zeros((4, 4, 3), np.int64))
+    with pytest.raises(InputError, match="unknown order of channels 'bgra'; did you mean 'bgr'"):
+        open_large(np.zeros((4, 4, 3), np.uint8), color="bgra")
     with pytest.raises(InputError, match="box: expected a window inside 4 × 4 pixels"):
         _MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
 
