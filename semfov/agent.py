@@ -55,8 +55,7 @@ class ActivePerception(nn.Module):
         search: observer and policy for search.
         explore: observer and policy for exploration; during a search this observer keeps the map of all classes.
         verification: probabilities after closer looks (`semfov.belief.Verification`); None searches without them.
-        windows: evidence for large pictures (`semfov.zoom.GlimpseEvidence`); None looks at slices in the order of what
-            the overview shows.
+        windows: evidence for windows (`semfov.zoom.GlimpseEvidence`); None looks at slices in the overview's order.
         grid: `(columns, rows)` of the belief, 1 to 200 each.
 
     Raises:
@@ -209,13 +208,12 @@ class ActivePerception(nn.Module):
 
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
-        detector, fitted = self.eye.detector, ["windows"] if self.windows is not None else []
-        fitted += ["closer looks"] if self.verification is not None else []
-        return (
-            f"{type(self).__name__}: {detector.settings()['name']}, {len(detector.classes)} classes, "
-            f"{type(self.eye.sensor).__name__}, {self.columns} × {self.rows} cells; "
-            f"fitted for {' and '.join(fitted) or 'neither windows nor closer looks'}"
+        fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
+        eye, cells = (
+            f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes",
+            (self.columns, self.rows),
         )
+        return f"{type(self).__name__}({eye}, {type(self.eye.sensor).__name__}, cells={cells}, fitted={fitted})"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -229,7 +227,7 @@ class ActivePerception(nn.Module):
 
     @property
     def zoom(self) -> ZoomAgent:
-        """The part of the agent that looks at windows of large pictures."""
+        """The part of the agent that looks at windows."""
         return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)
 
     @property
@@ -249,12 +247,12 @@ class ActivePerception(nn.Module):
         return HeadAgent(self.eye, search.model, explore.model)
 
     def kind_of_look(
-        self, picture: PictureLike, how: How = "auto", *, every: bool = False, foveal: bool = False
+        self, picture: PictureLike | OpenedPicture, how: How = "auto", *, every: bool = False, foveal: bool = False
     ) -> KindOfLook:
         """How the agent looks at a picture.
 
         Args:
-            picture: as for `search`.
+            picture: as for `search`, or one that is opened.
             how: `auto` chooses by the picture; another kind is returned as it is, if it suits the picture.
             every: whether all objects are wanted.
             foveal: whether something is asked for that only a fovea can do in a photograph: a search for any of several
@@ -266,11 +264,8 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        return self._kind_of(open_picture(picture), how, every=every, foveal=foveal)
-
-    def _kind_of(self, picture: OpenedPicture, how: str, *, every: bool, foveal: bool) -> KindOfLook:
-        photographs = not foveal and self.windows is not None and self.windows.photograph is not None
-        return picture.kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
+        known = not foveal and self.windows is not None and self.windows.photograph is not None
+        return open_picture(picture).kind(how, self.eye.detector.input_size, every=every, photographs=known)
 
     def search(
         self,
@@ -509,9 +504,8 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(
-            self.eye.detector, open_picture(picture, color).image(self.eye.sensor.like)[0], source=source
-        )
+        image = open_picture(picture, color).image(self.eye.sensor.like)[0]
+        return GazePrediction.of(self.eye.detector, image, source=source)
 
     def live(
         self,
@@ -585,7 +579,7 @@ class ActivePerception(nn.Module):
     ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
         """Open the picture, choose the kind of look, and check the limits that suit it."""
         opened = open_picture(picture, color)
-        kind = self._kind_of(opened, how, every=every, foveal=foveal or shifts is not None)
+        kind = self.kind_of_look(opened, how, every=every, foveal=foveal or shifts is not None)
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)
         return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}
@@ -602,7 +596,5 @@ class ActivePerception(nn.Module):
 
 def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
     """The record, whose objects count from `least` on; None leaves it as it is."""
-    if least is None:
-        return record
-    check_number(least, "least", 0, 1)
-    return replace(record, least=least)
+    check_number(0.0 if least is None else least, "least", 0, 1)
+    return record if least is None else replace(record, least=least)

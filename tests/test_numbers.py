@@ -31,6 +31,7 @@ from semfov.head import Speeds
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.closer import PART, PhotographPlaces
+from semfov.zoom.eye import _WIDE_BORDER
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
@@ -123,6 +124,7 @@ KNOWN = {
         f"confidence of {FAINT}": "code",
         f"hints of {PhotographPlaces.least}": "code",
         f"window is {PART} times as long": "code",
+        f"within {_WIDE_BORDER:g} canvas px": "code",
         "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
         f"probability {LIKELY} on": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",

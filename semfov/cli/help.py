@@ -35,7 +35,7 @@ _AGENT = """\
   --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
 
 _LOOKS = """\
-  --how KIND           auto (default: by the size of the picture), fovea, windows, or head (in a panorama)
+  --how KIND           auto (default: windows of any picture), fovea, windows, or head (in a panorama)
   --passes N           most passes of the detector; --shifts N: most gaze shifts of a fovea
   --seconds S          longest time for a picture; the first limit that is reached ends it"""
 

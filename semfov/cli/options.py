@@ -58,7 +58,7 @@ class PictureOptions(AgentOptions):
     Args:
         pictures: photographs, large pictures, or folders of them (none: an embedded scene).
         how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
-            in front of the viewer), or `auto` by the size of the picture.
+            in front of the viewer), or `auto` for what suits the picture.
         passes: largest number of passes of the detector, closer looks included (none: 24 for windows, 40 for a head).
         shifts: largest number of gaze shifts of a fovea (none: 30 for a search, 20 otherwise, without limit of passes).
         seconds: longest time in seconds for each picture on this machine.

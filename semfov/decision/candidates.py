@@ -43,6 +43,9 @@ class CandidatePlace:
 class CandidatePlaces(ABC, Generic[LookType]):
     """Base of the places that seem to hold the target of one search, the most evident first, each listed once."""
 
+    by_best = False
+    """Whether the probability that the picture holds the target is that after the look at the best place."""
+
     def __init__(self, forgetting: Forgetting | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
 

@@ -174,13 +174,15 @@ class Verifier(Generic[LookType]):
 
     @property
     def presence(self) -> float:
-        """Probability that the picture holds the target: after the look at the best place, or that without one."""
+        """Probability that the picture holds the target: after the closer looks, or that without them.
+
+        It is the largest after one of them, or that after the look at the best place (`CandidatePlaces.by_best`).
+        """
         without = self.places.presence
-        recent = [(self._chance(each), each) for each in self.verdicts if self._recent(each)]
-        if not recent:
-            return without
-        _, best = max(recent, key=lambda pair: pair[0])
-        return self._faded(best.look.presence, without, best.age)
+        recent = [each for each in self.verdicts if self._recent(each)]
+        if self.places.by_best:
+            recent = sorted(recent, key=self._chance)[-1:]
+        return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
 
     @property
     def best(self) -> CloseUp:

@@ -201,6 +201,7 @@ class PhotographPlaces(CandidateBoxes):
     """
 
     least = 0.002
+    by_best = True
 
     def __init__(self, target: int, forgetting: Forgetting | None = None) -> None:
         super().__init__(target, 0.0, forgetting)

@@ -27,6 +27,9 @@ _Frame = tuple[int, int, int, int, int, int, int, int]
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
 
+_WIDE_BORDER = 16.0
+"""The same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)."""
+
 
 @dataclass(frozen=True)
 class WindowView:
@@ -137,7 +140,8 @@ class WindowEye(nn.Module):
         candidates = proposals.precise()
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
-        place = _Placement(frames, view.picture.size, selected.boxes)
+        border = _WIDE_BORDER if view.lattice.levels == 1 else BORDER
+        place = _Placement(frames, view.picture.size, selected.boxes, border)
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
@@ -268,15 +272,15 @@ def _window_pixels(
 class _Placement:
     """Maps boxes from the canvases of several looks to the picture; size `(width, height)`."""
 
-    def __init__(self, frames: Sequence[_Frame], size: tuple[int, int], like: Tensor) -> None:
+    def __init__(self, frames: Sequence[_Frame], size: tuple[int, int], like: Tensor, border: float) -> None:
         wide, high = size
         rows = []
         # Python's numbers: tensors this small spend their time in calls.
         for x1, y1, x2, y2, u1, v1, u2, v2 in frames:
             scale = (x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)
             # The border of the picture cuts no object.
-            near = u1 + BORDER if x1 > 0 else -math.inf, v1 + BORDER if y1 > 0 else -math.inf
-            far = BORDER - u2 if x2 < wide else -math.inf, BORDER - v2 if y2 < high else -math.inf
+            near = u1 + border if x1 > 0 else -math.inf, v1 + border if y1 > 0 else -math.inf
+            far = border - u2 if x2 < wide else -math.inf, border - v2 if y2 < high else -math.inf
             rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, [*near, *far], [1, 1, -1, -1]])
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
         self._numbers = [numbers[number].unbind() for number in range(len(frames))]
