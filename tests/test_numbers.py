@@ -56,7 +56,13 @@ OTHERS = [
 COMMAND = re.compile(r"python -m|`(?:eval|train|benchmarks)\.|`semfov fit|commit [0-9a-f]{7}")
 
 COMPANIONS = {
-    "README.md": ["docs/results.md", "docs/tables.md", "docs/measurements/zoom.md", "docs/detectors.md"],
+    "README.md": [
+        "docs/results.md",
+        "docs/tables.md",
+        "docs/measurements/zoom.md",
+        "docs/detectors.md",
+        "docs/guides/gaze-prediction.md",
+    ],
     "docs/results.md": ["docs/tables.md"],
     "docs/tables.md": ["docs/results.md"],
     "docs/decisions/closer_looks.md": ["docs/results.md", "docs/tables.md"],
@@ -153,8 +159,6 @@ KNOWN = {
     "docs/decisions/closer_looks.md": {
         f"shows {PART} of the longer side": "code",
         "there and at none of the places looked at before is 0.1": "in the file of the model",
-        "1.99 passes, and looks at every place from a probability of 0.1 on 2.21": "tried on the fit set",
-        "curve (0.966)": "tried on the fit set, without a command",
         "958 searches of 116 photographs": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",
         "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
