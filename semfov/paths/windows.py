@@ -246,7 +246,8 @@ class ZoomPath(GazeRecord):
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
-        objects = Objects(**{name: tensors[f"object_{name}"] for name in _OBJECTS})
+        boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
+        objects = Objects(boxes, scores, labels, passes)
         unseen = record.get("unseen") and tuple(record["unseen"])
         looks, classes = shared["detections"], shared["classes"]
         check(len(record["seconds"]) in (0, len(looks)), "seconds", f"{len(looks)} times, or none", record["seconds"])

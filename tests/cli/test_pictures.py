@@ -32,7 +32,7 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
                         "--report", tmp_path / "page.html")  # fmt: skip
     assert code == 0
     found = re.search(
-        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, belief: [01]\.\d\d\n"
+        r"my photo\.png, 160 × 120 px: found red at \((\d+), (\d+)\)(, box (\S+))?, belief [01]\.\d\d\n"
         r"  \w.*\. \d+ passes in \d+\.\d s\.", printed.out,
     )  # fmt: skip
     assert found
