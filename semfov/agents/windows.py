@@ -313,7 +313,6 @@ class WindowEpisode(Episode[ZoomPath]):
     ) -> None:
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
-        self.certainty = None if evidence is None else evidence.certainty
         self.batch, self.worth, self._least = batch, worth, least
         self._confirm = confirm
         self._decisions: WindowDecisions | None = None

@@ -104,7 +104,7 @@ class LookFigure:
         self.record, believed = record, record.belief_map(0)
         panels, aspect = 2 if believed is None else 3, image.shape[-2] / image.shape[-1]
         wide = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
-        height = wide * aspect / 1.05 + 0.3
+        height = max(wide * aspect / 1.05 + 0.3, 3.4)  # the view keeps its height beside a flat panorama
         self.figure, self.axes = make_figure(1, panels, wide * panels, height, layout="compressed", axes=axes)
         path_axes, view_axes, *others = self.axes
         if axes is None:
