@@ -22,20 +22,26 @@ toaster, sink, refrigerator, book, clock, vase, scissors, teddy bear, hair drier
 COCO_CLASSES: tuple[str, ...] = tuple(name.strip() for name in _NAMES.split(","))
 
 
-_PLACEHOLDERS = ("", "N/A", "__background__")
-"""Names of outputs that do not stand for a class: gaps in COCO's category ids, and background."""
+_PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no object", "no-object")
+"""Names of outputs that do not stand for a class, in lower case: gaps in COCO's category ids, and background."""
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Find the names that stand for a class.
+    """Find the names that stand for a class; a whole number is a name, too.
 
     >>> named_outputs(["__background__", "cat", "N/A", "dog"])
     (('cat', 'dog'), (1, 3))
+    >>> named_outputs(["background", 7, "n/a"])
+    (('7',), (1,))
     """
-    places = tuple(index for index, name in enumerate(classes) if name not in _PLACEHOLDERS)
-    names = tuple(classes[index] for index in places)
-    check(len(set(names)) == len(names) > 0, "classes", "at least one name, all different", names)
-    return names, places
+    wrong = [name for name in classes if isinstance(name, bool) or not isinstance(name, str | int | None)]
+    remedy = "; YAML reads no, off, yes and on so: put names in quotes, or give classes="
+    check(not wrong, "classes", "names", f"{wrong[:3]}{remedy}")
+    names = [str(name).strip() for name in classes]
+    places = tuple(index for index, name in enumerate(names) if name.lower() not in _PLACEHOLDERS)
+    kept = tuple(names[index] for index in places)
+    check(len(set(kept)) == len(kept) > 0, "classes", "at least one name, all different", kept)
+    return kept, places
 
 
 def keep_classes(candidates: Candidates, places: Sequence[int], count: int) -> Candidates:

@@ -273,8 +273,8 @@ class OnnxTwin:
             path = exported(network, cache_folder() / "exported", layers)
         except DataError:  # the cache cannot be written to
             with tempfile.TemporaryDirectory() as folder:
-                return OnnxSession(exported(network, Path(folder), layers), checked=False)
-        return OnnxSession(path, checked=False)
+                return OnnxSession(exported(network, Path(folder), layers), open_ended=False)
+        return OnnxSession(path, open_ended=False)
 
 
 def network_digest(network: Darknet) -> str:

@@ -1,6 +1,7 @@
 """Detectors from ONNX models of common families, with the full score vector of every box."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
@@ -21,7 +22,7 @@ from semfov.detection.onnx_file import (
     read_settings,
     with_input_size,
 )
-from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, recognise
+from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, misplaced, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -34,6 +35,9 @@ from semfov.io.schema import excerpt
 
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
+
+_MOST_BOXES = 2**20
+"""Largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px."""
 
 
 class OnnxDetector(Detector):
@@ -75,6 +79,7 @@ class OnnxDetector(Detector):
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
+        self._placed = False
         self._layers: dict[str, str] | None = None
         self._named_layers: tuple[str, ...] = ()
         self._wide = session
@@ -126,13 +131,36 @@ class OnnxDetector(Detector):
 
     def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
         """Decode the outputs of the network, given by name, for a canvas of `(width, height)`."""
-        candidates = HEADS[self.head].decode(outputs, size)
+        candidates = HEADS[self.head].decode(outputs, size, self._scores)
+        if candidates.boxes.shape[1] > _MOST_BOXES:
+            raise DataError(f"{self.name}: expected at most {_MOST_BOXES:,} boxes, got {candidates.boxes.shape[1]:,}")
+        first = not self._placed and values_known(candidates.boxes, candidates.classes)
+        if first:
+            self._check_first(outputs, candidates, size)
         if self.logits:
             objectness = None if candidates.objectness is None else candidates.objectness.sigmoid()
             candidates = replace(candidates, classes=candidates.classes.sigmoid(), objectness=objectness)
         if values_known(candidates.boxes):
             self._check(candidates)
+        self._placed |= first
         return keep_classes(candidates, self._places, self._scores)
+
+    def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: tuple[int, int]) -> None:
+        """Raise `DataError` where the numbers of the first pass show another head or scores after their sigmoid."""
+        logits = [each for name, each in outputs.items() if name.endswith("logits")]
+        for each in [candidates.classes] if self.logits else logits:
+            low, high = map(float, each.aminmax()) if each.numel() else (0.0, 0.0)
+            if 0 <= low < high <= 1:
+                raise DataError(
+                    f"{self.name}: expected scores before the {'sigmoid' if self.logits else 'softmax or sigmoid'}, "
+                    f"got [{low:.3g}, {high:.3g}]; "
+                    + ("set logits=False" if self.logits else "export the model without it")
+                )
+        if wrong := misplaced(candidates.boxes, size):
+            raise DataError(
+                f"{self.name}: expected boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}, got "
+                f"{wrong}; name the model's head with head=, one of {', '.join(sorted(HEADS))}"
+            )
 
     def _check(self, candidates: Candidates) -> None:
         """Raise `DataError` where the numbers show a wrong head or a missing sigmoid."""
@@ -207,22 +235,31 @@ def load_onnx(
     outputs = probe(session, size)
     names = chosen.get("classes")
     if "head" not in chosen:
+        # A pass tells apart heads whose shapes are alike.
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
         coco = len(COCO_CLASSES) if published_name else None
         count = coco if names is None else len(names)
-        chosen["head"] = recognise(Signature(session.image, shapes, size, session.producer, count))
+        grey = torch.full((1, 3, size[1], size[0]), 0.5)
+        signature = Signature(session.image, shapes, size, session.producer, count, session.metadata)
+        chosen["head"] = recognise(signature, lambda: session(grey))
     head_kind = HEADS[lookup(chosen["head"], HEADS, "head")]
     if not isinstance(preprocessing, Preprocessing):
         default = head_kind.preprocessing.merged(stored["preprocessing"])
         preprocessing = default.merged({} if preprocessing is None else preprocessing)
     try:
-        scores = head_kind.decode(outputs, size).classes.shape[-1]
+        scores = head_kind.decode(outputs, size, None if names is None else len(names)).classes.shape[-1]
     except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
         listed = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
         raise InputError(
             f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
         ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
+    if chosen["head"] == "end2end":
+        warnings.warn(
+            f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
+            "end2end=False (and without NMS) it has all scores, from which beliefs learn more",
+            stacklevel=2,
+        )
     names = _coco_names(scores) if names is None else names
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
@@ -270,7 +307,7 @@ def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
     stated = {name: [n for n in shape[1:] if n is not None] for name, shape in session.outputs}
     for name, sizes in stated.items():
         check_elements(f"{session.path.name}: output {name!r}", sizes)
-    if all(shape and len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
+    if not session.open_ended and all(shape and len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
         return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
     return session(torch.zeros(1, 3, size[1], size[0]))
 

@@ -23,6 +23,10 @@ MOST_BATCH = 1024
 """Largest fixed batch size of a model."""
 _MOST_PIXELS = 89_478_485
 """Largest number of pixels of a canvas, the same as for pictures that are read."""
+_USUAL_SIDE = 640
+"""Side of a picture with which open sizes are tried out."""
+_WITH_GRAPHS = {"Loop", "Scan", "If"}
+"""Operations with graphs of their own, whose steps are not counted."""
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
 
 METADATA_KEY = "semfov"
@@ -43,8 +47,12 @@ _KEYS: dict[str, tuple[type, ...]] = {
 """Keys of a settings file, with the types of their values; `licence` and `source` are for people."""
 
 
-def check_file(path: Path) -> None:
-    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
+def check_file(path: Path) -> bool:
+    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone.
+
+    Returns:
+        Whether sizes or the number of steps cannot be known from the file, as they may depend on values.
+    """
     import onnx
 
     check_regular(path, f"ONNX model {str(path)!r}")
@@ -60,14 +68,25 @@ def check_file(path: Path) -> None:
         _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
         if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
             raise DataError(f"ONNX model {str(path)!r}: expected at most {_MOST_METADATA:,} characters of metadata")
-        inferred = onnx.shape_inference.infer_shapes(_without_weights(model), data_prop=True).graph
+        slim = _without_weights(model)
+        for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
+            for place, side in enumerate(value.type.tensor_type.shape.dim):
+                if not side.dim_value:
+                    side.dim_value = _USUAL_SIDE if place > 1 else 1
+        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=True).graph
     except DataError:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
-        reason = " ".join(str(error).split())[:200]
+        reason = " ".join(str(error).split())[-400:]
         raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from None
     values = [*inferred.value_info, *inferred.input, *inferred.output]
     _check_sizes(path, ((value.name, _dims(value)) for value in values))
+    known = {
+        value.name for value in values if all(each.HasField("dim_value") for each in value.type.tensor_type.shape.dim)
+    }
+    steps = {node.op_type for node in model.graph.node}
+    made = {name for node in model.graph.node for name in node.output if name}
+    return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
 
 
 def model_digest(path: Path) -> str:
@@ -175,7 +194,7 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
         if "names" in metadata:
             names = ast.literal_eval(metadata["names"])
             settings["classes"] = [names[i] for i in range(len(names))]
-            if not all(isinstance(name, str) and is_plain(name) for name in settings["classes"]):
+            if isinstance(names, str) or not all(is_plain(str(name)) for name in settings["classes"]):
                 return {}
         if "imgsz" in metadata:
             height, width = ast.literal_eval(metadata["imgsz"])

@@ -4,7 +4,7 @@ Boxes are `(x1, y1, x2, y2)` in canvas pixels, edges between pixels (0 is the le
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from semfov.detection.detector import FAINT
 from semfov.detection.objects import LEAST
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.errors import InputError, check, check_shape
+from semfov.errors import InputError, check, check_shape, values_known
 
 
 def cells(canvas: tuple[int, int], stride: int) -> tuple[int, int]:
@@ -80,6 +80,37 @@ def decode_yolov8(columns: Tensor) -> Candidates:
     check_shape(columns, "columns", None, None, None)
     rows = columns.transpose(1, 2)
     return Candidates(_corners(rows[..., :4]), rows[..., 4:])
+
+
+def decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
+    """Decode rows `x1 y1 x2 y2 score class` that a network has selected itself (YOLOv10): all other scores are 0.
+
+    >>> decode_end_to_end(torch.tensor([[[1.0, 2.0, 5.0, 4.0, 0.9, 1.0]]]), 3).classes
+    tensor([[[0.0000, 0.9000, 0.0000]]])
+
+    Shapes: rows `(B, N, 6)`.
+    """
+    check_shape(rows, "rows", None, None, 6)
+    scores, numbers = rows[..., 4], rows[..., 5]
+    if values_known(rows):
+        used = numbers[scores > 0]
+        check(
+            bool((used == used.round()).all()),
+            "rows",
+            "a whole number of a class in the last column",
+            used[:3].tolist(),
+        )
+        known = not len(used) or (float(used.min()) >= 0 and float(used.max()) < classes)
+        check(
+            known,
+            "classes",
+            "a name for each class of the rows",
+            f"{classes}, and class {used.max() if len(used) else 0:g}",
+        )
+    index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
+    return Candidates(
+        rows[..., :4], scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
+    )
 
 
 def decode_distances(
@@ -173,24 +204,56 @@ def _fractions(boxes: Tensor, canvas: tuple[int, int]) -> Tensor:
     return _corners(boxes) * boxes.new_tensor(canvas * 2)
 
 
+def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
+    """What boxes `(B, N, 4)` of one pass look like if another head has made them, in words; None for boxes in place.
+
+    >>> misplaced(torch.tensor([[[0.1, 0.2, 0.8, 0.9]]]), (640, 640))
+    'fractions of the canvas instead of pixels'
+    """
+    rows = boxes.detach().reshape(-1, 4).double()
+    rows = rows[(rows != 0).any(-1)]  # empty rows of a network that selects boxes itself
+    if not len(rows):
+        return None
+    if not bool(rows.isfinite().all()):
+        return "boxes that are not finite"
+    low, high = rows[:, :2], rows[:, 2:]
+    if float(rows.abs().max()) <= _FRACTIONS < min(canvas):
+        return "fractions of the canvas instead of pixels"
+    if float((high < low).any(-1).double().mean()) > _MOST_MISPLACED:
+        return "boxes whose right or lower edge comes first"
+    size = rows.new_tensor(canvas)
+    away = ((low + high) / 2 - size / 2).abs() > size
+    if float(away.any(-1).double().mean()) > _MOST_MISPLACED:
+        return f"boxes around {[*((low + high) / 2).median(0).values.round().long().tolist()]}, outside the canvas"
+    return None
+
+
 Outputs = Mapping[str, Tensor]
 _Canvas = tuple[int, int]
 
+_FRACTIONS = 2.0
+"""Coordinates up to here, of all boxes of a canvas, are no pixels."""
+_MOST_MISPLACED = 0.5
+"""Share of the boxes of a pass that may lie elsewhere."""
+
 _LETTERBOX = Preprocessing()
+_YOLOX = Preprocessing(channels="bgr", scale=255.0, corner=True)
 _IMAGENET = Preprocessing(mean=IMAGENET_MEAN, std=IMAGENET_STD, stretch=True)
 _NANODET = Preprocessing(
     channels="bgr", scale=255.0, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395), stretch=True
 )
 
 STRIDES = (8, 16, 32, 64)
+_OTHER_TASKS = ("segment", "pose", "obb", "classify")
+"""Tasks in Ultralytics' metadata whose outputs are other ones than those of detection."""
 _DETR_LOGITS = ("logits", "pred_logits")
 
 
 @dataclass(frozen=True)
 class _DetectionHead:
-    """The head of a family of networks; decode `(width, height)`."""
+    """The head of a family of networks; `decode` takes outputs, `(width, height)` and the number of names, if known."""
 
-    decode: Callable[[Outputs, _Canvas], Candidates]
+    decode: Callable[[Outputs, _Canvas, int | None], Candidates]
     preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
     faint: float = FAINT
@@ -206,16 +269,22 @@ class Signature:
     canvas: _Canvas
     producer: str = ""
     classes: int | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-def recognise(signature: Signature) -> str:
-    """Recognise the head of a model.
+def recognise(signature: Signature, run: Callable[[], Outputs] | None = None) -> str:
+    """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes.
 
     >>> recognise(Signature("images", (("output0", (1, 84, 8400)),), (640, 640)))
     'yolov8'
     """
+    task = signature.metadata.get("task", "detect")
+    check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
     names = list(_fitting(signature))
-    if len(names) == 1:
+    if len(names) > 1 and run is not None:
+        outputs = run()
+        names = [name for name in names if _fits(name, outputs, signature)] or names
+    if len(names) == 1 or names == ["yolox", "yolox-decoded"]:  # YOLOX's own names, and values that do not tell
         return names[0]
     shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
     width, height = signature.canvas
@@ -225,6 +294,15 @@ def recognise(signature: Signature) -> str:
         f"outputs {shapes} on a {width} x {height} canvas{count}: {fits}; "
         f"name the head with head=, one of {', '.join(sorted(HEADS))}"
     )
+
+
+def _fits(name: str, outputs: Outputs, signature: Signature) -> bool:
+    """Whether the boxes that a head makes of outputs lie on the canvas."""
+    try:
+        found = HEADS[name].decode(outputs, signature.canvas, signature.classes)
+    except InputError:
+        return False
+    return misplaced(found.boxes, signature.canvas) is None
 
 
 def _fitting(signature: Signature) -> Iterator[str]:
@@ -269,32 +347,47 @@ def _distances(signature: Signature) -> Iterator[str]:
 
 
 def _single(signature: Signature, name: str, rows: int, columns: int) -> Iterator[str]:
-    """Heads with everything in one tensor `(1, rows, columns)`."""
-    canvas, classes = signature.canvas, signature.classes
-    three, four = (_cell_count(canvas, STRIDES[:count]) for count in (3, 4))
+    """Heads with everything in one tensor `(1, rows, columns)`, of which either may be the boxes."""
+    classes, meta = signature.classes, signature.metadata
+    counts = _box_counts(signature.canvas)
+    across = columns in counts and rows not in counts
+    anchors, levels = counts.get(columns if across else rows, (0, 0))
+    channels = rows if across else columns
 
-    def scores(channels: int, others: int) -> bool:
+    def scores(others: int) -> bool:
         return channels > others and classes in (None, channels - others)
 
-    if columns in (6, 7) and rows not in (three, four, 3 * three, 3 * four) and classes != columns - 4:
+    if anchors == 3:
+        yield from ("yolov5",) if scores(5) else ()
+    # Without names, rows have an objectness unless their scores are as many as COCO's.
+    elif anchors and scores(4) and (across or classes is not None or channels - 4 in (80, 91)):
+        yield "yolov8"
+    elif levels == 3 and scores(5) and not across:
+        named = (signature.image, name) == ("images", "output")  # names in YOLOX's own exports
+        yield from ("yolox", "yolox-decoded", *(() if named else ("yolov5",)))
+    elif levels == 4 and not across:
+        yield from ("nanodet-plus",) if scores(32) else ()
+        yield from ("yolov5",) if scores(5) else ()
+    elif columns == 6 and not anchors:
+        selects = meta.get("end2end") == "True" or "'nms': True" in meta.get("args", "")
+        if classes != 2 or selects or "end2end" not in meta:
+            yield "end2end"
+        if classes == 2 and not selects:
+            yield "rtdetr"
+    elif columns == 7 and classes != 3 and not anchors:
         raise InputError(
             f"output {name} (1, {rows}, {columns}): expected all class scores of each box, got boxes without them; "
             f"export the model without NMS"
         )
-    if columns in (three, four) and scores(rows, 4):
-        yield "yolov8"
-    elif rows in (3 * three, 3 * four) and scores(columns, 5):
-        yield "yolov5"
-    elif rows == three and scores(columns, 5):
-        yield "yolox"
-        if (signature.image, name) != ("images", "output"):  # names in YOLOX's own exports of raw outputs
-            yield "yolov5"
-    elif rows == four and classes is None:
-        yield from ("nanodet-plus", "yolov5")
-    elif rows == four and scores(columns, 32):
-        yield "nanodet-plus"
-    elif classes is not None and scores(columns, 4):
+    elif classes is not None and scores(4) and not across:
         yield "rtdetr"
+
+
+def _box_counts(canvas: _Canvas) -> dict[int, tuple[int, int]]:
+    """Anchors per cell and levels by the number of boxes of a head with cells."""
+    return {
+        anchors * _cell_count(canvas, STRIDES[:levels]): (anchors, levels) for anchors in (3, 1) for levels in (4, 3)
+    }
 
 
 def _logits(outputs: Mapping[str, object]) -> str:
@@ -309,13 +402,21 @@ def _first(outputs: Outputs) -> Tensor:
     return next(iter(outputs.values()))
 
 
-def _candidates(outputs: Outputs, canvas: _Canvas) -> Candidates:
+def _rows(outputs: Outputs, canvas: _Canvas, *, across: bool = False) -> Tensor:
+    """The only tensor of a head as rows `(B, N, C)`; `across`: usually the boxes are its columns."""
+    tensor, counts = _first(outputs), _box_counts(canvas)
+    check_shape(tensor, "outputs", None, None, None)
+    rows, columns = (size in counts for size in tensor.shape[1:])
+    return tensor.mT if (columns and not rows) or (across and rows == columns) else tensor
+
+
+def _candidates(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     return Candidates(
         outputs["boxes"], outputs[_classes(outputs)], outputs.get("objectness"), outputs.get("background")
     )
 
 
-def _level_maps(outputs: Outputs, canvas: _Canvas) -> Candidates:
+def _level_maps(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
     maps = list(outputs.values())
@@ -330,13 +431,19 @@ def _level_maps(outputs: Outputs, canvas: _Canvas) -> Candidates:
     return decode_distances(classes, distances, canvas, strides=strides)
 
 
-def _nanodet_plus(outputs: Outputs, canvas: _Canvas) -> Candidates:
+def _nanodet_plus(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode NanoDet-Plus: class scores, then distances with 8 bins for each side."""
     rows = _first(outputs)
     return decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
 
 
-def _rtdetr(outputs: Outputs, canvas: _Canvas) -> Candidates:
+def _end_to_end(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+    if count is None:
+        raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
+    return decode_end_to_end(_first(outputs), count)
+
+
+def _rtdetr(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if "pred_boxes" in outputs:
         return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
     return _decode_rtdetr_rows(_first(outputs), canvas)
@@ -344,19 +451,18 @@ def _rtdetr(outputs: Outputs, canvas: _Canvas) -> Candidates:
 
 HEADS: dict[str, _DetectionHead] = {
     "candidates": _DetectionHead(_candidates),
-    "yolox": _DetectionHead(
-        lambda outputs, canvas: decode_yolox(_first(outputs), canvas),
-        Preprocessing(channels="bgr", scale=255.0, corner=True),
-    ),
-    "yolov5": _DetectionHead(lambda outputs, canvas: decode_yolov5(_first(outputs))),
-    "yolov8": _DetectionHead(lambda outputs, canvas: decode_yolov8(_first(outputs))),
+    "yolox": _DetectionHead(lambda outputs, canvas, _: decode_yolox(_first(outputs), canvas), _YOLOX),
+    "yolox-decoded": _DetectionHead(lambda outputs, canvas, _: decode_yolov5(_first(outputs)), _YOLOX),
+    "yolov5": _DetectionHead(lambda outputs, canvas, _: decode_yolov5(_rows(outputs, canvas))),
+    "yolov8": _DetectionHead(lambda outputs, canvas, _: decode_yolov8(_rows(outputs, canvas, across=True).mT)),
+    "end2end": _DetectionHead(_end_to_end),
     "picodet": _DetectionHead(_level_maps, _IMAGENET),
     "nanodet": _DetectionHead(_level_maps, _NANODET),
     # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
     # some score, which would dilute that of the best one if only their shares counted.
     "nanodet-plus": _DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
     "detr": _DetectionHead(
-        lambda outputs, canvas: decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
+        lambda outputs, canvas, _: decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
         "own",
     ),

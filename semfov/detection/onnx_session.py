@@ -1,6 +1,9 @@
 """An ONNX model in onnxruntime, called with torch tensors."""
 
+import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,13 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+_MOST_MEMORY = 3 * 2**28
+"""Bytes for the tensors of models whose sizes depend on values, all together."""
+_MOST_SECONDS = 10.0
+"""Longest pass of such a model for one image."""
+_MOST_REASON = 400
+"""Largest number of characters of onnxruntime's reasons that a message has."""
+
 Provider = str | tuple[str, Mapping[str, Any]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
@@ -30,7 +40,8 @@ class OnnxSession:
 
     Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
 
-    Shapes: providers `(name, options)`. `further` names tensors inside the model that are outputs too.
+    Shapes: providers `(name, options)`. `further` names tensors inside the model that are outputs too; `open_ended`
+    says whether the sizes of tensors or the number of steps depend on values, None: whatever the file shows.
     """
 
     def __init__(
@@ -41,11 +52,12 @@ class OnnxSession:
         device: torch.device | str = "cpu",
         providers: Sequence[Provider] | None = None,
         spinning: bool = False,
-        checked: bool = True,
+        open_ended: bool | None = None,
         further: Sequence[str] = (),
     ) -> None:
         import onnxruntime as ort
 
+        ort.disable_telemetry_events()
         self.path, self.spinning, self.further = Path(path), spinning, tuple(further)
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
@@ -54,10 +66,12 @@ class OnnxSession:
         options = ort.SessionOptions()
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
-        options.log_severity_level = 3  # some exporters leave a warning for every initialiser
+        options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
-        if checked:
-            check_file(self.path)
+        self.open_ended = check_file(self.path) if open_ended is None else open_ended
+        if self.open_ended:
+            _limit_memory()
+            options.add_session_config_entry("session.use_env_allocators", "1")
         try:
             chosen = _providers(self.device) if self.providers is None else _available_providers(self.providers)
             # onnxruntime's fallback would print messages and try the same again.
@@ -70,8 +84,7 @@ class OnnxSession:
         except InputError:
             raise
         except Exception as error:  # onnxruntime's own exceptions share no base class
-            reason = " ".join(str(error).split())[:300]
-            raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from error
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
         try:
             self._describe()
         except UnicodeDecodeError as error:
@@ -116,6 +129,7 @@ class OnnxSession:
         short = -batch % size
         if short:
             source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])
+        size = 1 if self.open_ended and fixed is None else size  # each has all the memory
         runs = [self._run(part.contiguous()) for part in source.split(size)]
         joined = runs[0] if len(runs) == 1 else {name: torch.cat([run[name] for run in runs]) for name in runs[0]}
         return {name: joined[name][:batch].to(image) for name, _ in self.outputs}
@@ -124,9 +138,13 @@ class OnnxSession:
         feed = {self.image: image.numpy()} | {name: _EXTRA_INPUTS[name](image).numpy() for name in self._extra}
         names = [name for name, _ in self.outputs]
         try:
-            arrays = self._session.run(names, feed)
+            arrays = self._limited(names, feed) if self.open_ended else self._session.run(names, feed)
         except Exception as error:  # as above
-            reason = " ".join(str(error).split())[:300]
+            reason = _reason(error)
+            if "terminate flag" in reason:
+                reason = f"not done after {_MOST_SECONDS:.0f} s, as with a loop that does not end"
+            elif "Available memory" in reason:
+                reason = f"its tensors need more than {_MOST_MEMORY >> 20} MiB, as with too many boxes; {reason}"
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         for name, array in zip(names, arrays, strict=True):
             if array.ndim < 1 or array.shape[0] != len(image):
@@ -136,12 +154,29 @@ class OnnxSession:
                 )
         return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
+    def _limited(self, names: list[str], feed: dict[str, Any]) -> Any:
+        """The outputs of a run that is stopped after some time."""
+        import onnxruntime as ort
+
+        options = ort.RunOptions()
+        options.log_severity_level = 4
+        timer = threading.Timer(_MOST_SECONDS * len(feed[self.image]), setattr, (options, "terminate", True))
+        timer.daemon = True
+        timer.start()
+        try:
+            return self._session.run(names, feed, options)
+        finally:
+            timer.cancel()
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (self.path, self.threads, self.device, self.providers, self.spinning, self.further)
+        return _reopen, (*self._settings(), self.further)
 
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
-        return _reopen(self.path, self.threads, self.device, self.providers, self.spinning, further)
+        return _reopen(*self._settings(), further)
+
+    def _settings(self) -> tuple[Any, ...]:
+        return self.path, self.threads, self.device, self.providers, self.spinning, self.open_ended
 
 
 def _reopen(
@@ -150,10 +185,28 @@ def _reopen(
     device: torch.device,
     providers: Sequence[Provider] | None,
     spinning: bool,
-    further: Sequence[str] = (),
+    open_ended: bool,
+    further: Sequence[str],
 ) -> OnnxSession:
     settings: dict[str, Any] = {"threads": threads, "device": device, "providers": providers, "spinning": spinning}
-    return OnnxSession(path, **settings, checked=False, further=further)
+    return OnnxSession(path, **settings, open_ended=open_ended, further=further)
+
+
+@cache
+def _limit_memory() -> None:
+    """Register a limited allocator, which sessions use that ask for it."""
+    import onnxruntime as ort
+
+    kinds = ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+    limits = ort.OrtArenaCfg({"max_mem": _MOST_MEMORY, "arena_extend_strategy": 1})
+    ort.create_and_register_allocator(ort.OrtMemoryInfo("Cpu", *kinds), limits)
+
+
+def _reason(error: Exception) -> str:
+    """Onnxruntime's own words, whose end says most."""
+    text = " ".join(str(error).split()).rpartition("Status Message: ")[2]
+    text = re.sub(r"/\S+:\d+ .*?\) ", "", text, count=1)  # where in its source
+    return text if len(text) <= _MOST_REASON else f"…{text[-_MOST_REASON:]}"
 
 
 def _available_providers(providers: Sequence[Provider]) -> list[Any]:

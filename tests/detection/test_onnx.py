@@ -8,6 +8,7 @@ import torch
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
+from semfov.detection.onnx_heads import HEADS
 from semfov.detection.preprocessing import Preprocessing
 from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
@@ -271,10 +272,47 @@ def test_options_that_contradict_the_model_are_refused(make_onnx):
 
 
 def test_outputs_of_a_wrong_head_are_refused(make_onnx):
-    rows = pixels(random(1, 84, 8)) * 50  # decoded boxes, as YOLOv6 returns them in the shape of YOLOX
-    detector = load_onnx(make_onnx({"output": rows}), classes=NAMES)
-    with pytest.raises(DataError, match="expected finite boxes"):
-        detector(torch.ones(1, 3, 64, 64))
+    decoded = make_onnx({"output": pixels(random(1, 84, 8))})  # YOLOX with its boxes decoded in the graph
+    canvas = torch.ones(1, 3, SIDE, SIDE)
+    detector = load_onnx(decoded, classes=NAMES)
+    assert (detector.head, detector.preprocessing) == ("yolox-decoded", HEADS["yolox"].preprocessing)
+    wanted = load_onnx(decoded, classes=NAMES, head="yolov5", preprocessing=detector.preprocessing)
+    assert torch.equal(detector.propose(canvas).boxes, wanted.propose(canvas).boxes)
+    with pytest.raises(DataError, match="expected boxes on a canvas of 64 x 64 px with head 'yolox', got"):
+        load_onnx(decoded, classes=NAMES, head="yolox")(canvas)
+    fractions = make_onnx({"output0": random(1, 84, 7).transpose(0, 2, 1)}, file="other.onnx")
+    with pytest.raises(DataError, match="got fractions of the canvas"):
+        load_onnx(fractions, classes=NAMES)(canvas)
+
+
+def test_rows_may_be_boxes_or_channels(make_onnx):
+    outputs = yolov8()[0]
+    canvas = torch.ones(1, 3, SIDE, SIDE)
+    usual = load_onnx(make_onnx(outputs), classes=NAMES).propose(canvas)
+    other = make_onnx({"output0": outputs["output0"].transpose(0, 2, 1)}, file="other.onnx")
+    turned = load_onnx(other, classes=NAMES).propose(canvas)
+    assert torch.equal(usual.boxes, turned.boxes)
+    assert torch.equal(usual.classes, turned.classes)
+
+
+def test_rows_of_an_end_to_end_model_are_read_with_a_note(make_onnx):
+    """`make_onnx` halves all numbers of a black picture, which for classes gives whole numbers of even ones."""
+    rows = np.array([[[8, 16, 80, 60, 1.8, 2], [2, 2, 18, 18, 0.4, 0], [0, 0, 0, 0, 0, 0]]], np.float32)
+    path = make_onnx({"output0": rows}, metadata={"names": "{0: 'cat', 1: 'dog'}", "end2end": "True"})
+    with pytest.warns(UserWarning, match=r"model\.onnx selects boxes itself .* end2end=False"):
+        detector = load_onnx(path)
+    assert detector.head == "end2end"
+    found = detector.detect(torch.zeros(1, 3, SIDE, SIDE))
+    assert found.boxes[0].tolist() == [[4, 8, 40, 30], [1, 1, 9, 9]]
+    torch.testing.assert_close(found.scores[0], torch.tensor([[0.1, 0.0, 0.9], [0.8, 0.2, 0.0]]))
+
+
+@pytest.mark.parametrize("logits", [None, True])
+def test_scores_after_their_sigmoid_are_refused_where_logits_are_expected(make_onnx, logits):
+    outputs = {"logits": random(1, 9, 4), "pred_boxes": random(1, 9, 4, seed=1)} if logits is None else yolov8()[0]
+    detector = load_onnx(make_onnx(outputs), classes=NAMES, logits=logits)
+    with pytest.raises(DataError, match="expected scores before the"):
+        detector(torch.ones(1, 3, SIDE, SIDE))
 
 
 def test_scores_without_sigmoid_need_the_option_logits(make_onnx):
@@ -301,7 +339,7 @@ def test_scores_of_unused_class_ids_are_dropped(make_onnx):
 
 def test_coco_class_names_are_the_default_for_80_and_91_classes(make_onnx):
     assert load_onnx(make_onnx({"output": random(1, 84, 85)})).classes == COCO_CLASSES
-    outputs = {"logits": random(1, 9, 92), "pred_boxes": random(1, 9, 4)}
+    outputs = {"logits": 9 * random(1, 9, 92), "pred_boxes": random(1, 9, 4)}
     detector = load_onnx(make_onnx(outputs))
     assert detector.classes == COCO_CLASSES  # from 91 ids, without the unused ones
     assert detector.propose(torch.ones(1, 3, SIDE, SIDE)).classes.shape[-1] == 80

@@ -38,6 +38,16 @@ def test_metadata_of_ultralytics(tmp_path):
     assert found == {"classes": ["person", "dog"], "input_size": [640, 480], "preprocessing": {}}
 
 
+def test_numbers_are_names_and_words_that_yaml_changes_are_refused(make_onnx):
+    """YAML reads the names `no` and `yes` as booleans; a name that is a number is meant as one."""
+    values = {"output0": np.random.default_rng(0).random((1, 6, 84)).astype(np.float32)}
+    assert load_detector(make_onnx(values, metadata={"names": "{0: 7, 1: 12}"})).classes == ("7", "12")
+    path = make_onnx(values, metadata={"names": "{0: False, 1: 'cat'}"})
+    with pytest.raises(InputError, match=r"classes: expected names, got \[False\]; YAML reads no, off"):
+        load_detector(path)
+    assert load_detector(path, classes=["no", "cat"]).classes == ("no", "cat")
+
+
 @pytest.mark.parametrize("names", ["person,dog", "{1: 'a'}", "{0: ", "3"])
 def test_metadata_of_another_form_is_ignored(tmp_path, names):
     assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}

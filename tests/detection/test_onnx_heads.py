@@ -1,6 +1,7 @@
 """Decoders of cells against plain Python code (`test_onnx` has the others), and recognition of heads."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -109,9 +110,9 @@ def test_wrong_shapes_are_refused_by_name():
 LEVELS = (6400, 1600, 400)
 
 
-def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None):
+def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None, **metadata):
     named = tuple(o if isinstance(o[0], str) else (f"output{i}", o) for i, o in enumerate(outputs))
-    return Signature(image, named, canvas, producer, classes)
+    return Signature(image, named, canvas, producer, classes, metadata)
 
 
 def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
@@ -132,7 +133,14 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
         ("yolov8", signature((1, 84, 8400))),
         ("yolov8", signature((1, 5, 8400))),
         ("yolov8", signature((1, 84, 6300), canvas=(640, 480))),
+        ("yolov8", signature((1, 8400, 84))),
+        ("yolov8", signature((1, 8400, 6), classes=2)),
+        ("yolov5", signature((1, 85, 25200))),
         ("rtdetr", signature((1, 300, 84), classes=80)),
+        ("rtdetr", signature((1, 300, 6), classes=2, end2end="False")),
+        ("end2end", signature((1, 300, 6), classes=2, end2end="True", task="detect")),
+        ("end2end", signature((1, 300, 6), classes=2, end2end="False", args="{'batch': 1, 'nms': True}")),
+        ("end2end", signature((1, 300, 6), classes=80)),
         ("rtdetr", signature(("logits", (1, 300, 80)), ("pred_boxes", (1, 300, 4)))),
         ("detr", signature(("logits", (1, 100, 92)), ("pred_boxes", (1, 100, 4)), ("hidden", (1, 100, 256)))),
         ("detr", signature(("pred_logits", (1, 100, 6)), ("pred_boxes", (1, 100, 4)), classes=5)),
@@ -151,7 +159,9 @@ def test_unambiguous_signatures_are_recognised(expected, given):
 @pytest.mark.parametrize(
     ("fits", "given"),
     [
-        ("yolox and yolov5 fit", signature((1, 8400, 85))),  # YOLOv6 also has this shape, with decoded boxes
+        # YOLOv6 also has this shape, with decoded boxes.
+        ("yolox and yolox-decoded and yolov5 fit", signature((1, 8400, 85))),
+        ("end2end and rtdetr fit", signature((1, 300, 6), classes=2)),
         ("nanodet-plus and yolov5 fit", signature((1, 2125, 112), canvas=(320, 320))),
         ("picodet and nanodet fit", signature(*maps(1600, 400, 100, names=("a{}", "b{}")), canvas=(320, 320))),
         ("no head fits", signature((1, 300, 84))),
@@ -170,11 +180,55 @@ def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
 @pytest.mark.parametrize(
     "given",
     [
-        signature((1, 300, 6)),
-        signature((1, 300, 6), classes=80),
+        signature((1, 300, 7)),
         signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
     ],
 )
 def test_outputs_without_score_vectors_are_refused(given):
     with pytest.raises(InputError, match="export"):
         recognise(given)
+
+
+@pytest.mark.parametrize("task", ["segment", "pose", "obb", "classify"])
+def test_models_of_other_tasks_are_refused(task):
+    with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
+        recognise(signature((1, 116, 8400), classes=80, task=task))
+
+
+def test_places_of_a_pass_tell_heads_of_one_shape_apart():
+    """Boxes that the other head would put outside the canvas, or into one pixel of it."""
+    raw, pixels = noise(1, 84, 8), torch.cat([64 * noise(1, 84, 4).sigmoid(), noise(1, 84, 4).sigmoid()], -1)
+    both = signature(("output", (1, 84, 8)), canvas=(64, 64), classes=3)
+    assert recognise(both, lambda: {"output": raw}) == "yolox"
+    assert recognise(both, lambda: {"output": pixels}) == "yolox-decoded"
+    rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 1.0], [3.0, 2.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
+    two = signature((1, 3, 6), canvas=(64, 64), classes=2)
+    assert recognise(two, lambda: {"output0": rows}) == "end2end"
+    assert recognise(two, lambda: {"output0": noise(1, 3, 6).sigmoid()}) == "rtdetr"
+
+
+def test_end_to_end_rows_are_one_hot_vectors():
+    rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 2.0], [1.0, 1.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
+    found = heads.decode_end_to_end(rows, 3)
+    assert torch.equal(found.boxes, rows[..., :4])
+    assert torch.equal(found.classes, torch.tensor([[[0, 0, 0.9], [0.2, 0, 0], [0, 0, 0]]]))
+    with pytest.raises(InputError, match="classes: expected a name for each class of the rows, got 2, and class 2"):
+        heads.decode_end_to_end(rows, 2)
+    with pytest.raises(InputError, match="rows: expected a whole number"):
+        heads.decode_end_to_end(rows + 0.5, 9)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ([0.1, 0.2, 0.4, 0.9], "fractions"),
+        ([30.0, 40.0, 10.0, 50.0], "comes first"),
+        ([3000.0, 40.0, 3010.0, 50.0], "around .3005, 45., outside"),
+        ([30.0, math.nan, 40.0, 50.0], "finite"),
+        ([30.0, 40.0, 50.0, 60.0], None),
+        ([0.0, 0.0, 0.0, 0.0], None),
+    ],
+)
+def test_boxes_of_another_head_are_told_by_their_places(box, message):
+    found = heads.misplaced(torch.tensor([[box]]), (64, 64))
+    assert found is None if message is None else re.search(message, found)

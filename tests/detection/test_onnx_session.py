@@ -2,9 +2,14 @@ import copy
 import pickle
 
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper, numpy_helper
 
+from semfov.detection import onnx as onnx_detector
+from semfov.detection import onnx_session
+from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, InputError
@@ -116,3 +121,76 @@ def test_execution_providers_are_chosen_by_name(make_onnx):
     for missing in ([], ["CPUExecutionProvider", "NoSuchProvider"]):
         with pytest.raises(InputError, match=r"providers: expected some of .*CPUExecutionProvider, got (none|NoSuch)"):
             load_onnx(path, providers=missing)
+
+
+def open_ended(path, nodes, numbers, boxes):
+    """A model of the family `candidates` with given steps to its boxes and scores."""
+    stored = [numpy_helper.from_array(np.array(value), name) for name, value in numbers.items()]
+    image = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])
+    sizes = {"boxes": [1, boxes, 4], "scores": [1, boxes, 80]}
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, size) for name, size in sizes.items()]
+    model = helper.make_model(
+        helper.make_graph(nodes, "graph", [image], outputs, stored),
+        opset_imports=[helper.make_opsetid("", 17)],
+        ir_version=8,
+    )
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize(("count", "reason"), [(9, None), (11, "at most 10 boxes, got 11"), (9_000_000, "768 MiB")])
+def test_the_number_of_boxes_may_depend_on_values_up_to_a_limit(tmp_path, monkeypatch, count, reason):
+    monkeypatch.setattr(onnx_detector, "_MOST_BOXES", 10)
+    shapes = [
+        helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
+        helper.make_node("Cast", ["mean"], ["whole"], to=TensorProto.INT64),
+        helper.make_node("Add", ["whole", "count"], ["boxes count"]),
+    ]
+    for name in ("boxes", "scores"):
+        shapes.append(helper.make_node("Concat", ["one", "boxes count", f"{name} size"], [f"{name} shape"], axis=0))
+        shapes.append(helper.make_node("ConstantOfShape", [f"{name} shape"], [name]))
+    numbers = {"count": [count], "one": [1], "boxes size": [4], "scores size": [80]}
+    path = open_ended(tmp_path / "model.onnx", shapes, numbers, None)
+    if reason is None:
+        assert load_detector(path).propose(torch.zeros(2, 3, 64, 64)).boxes.shape == (2, 9, 4)
+    else:
+        with pytest.raises(DataError, match=rf"model.*{reason}"):
+            load_detector(path).propose(torch.zeros(2, 3, 64, 64))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_loop_that_does_not_end_is_stopped(tmp_path, monkeypatch, nested):
+    def value(name, kind=TensorProto.FLOAT, shape=(1, 9, 4)):
+        return helper.make_tensor_value_info(name, kind, [*shape])
+
+    again = [helper.make_node("Identity", ["go"], ["go on"]), helper.make_node("Identity", ["in"], ["out"])]
+    body_inputs = [value("step", TensorProto.INT64, ()), value("go", TensorProto.BOOL, ()), value("in")]
+    body = helper.make_graph(again, "body", body_inputs, [value("go on", TensorProto.BOOL, ()), value("out")])
+    loop = helper.make_node("Loop", ["", "yes", "start"], ["boxes"], body=body)
+    if nested:
+        inner = helper.make_node("Loop", ["", "yes", "start"], ["inside"], body=body)
+        branches = {
+            f"{name}_branch": helper.make_graph([inner], name, [], [value("inside")]) for name in ("then", "else")
+        }
+        loop = helper.make_node("If", ["yes"], ["boxes"], **branches)
+    numbers = {"yes": True, "start": np.ones((1, 9, 4), np.float32), "half": np.full((1, 9, 80), 0.5, np.float32)}
+    path = open_ended(tmp_path / "model.onnx", [loop, helper.make_node("Identity", ["half"], ["scores"])], numbers, 9)
+    monkeypatch.setattr(onnx_session, "_MOST_SECONDS", 0.1)
+    with pytest.raises(DataError, match=r"model\.onnx: fails on images .* not done after 0 s, as with a loop"):
+        load_detector(path)
+
+
+def test_the_reason_of_onnxruntime_is_not_cut_and_its_telemetry_is_off(tmp_path, make_onnx, monkeypatch):
+    import onnxruntime
+
+    off = []
+    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: off.append(True))
+    session = OnnxSession(make_onnx({"a": values(1, 5, 4)}))
+    assert off
+    with pytest.raises(DataError, match=r"index: 3 Got: 32 Expected: 64"):
+        session(images(1)[..., :32])
+    nodes = [helper.make_node("Identity", ["images"], ["boxes"]), helper.make_node("Unknown", ["images"], ["scores"])]
+    long = tmp_path / ("long" * 40) / "model.onnx"
+    long.parent.mkdir()
+    with pytest.raises(DataError, match="Unknown"):
+        OnnxSession(open_ended(long, nodes, {}, 9))
