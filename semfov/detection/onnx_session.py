@@ -169,14 +169,14 @@ class OnnxSession:
             timer.cancel()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (*self._settings(), self.further)
+        return _reopen, self._settings(self.further)
 
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
-        return _reopen(*self._settings(), further)
+        return _reopen(*self._settings(further))
 
-    def _settings(self) -> tuple[Any, ...]:
-        return self.path, self.threads, self.device, self.providers, self.spinning, self.open_ended
+    def _settings(self, further: Sequence[str]) -> tuple[Any, ...]:
+        return self.path, self.threads, self.device, self.providers, self.spinning, self.open_ended, further
 
 
 def _reopen(
