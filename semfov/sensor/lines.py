@@ -96,7 +96,12 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     if down.middle is None and across.middle is None:
         return down.first @ (image @ across.first.mT)
     planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
-    result = _write(_write(planes.mT, across).mT, down)
+    result = planes.new_empty(len(planes), down.length, across.length)
+    between = planes.new_empty(planes.shape[-2], across.length)
+    # One plane at a time, with one memory in between, which stays in the cache.
+    for plane, filtered in zip(planes, result, strict=True):
+        _fill(between.mT, plane.mT, across)
+        _fill(filtered, between, down)
     return result.reshape(*image.shape[:-2], *result.shape[-2:])
 
 
@@ -116,18 +121,16 @@ def _product(image: Tensor, lines: Lines) -> Tensor:
     return torch.cat([top, (lines.middle @ _windows(image, lines, lines.middle)).flatten(-3, -2), bottom], -2)
 
 
-def _write(planes: Tensor, lines: Lines) -> Tensor:
-    """Filter the columns of planes `(B, h, w)` and write each part into its place, which copies less."""
+def _fill(result: Tensor, plane: Tensor, lines: Lines) -> None:
+    """Filter the columns of a plane `(h, w)`, and write each part into its place."""
     if lines.middle is None or lines.last is None:
-        return lines.first @ planes
-    result = planes.new_empty(len(planes), lines.length, planes.shape[-1])
+        torch.mm(lines.first, plane, out=result)
+        return
     top, bottom = len(lines.first), lines.length - len(lines.last)
-    result[:, :top] = lines.first @ planes[:, : lines.first.shape[1]]
-    result[:, bottom:] = lines.last @ planes[:, planes.shape[1] - lines.last.shape[1] :]
-    inner = result[:, top:bottom].unflatten(1, (len(lines.middle), -1))
-    for windows, made in zip(_windows(planes, lines, lines.middle), inner, strict=True):
-        torch.bmm(lines.middle, windows, out=made)
-    return result
+    torch.mm(lines.first, plane[: lines.first.shape[1]], out=result[:top])
+    torch.mm(lines.last, plane[plane.shape[0] - lines.last.shape[1] :], out=result[bottom:])
+    inner = result[top:bottom].unflatten(0, (len(lines.middle), -1))
+    torch.bmm(lines.middle, _windows(plane, lines, lines.middle), out=inner)
 
 
 def _windows(image: Tensor, lines: Lines, middle: Tensor) -> Tensor:

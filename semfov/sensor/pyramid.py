@@ -19,7 +19,7 @@ Convention = Literal["kornia", "opencv"]
 _AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 # Input pixels that one tile covers: with fewer the products are slow, with more they multiply more zeros.
-_SHIFT = 8
+_SHIFT = 32
 
 
 @dataclass(frozen=True)
