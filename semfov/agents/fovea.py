@@ -349,15 +349,14 @@ class FoveaEpisode(Episode[Scanpath]):
 
     def record(self) -> Scanpath:
         """The scanpath so far."""
-        path, decision = self._trace.scanpath(), self.decision
+        decision = self.decision
         if self.target is None or self._last is None:
-            return replace(path, stimulus=self._stimulus, ending=self.ending)
+            return self._trace.scanpath(stimulus=self._stimulus, ending=self.ending)
         outcome = OUTCOMES[self._outcome] if decision is None else decision.outcome
         target = class_meant(self._last[0].belief, self.target)
         if self._verifier is not None and outcome == "found":
             target = self._verifier.best.target
-        return replace(
-            path,
+        return self._trace.scanpath(
             stimulus=self._stimulus,
             ending=self.ending,
             target=target,

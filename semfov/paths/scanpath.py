@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 from typing import Any
 
@@ -67,6 +68,24 @@ _FORMAT = Format(
 """Format of the files of scanpaths."""
 
 
+class _MadeWhenRead:
+    """A field that can be given as a function, which then makes it when it is read for the first time."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, record: Any, owner: type | None = None) -> Any:
+        if record is None:
+            raise AttributeError(self._name)  # no default
+        values = vars(record)
+        if callable(values[self._name]):
+            values[self._name] = values[self._name]()
+        return values[self._name]
+
+    def __set__(self, record: Any, value: Any) -> None:
+        vars(record)[self._name] = value
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scanpath(GazeRecord):
     """Fixations of one episode in order, with the detections and the belief at each of them.
@@ -99,7 +118,7 @@ class Scanpath(GazeRecord):
     grid: Grid
     cells: Tensor
     fixations: Tensor
-    probabilities: Tensor
+    probabilities: Tensor = _MadeWhenRead()  # type: ignore[assignment]
     values: Tensor
     posterior: Tensor | None = None
     presence: Tensor | None = None
@@ -108,6 +127,9 @@ class Scanpath(GazeRecord):
 
     how = "fovea"
     _format = _FORMAT
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "probabilities": self.probabilities}
 
     def __len__(self) -> int:
         """Number of fixations, the start included."""
@@ -309,6 +331,7 @@ class Trace:
         self.steps: list[Step] = []
         self._maps: list[Tensor] = []
         self._belief: Belief | None = None
+        self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def add(self, step: Step) -> None:
         """Keep a step.
@@ -316,36 +339,46 @@ class Trace:
         Args:
             step: the next step of the episode.
         """
-        belief = step.belief
-        if self.beside is not None:
-            before = self.beside.start(1, self.grid, step.values) if self._belief is None else self._belief
-            belief = self.beside(before, step.detections, step.fixation, self.grid)
-        self._belief = belief
-        self._maps.append(belief.class_probabilities()[0])
         self.steps.append(step)
 
-    def scanpath(self) -> Scanpath:
-        """Make the scanpath of the steps so far.
+    def scanpath(self, **outcome: Any) -> Scanpath:
+        """Make the scanpath of the steps so far. Its map of all classes is made when it is read.
+
+        Args:
+            outcome: other attributes of the scanpath, such as its decision.
 
         Returns:
-            The scanpath, without a decision.
+            The scanpath.
         """
         steps, target = self.steps, self.target
-        return Scanpath(
-            grid=self.grid,
-            classes=self.classes,
-            target=target,
-            least=self.least,
-            cells=torch.cat([step.cell for step in steps]),
-            fixations=torch.cat([step.fixation for step in steps]),
-            detections=tuple(step.detections for step in steps),
-            probabilities=torch.stack(self._maps),
-            values=torch.stack([step.values[0] for step in steps]),
-            found=False,
-            posterior=None if target is None else torch.stack([step.belief.probability(target)[0] for step in steps]),
-            presence=None if target is None else torch.stack([step.belief.presence(target)[0] for step in steps]),
-            seconds=tuple(step.seconds for step in steps),
-        )
+        fields = {
+            "grid": self.grid,
+            "classes": self.classes,
+            "target": target,
+            "least": self.least,
+            "cells": torch.cat([step.cell for step in steps]),
+            "fixations": torch.cat([step.fixation for step in steps]),
+            "detections": tuple(step.detections for step in steps),
+            "probabilities": partial(self._probabilities, len(steps)),
+            "values": torch.stack([step.values[0] for step in steps]),
+            "found": False,
+            "seconds": tuple(step.seconds for step in steps),
+        }
+        if target is not None:
+            fields["posterior"] = torch.stack([step.belief.probability(target)[0] for step in steps])
+            fields["presence"] = torch.stack([step.belief.presence(target)[0] for step in steps])
+        return Scanpath(**{**fields, **outcome})
+
+    def _probabilities(self, looks: int) -> Tensor:
+        """The map of all classes after each of the first looks, `(looks, X·Y, K+1)`."""
+        gradients, inference = self._modes
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            for step in self.steps[len(self._maps) : looks]:
+                if self.beside is not None:
+                    before = self._belief or self.beside.start(1, self.grid, step.values)
+                    self._belief = self.beside(before, step.detections, step.fixation, self.grid)
+                self._maps.append((self._belief or step.belief).class_probabilities()[0])
+            return torch.stack(self._maps[:looks])
 
 
 def trace(
