@@ -31,6 +31,7 @@ MODULES = (
     "semfov.data",
     "semfov.data.fixations",
     "semfov.metrics.scanpath",
+    "semfov.metrics.merging",
     "semfov.errors",
 )
 

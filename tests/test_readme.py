@@ -13,18 +13,14 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 import semfov
 from semfov.cli.main import main as semfov_command
-from semfov.data.fixations import Fixations
-from semfov.data.mosaics import Mosaics
 from semfov.detection.weights import fetch
 from tests.colours import SMALL, write_network, write_photographs
+from tests.reader import fill
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -96,25 +92,18 @@ def weights(tmp_path_factory):
     return cache
 
 
-def save(image, path, size=None):
-    picture = Image.fromarray((image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy())
-    (picture if size is None else picture.resize(size)).save(path)
+@pytest.fixture
+def given(tmp_path, monkeypatch, weights):
+    """What code of a reader takes as given; the present folder is the reader's."""
+    given = fill(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SEMFOV_CACHE", str(weights))
+    return given
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch, weights):
-    """A reader's folder: a photograph, a large picture, a panorama and a video."""
-    scenes = semfov.EmbeddedScenes(["cup"], count=16)
-    save(scenes[0].image, tmp_path / "kitchen.jpg")
-    save(Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image, tmp_path / "harbour.jpg")
-    save(scenes[1].image, tmp_path / "street.jpg", (1024, 512))
-    frame = cv2.imread(str(tmp_path / "kitchen.jpg"))
-    writer = cv2.VideoWriter(str(tmp_path / "VIDEO.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, frame.shape[1::-1])
-    for _ in range(2):
-        writer.write(frame)
-    writer.release()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SEMFOV_CACHE", str(weights))
+def folder(given, tmp_path):
+    """A reader's folder."""
     return tmp_path
 
 
@@ -171,18 +160,18 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
     assert written_files(run([*fit, *tiny]))
     assert "red" in run(find)
     assert "red" in run(search)
+    task = (ROOT / "docs/tasks/own-detector.md").read_text(encoding="utf-8")
+    assert all(line in task for line in OWN)
+    (block,) = re.findall(r"```python\n(.*?)```", task, re.S)
+    exec(compile(block, "own-detector.md", "exec"), {})
     assert written_files(run([*study, "--data.min_instances", "0", "--data.limit", "1"]))
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_code_runs_as_printed(folder):
-    """The blocks in their order, with frames of the video and with fixations of a person."""
-    video, frames = cv2.VideoCapture("VIDEO.avi"), []
-    while (read := video.read())[0]:
-        frames.append(read[1])
-    people = [Fixations("kitchen.jpg", "someone", np.array([[100.0, 80], [320, 200]]), (640, 480), target="cup")]
-    names = {"frames": frames, "people": people}
+def test_code_runs_as_printed(given):
+    """The blocks in their order, with frames of the video and with fixations of people."""
+    names = dict(given)
     blocks = re.findall(r"```python\n(.*?)```", README, re.S)
     assert len(blocks) >= 5
     for block in blocks:

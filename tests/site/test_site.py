@@ -176,6 +176,22 @@ def test_a_browser_draws_formulas_and_requests_nothing_else(site, opened):
     assert [address for address in asked if not address.startswith(("file:", "data:", "blob:"))] == []
 
 
+ASKED = {
+    "csv": "tasks/count",
+    "opencv": "tasks/camera",
+    "device": "tasks/running",
+    "drone": "tasks/count",
+    "visual angle": "tasks/eye-tracker",
+    "jupyter": "tasks/running",
+}
+"""Words that a reader may ask for, and a page that is among the first three answers."""
+ANSWERS = """() => {
+  let focus = document.activeElement;
+  while (focus.shadowRoot) focus = focus.shadowRoot.activeElement;
+  return [...focus.getRootNode().querySelectorAll("a[href*='?h=']")].slice(0, 3).map(link => link.href);
+}"""
+
+
 def test_the_search_works_and_requests_nothing_from_elsewhere(address, opened):
     page, asked = opened
     page.goto(f"{address}/index.html")
@@ -187,4 +203,11 @@ def test_the_search_works_and_requests_nothing_from_elsewhere(address, opened):
             break
     box.press_sequentially("Kaplan")
     page.get_by_text(re.compile(r"^\d+ results$")).first.wait_for()
+    for words, wanted in ASKED.items():
+        box.fill(words)
+        for _ in range(20):
+            page.wait_for_timeout(100)
+            if f"?h={words.replace(' ', '+')}" in (answers := " ".join(page.evaluate(ANSWERS))):
+                break
+        assert wanted in answers, words
     assert [other for other in asked if not other.startswith((address, "data:", "blob:"))] == []

@@ -1,0 +1,92 @@
+"""Measures as metrics of torchmetrics, which merge over batches and processes (`pip install "semfov[metrics]"`)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.errors import InputError
+from semfov.metrics.calibration import BinarySums
+from semfov.metrics.labels import as_numbers, as_outcomes
+from semfov.metrics.presence import area_under_roc
+
+try:
+    from torchmetrics import Metric
+except ImportError:
+    raise InputError("these metrics need torchmetrics: pip install semfov[metrics]") from None
+
+
+class AreaUnderRoc(Metric):
+    """Area under the receiver operating characteristic of all cases so far (`semfov.metrics.presence.area_under_roc`).
+
+    It keeps the scores, as the area needs all of them.
+
+    Shapes of an update: score `(M,)`, present `(M,)`, booleans or 0 and 1.
+
+    >>> area = AreaUnderRoc()
+    >>> area.update(torch.tensor([0.9, 0.4]), torch.tensor([True, True]))
+    >>> area.update(torch.tensor([0.4, 0.1]), torch.tensor([False, False]))
+    >>> area.compute()
+    tensor(0.8750)
+    """
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+    score: list[Tensor]
+    present: list[Tensor]
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.add_state("score", default=[], dist_reduce_fx="cat")
+        self.add_state("present", default=[], dist_reduce_fx="cat")
+
+    def update(self, score: Tensor, present: Tensor) -> None:
+        """Add cases."""
+        self.score.append(as_numbers(score, "score").detach())
+        self.present.append(as_outcomes(present, "present"))
+
+    def compute(self) -> Tensor:
+        """The area over all cases; both kinds are needed."""
+        return torch.tensor(area_under_roc(*(_joined(part) for part in (self.score, self.present))))
+
+
+class Reliability(Metric):
+    """Negative log likelihood, Brier score and calibration error of all predictions so far (`BinarySums`).
+
+    It keeps sums, so that its size does not grow.
+
+    Shapes of an update: probability `(M,)`, outcome `(M,)`, booleans or 0 and 1.
+
+    >>> reliability = Reliability()
+    >>> reliability.update(torch.tensor([0.9, 0.2]), torch.tensor([True, False]))
+    >>> {name: round(float(value), 3) for name, value in reliability.compute().items()}
+    {'count': 2.0, 'nll': 0.164, 'brier': 0.025, 'ece': 0.15}
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+    bins: Tensor
+    sums: Tensor
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.add_state("bins", default=BinarySums.nothing().bins, dist_reduce_fx="sum")
+        self.add_state("sums", default=torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, probability: Tensor, outcome: Tensor) -> None:
+        """Add predictions."""
+        added = BinarySums.of(probability, outcome)
+        self.bins += added.bins.to(self.bins.device)
+        self.sums += torch.tensor([added.surprisal, added.square], dtype=torch.float64, device=self.sums.device)
+
+    def compute(self) -> dict[str, Tensor]:
+        """Number of predictions, mean negative log likelihood in nats, Brier score and expected calibration error."""
+        sums = BinarySums(self.bins.cpu(), *self.sums.tolist())
+        return {name: torch.tensor(float(getattr(sums, name))) for name in ("count", "nll", "brier", "ece")}
+
+
+def _joined(parts: list[Tensor] | Tensor) -> Tensor:
+    """The cases of all updates; after a synchronisation they are one tensor already."""
+    return parts if isinstance(parts, Tensor) else torch.cat(parts)

@@ -1,0 +1,48 @@
+"""A reader's folder: the files that README and the pages by task name, and what cameras and people would give."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+
+import semfov
+from semfov.data.fixations import Fixations, write_table
+from semfov.data.mosaics import Mosaics
+from semfov.head import Panoramas
+
+
+def _save(image, path, size=None):
+    picture = Image.fromarray((image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy())
+    (picture if size is None else picture.resize(size)).save(path)
+
+
+def fill(folder: Path) -> dict[str, object]:
+    """Write photographs, large pictures, a video and fixations, and return what code takes as given."""
+    scenes = semfov.EmbeddedScenes(["cup"], count=16)
+    _save(scenes[0].image, folder / "kitchen.jpg")
+    _save(scenes[2].image, folder / "poster.jpg")
+    _save(Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image, folder / "harbour.jpg")
+    (folder / "drone.jpg").symlink_to("harbour.jpg")
+    _save(Panoramas(scenes, width=1024, count=1)[0].image, folder / "street.jpg")
+    for name in ("FLIGHT/1.jpg", "FLIGHT/2.jpg", "drafts/a.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        _save(scenes[3].image, folder / name, (960, 640))
+    frame = cv2.imread(str(folder / "kitchen.jpg"))
+    writer = cv2.VideoWriter(str(folder / "VIDEO.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, frame.shape[1::-1])
+    for _ in range(2):
+        writer.write(frame)
+    writer.release()
+    people = [
+        Fixations(
+            "kitchen.jpg", person, np.array([[100.0, 80], [320, 200], [90 + each, 300]]), (640, 480), target="cup"
+        )
+        for each, person in enumerate(("someone", "another"))
+    ]
+    write_table(folder / "fixations.csv", people)
+    at: list[float] = []
+    motors = SimpleNamespace(move=lambda *direction: at.__setitem__(slice(None), direction), position=lambda: tuple(at))
+    video = SimpleNamespace(read=lambda: (True, frame))
+    return {"frames": [frame, frame], "people": people, "motors": motors, "video": video}

@@ -1,0 +1,56 @@
+"""The pages by task run as printed, except that the default detector, whose weights the tests have, stands for others.
+
+Commands of a checkout are not run: their programs exist and take the options.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+from semfov.cli.main import main
+from tests.reader import fill
+
+TASKS = Path(__file__).parents[1] / "docs" / "tasks"
+PAGES = sorted(TASKS.glob("*.md"))
+RUN = [page for page in PAGES if "mymodels" not in page.read_text(encoding="utf-8")]  # a fit: tests/test_readme.py
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reader")
+    return folder, fill(folder)
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
+def test_a_page_runs_as_printed(page, filled, monkeypatch, capsys, one_thread):
+    folder, given = filled
+    monkeypatch.chdir(folder)
+    names = dict(given)
+    text = re.sub("yolox-nano|nanodet-plus-m-1.5x", "yolov3-tiny", page.read_text(encoding="utf-8"))
+    for language, block in re.findall(r"```(python|sh)\n(.*?)```", text, re.DOTALL):
+        if language == "python":
+            exec(compile(block, page.name, "exec"), names)
+            plt.close("all")
+        else:
+            for line in block.splitlines():
+                assert main(shlex.split(line)[1:]) == 0, capsys.readouterr().err
+
+
+def test_every_page_is_in_the_index_and_on_the_site():
+    index, site = (TASKS / "index.md").read_text(encoding="utf-8"), (TASKS.parents[1] / "mkdocs.yml").read_text()
+    for page in PAGES:
+        assert page.stem == "index" or f"({page.name})" in index
+        assert f"tasks/{page.name}" in site
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_fits_on_a_screen_and_needs_no_checkout(page):
+    text = page.read_text(encoding="utf-8")
+    for block in re.findall(r"```\w*\n(.*?)```", text, re.DOTALL):
+        assert len(block.splitlines()) <= 30
+    assert "needs a checkout" in text or not re.search(r"python -m (eval|train|benchmarks)|pip install -e", text)
