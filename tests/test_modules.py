@@ -70,7 +70,7 @@ def find_testers() -> dict[str, type[BaseTester]]:
 
 
 def test_every_public_module_has_a_tester():
-    """The modules are those of the API reference. A policy without a name is a base of others; metrics have no output."""
+    """Those of the API reference. A policy without a name is a base of others; metrics have no output."""
     modules = {
         name
         for things in entries().values()
