@@ -375,6 +375,9 @@ class FoveaEpisode(Episode[Scanpath]):
             probability = 1 - belief.class_probabilities()[0, :, 0]
         else:
             probability = belief.probability(self.target)[0]
+        # Reduced by a whole number: resampling a large frame takes as long as a look.
+        side = -(-max(self._image.shape[-2:]) // _LONGEST)
+        small = self._image if side == 1 else F.avg_pool2d(self._image, side, ceil_mode=True, count_include_pad=False)
         return FoveaMoment(
             classes=self.classes,
             target=self.target,
@@ -390,7 +393,7 @@ class FoveaEpisode(Episode[Scanpath]):
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=None if closer is None else replace(closer, fixation=0),
-            photograph=_copy(self._image),
+            photograph=in_bytes(small[0]),
         )
 
     @property
@@ -398,13 +401,6 @@ class FoveaEpisode(Episode[Scanpath]):
         """Cell of the place that the next look is spent on; None for a look of the fovea."""
         place = None if self._verifier is None else self._verifier.candidate
         return None if place is None else place.cell
-
-
-def _copy(frame: Tensor) -> Tensor:
-    """A frame `(1, 3, H, W)` as bytes, reduced by a whole number: resampling a large frame takes as long as a look."""
-    side = -(-max(frame.shape[-2:]) // _LONGEST)
-    small = frame if side == 1 else F.avg_pool2d(frame, side, ceil_mode=True, count_include_pad=False)
-    return in_bytes(small[0])
 
 
 def _shifts(shifts: int | None, usual: int, limits: EpisodeLimits) -> int:

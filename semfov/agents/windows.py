@@ -359,7 +359,15 @@ class WindowEpisode(Episode[ZoomPath]):
         """Look at the next window, at a given one, or closely at a place that seems to hold the target."""
         with torch.inference_mode():
             if frame is not None:
-                self._show(frame)
+                assert self.eye is not None
+                view = self.eye.open(open_large(frame, color=self.color))
+                self._check_size(view.picture.size)
+                if self._glances is None:
+                    self.open(LiveGlances(self.eye, view))
+                assert isinstance(self._glances, LiveGlances)
+                self._glances.show(view, self.passes)
+                if self._decisions is not None:
+                    self._decisions.wait()
             assert self._glances is not None
             if window is not None:
                 self._window = window
@@ -370,7 +378,10 @@ class WindowEpisode(Episode[ZoomPath]):
             elif not self._turn():
                 return None
             if self.forgetting is None:
-                self._judge()
+                if self._decisions is not None and self._decisions.outcome and self._decisions.candidate is None:
+                    self.ending = "decision"
+                elif self.searches and self.evidence is None and self.decision is not None:
+                    self.ending = "detection" if self.decision.outcome == "found" else None
             seen, lattice = self._looks[-1], self._glances.lattice
             return RecordedLook(
                 self.passes - 1,
@@ -380,18 +391,6 @@ class WindowEpisode(Episode[ZoomPath]):
                 seen.seconds,
                 seen.value if isfinite(seen.value) else None,
             )
-
-    def _show(self, frame: ImageLike | LargePicture) -> None:
-        """Take the next frame of a stream."""
-        assert self.eye is not None
-        view = self.eye.open(open_large(frame, color=self.color))
-        self._check_size(view.picture.size)
-        if self._glances is None:
-            self.open(LiveGlances(self.eye, view))
-        assert isinstance(self._glances, LiveGlances)
-        self._glances.show(view, self.passes)
-        if self._decisions is not None:
-            self._decisions.wait()
 
     def _turn(self) -> bool:
         """Make the next look of the search or the exploration; returns whether one was left."""
@@ -418,13 +417,6 @@ class WindowEpisode(Episode[ZoomPath]):
         self._looks.append(_Look(self.passes, glance, 0.0, perf_counter() - self._began, closely=True))
         self.passes += 1
         return candidates(glance)
-
-    def _judge(self) -> None:
-        """End the search where the look decides it."""
-        if self._decisions is not None and self._decisions.outcome and self._decisions.candidate is None:
-            self.ending = "decision"
-        elif self.searches and self.evidence is None and self.decision is not None:
-            self.ending = "detection" if self.decision.outcome == "found" else None
 
     def _end(self, limit: Ending | None) -> None:
         decided: Ending = "decision"
@@ -471,7 +463,13 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def record(self) -> ZoomPath:
         """The record of the looks so far."""
-        return ZoomPath(**self._recorded(), photograph=self._photograph, source=self._source, ending=self.ending)
+        path = self._glances.view.picture.path if isinstance(self._glances, LiveGlances) else None
+        return ZoomPath(
+            **self._recorded(),
+            photograph=self._photograph,
+            source=None if path is None else str(path),
+            ending=self.ending,
+        )
 
     def moment(self) -> WindowMoment:
         """What is known at the present frame."""
@@ -525,11 +523,6 @@ class WindowEpisode(Episode[ZoomPath]):
         return probable_objects(
             glances, lattice, target, self.certainty, remaining=remaining, promised=sum(further), latest=latest
         )
-
-    @property
-    def _source(self) -> str | None:
-        path = self._glances.view.picture.path if isinstance(self._glances, LiveGlances) else None
-        return None if path is None else str(path)
 
     @cached_property
     def _photograph(self) -> Tensor | None:

@@ -10,7 +10,7 @@ from semfov.cli.options import AgentOptions
 from semfov.data.classes import class_index
 from semfov.detection.load import check_detector, detector_name
 from semfov.detection.weights import WEIGHTS
-from semfov.errors import InputError, check
+from semfov.errors import check
 from semfov.io.manifest import Manifest
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import SENSORS
@@ -64,11 +64,3 @@ def one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
     if text is None or classes is None:
         return text
     return classes[class_index(text, classes, "target") - 1]
-
-
-def check_target(target: str | None, options: AgentOptions) -> str:
-    """Raise `InputError` without a target; the message tells how to list the classes."""
-    if not target:
-        name = options.detector if options.models is None else options.models
-        raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
-    return target

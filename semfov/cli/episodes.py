@@ -78,16 +78,6 @@ class PictureJob(ABC):
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Look at a picture, with the arguments that all subcommands share, and return the record."""
 
-    def check_drawings(self) -> None:
-        """Raise `InputError` for a named figure that the looks at one of the pictures do not have."""
-        wanted = self.options.draw or ()
-        for source in self.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
-            kind = self.agent.kind_of_look(source.opened("auto"), self.options.how, every=self.every)
-            have = self.drawings if kind == "fovea" else OF_ANY_LOOK
-            missing = ", ".join(name for name in wanted if name not in have)
-            expected = f"{' or '.join(have)} for {source.name}, which is looked at by {kind!r}"
-            check(not missing, "draw", expected, missing)
-
     def outcome(self, number: int) -> PictureOutcome | SemfovError:
         """Look at the picture of this number, and make its text, row and figures; an error is returned, not raised."""
         source, began = self.sources[number], time.perf_counter()
@@ -205,7 +195,13 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
     A picture that cannot be read is reported and left out, unless it is the only one. With a file of results, a command
     that was stopped continues.
     """
-    job.check_drawings()
+    wanted = job.options.draw or ()
+    for source in job.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
+        kind = job.agent.kind_of_look(source.opened("auto"), job.options.how, every=job.every)
+        have = job.drawings if kind == "fovea" else OF_ANY_LOOK
+        missing = ", ".join(name for name in wanted if name not in have)
+        expected = f"{' or '.join(have)} for {source.name}, which is looked at by {kind!r}"
+        check(not missing, "draw", expected, missing)
     sources, several = job.sources, job.several
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")

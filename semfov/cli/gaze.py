@@ -11,7 +11,7 @@ from tqdm import tqdm
 from semfov.cli.options import GazeOptions
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
-from semfov.data.fixations import Fixations, write_table
+from semfov.data.fixations import write_table
 from semfov.data.inputs import as_image
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
@@ -57,26 +57,22 @@ def predict_gaze(options: GazeOptions) -> int:
             continue
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
         drawn.append(DrawnGaze(prediction, tuple(paths)))
-        tqdm.write(_text(source.name, prediction, paths), file=sys.stdout)
+        places = "; ".join(
+            f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
+            for number, peak in enumerate(prediction.peaks(), 1)
+        )
+        terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
+        mean = sum(map(len, paths)) / len(paths)
+        tqdm.write(
+            f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
+            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
+            file=sys.stdout,
+        )
     if drawn:
         written = _write(options, kind, drawn)
         if written:
             print("written:", *(f"  {path}" for path in written), sep="\n")
     return 1 if skipped else 0
-
-
-def _text(name: str, prediction: GazePrediction, paths: list[Fixations]) -> str:
-    """The prediction in lines: where fixations are expected, and what each term adds."""
-    places = "; ".join(
-        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
-        for number, peak in enumerate(prediction.peaks(), 1)
-    )
-    terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
-    mean = sum(map(len, paths)) / len(paths)
-    return (
-        f"{name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
-        f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
-    )
 
 
 def _write(options: GazeOptions, kind: str | None, drawn: list[DrawnGaze]) -> list[Path]:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import Any, TextIO, get_args
 
 from semfov.agents.picture import PictureLike
-from semfov.cli.agent import check_target, detector_classes, make_agent, several_classes
+from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
 from semfov.cli.results import STDOUT, kind_of
@@ -27,7 +27,9 @@ class _SearchJob(PictureJob):
     drawings = get_args(Drawing)
 
     def __init__(self, options: SearchOptions) -> None:
-        check_target(options.target, options)
+        if not options.target:
+            name = options.detector if options.models is None else options.models
+            raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
         super().__init__(options)
         self.start = _check(options)
         classes = detector_classes(options)

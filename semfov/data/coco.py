@@ -220,7 +220,13 @@ class CocoScenes:
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
-            _log.warning("%s: %s", annotations, _summary(self.repairs))
+            first = ", ".join(f"{what}: {n}" for what, n in self.repairs.most_common(8))
+            rest = [n for _, n in self.repairs.most_common()[8:]]
+            _log.warning(
+                "%s: %s",
+                annotations,
+                first + (f", and {sum(rest)} boxes cut or dropped for {len(rest)} more reasons" if rest else ""),
+            )
 
         self._packed = packed
         self._rows: list[int] = []
@@ -297,13 +303,6 @@ class CocoScenes:
         except OSError as error:
             raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
         return json_sha256([content, self._packed.sizes[self._rows[index]]])
-
-
-def _summary(repairs: Counter[str], most: int = 8) -> str:
-    """Repairs in words; the `most` most frequent ones are listed one by one."""
-    first = ", ".join(f"{what}: {n}" for what, n in repairs.most_common(most))
-    rest = [n for _, n in repairs.most_common()[most:]]
-    return first + (f", and {sum(rest)} boxes cut or dropped for {len(rest)} more reasons" if rest else "")
 
 
 def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:

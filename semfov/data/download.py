@@ -101,7 +101,13 @@ def _fetch_archive(archive: _Archive, folder: Path, *, address: str = _ADDRESS, 
     if file.exists():
         return file
     folder.mkdir(parents=True, exist_ok=True)
-    _check_space(folder, archive, part)
+    needed = 2 * archive.size - _size(part)  # for the archive and for the files in it
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise DataError(
+            f"{folder}: expected {needed / 1e9:.1f} GB of free space for {archive.name} and its files, "
+            f"got {free / 1e9:.1f} GB; free some space or choose another --root"
+        )
     failures = 0
     while (before := _size(part)) < archive.size:
         try:
@@ -134,8 +140,14 @@ def unpack_members(file: Path, root: Path, members: str) -> None:
             if not entries:
                 raise DataError(f"{file}: expected members {members}*, got none; delete the file and run again")
             for member in tqdm(entries, desc=f"unpacking {file.name}", unit="file", disable=None):
-                target = _inside(root, member, file)
-                if _is_unpacked(target, member):
+                path = PurePosixPath(member.filename)
+                if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
+                    raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
+                if stat.S_ISLNK(member.external_attr >> 16):
+                    raise DataError(f"{file}: holds the link {member.filename!r}; delete it")
+                target = root.joinpath(*path.parts)
+                right_size = target.is_file() and target.stat().st_size == member.file_size
+                if right_size and zlib.crc32(target.read_bytes()) == member.CRC:
                     continue
                 target.parent.mkdir(parents=True, exist_ok=True)
                 part = target.with_name(f"{target.name}.part")
@@ -228,31 +240,6 @@ def _verify(file: Path, archive: _Archive, remedy: str) -> None:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     if digest != archive.sha256:
         raise DataError(f"{file}: expected sha256 {archive.sha256}, got {digest}; {remedy}")
-
-
-def _is_unpacked(target: Path, member: zipfile.ZipInfo) -> bool:
-    right_size = target.is_file() and target.stat().st_size == member.file_size
-    return right_size and zlib.crc32(target.read_bytes()) == member.CRC
-
-
-def _inside(root: Path, member: zipfile.ZipInfo, file: Path) -> Path:
-    """The path to unpack a member to; links and names that lead out of `root` are refused."""
-    path = PurePosixPath(member.filename)
-    if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
-        raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
-    if stat.S_ISLNK(member.external_attr >> 16):
-        raise DataError(f"{file}: holds the link {member.filename!r}; delete it")
-    return root.joinpath(*path.parts)
-
-
-def _check_space(folder: Path, archive: _Archive, part: Path) -> None:
-    needed = 2 * archive.size - _size(part)  # for the archive and for the files in it
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise DataError(
-            f"{folder}: expected {needed / 1e9:.1f} GB of free space for {archive.name} and its files, "
-            f"got {free / 1e9:.1f} GB; free some space or choose another --root"
-        )
 
 
 def _size(file: Path) -> int:

@@ -106,7 +106,13 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
     if isinstance(image, Tensor):
         return image
     if isinstance(image, np.ndarray):
-        return _from_numpy(image, argument)
+        kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}
+        name = f"{image.dtype.kind}{image.dtype.itemsize}"
+        check(
+            name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {image.dtype}{_integers(image)}"
+        )
+        native = np.float64 if name == "f16" else np.dtype(name)
+        return torch.from_numpy(np.array(image, dtype=native, order="C"))
     if isinstance(image, str | PathLike):
         check_local(image, argument)
         return read_image(image)
@@ -178,15 +184,6 @@ def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
     """
     base = values if like is None else like
     return values.to(base.device, torch.promote_types(base.dtype, torch.float32))
-
-
-def _from_numpy(array: NDArray[Any], argument: str) -> Tensor:
-    """An array as a tensor; the array may have any order in memory."""
-    kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}
-    name = f"{array.dtype.kind}{array.dtype.itemsize}"
-    check(name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {array.dtype}{_integers(array)}")
-    native = np.float64 if name == "f16" else np.dtype(name)
-    return torch.from_numpy(np.array(array, dtype=native, order="C"))
 
 
 def _integers(array: NDArray[Any]) -> str:

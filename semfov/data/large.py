@@ -181,9 +181,6 @@ class _PhotographPicture(LargePicture):
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window."""
         x1, y1, x2, y2 = box
-        return self._whole()[y1:y2, x1:x2]
-
-    def _whole(self) -> NDArray[np.uint8]:
         if self._array is None:
             with _opening(self.path, "decoded"), open_pillow(self.path) as image:
                 if image.mode in _PLAIN:
@@ -192,7 +189,7 @@ class _PhotographPicture(LargePicture):
                     self._array = _rgb(turned(image, stored, orientation(image), upright=True))
                 else:
                     self._array = to_bytes(read_image(self.path))
-        return self._array
+        return self._array[y1:y2, x1:x2]
 
 
 def _rgb(image: "Image") -> NDArray[np.uint8]:
@@ -270,7 +267,12 @@ class _TiffPicture(LargePicture):
             self._file.filehandle.seek(offset)
             check_tile(size, count, f"image {self.path}")
             data = self._file.filehandle.read(count)
-            _check_inflated(data, page.compression, size, self.path)
+            make = _INFLATERS.get(int(page.compression))
+            most = 2 * size + 2**16
+            if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
+                raise DataError(
+                    f"image {self.path}: expected tiles of {size:,} bytes, got one that inflates to more; replace it"
+                )
             tile = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
             top, left = number // across * high, number % across * wide
             tile = tile[: self.size[1] - top, : self.size[0] - left]
@@ -434,14 +436,6 @@ def _is_converted(path: str | PathLike[str]) -> bool:
     kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
     unusual = kind > _PALETTE and (kind, packed) != (_YCBCR, _JPEG)
     return unusual or tags.get(_ORIENTATION, 1) != 1 or tags.get(_SAMPLES, 1) == 2
-
-
-def _check_inflated(data: bytes, compression: int, size: int, path: Path) -> None:
-    """Raise `DataError` for a tile that inflates to far more bytes than its pixels take."""
-    make = _INFLATERS.get(int(compression))
-    most = 2 * size + 2**16
-    if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
-        raise DataError(f"image {path}: expected tiles of {size:,} bytes, got one that inflates to more; replace it")
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:

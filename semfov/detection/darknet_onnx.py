@@ -105,7 +105,10 @@ class _NetworkGraph(Graph):
             return self.add("Resize", sources[0], "", scales, mode="nearest", nearest_mode="floor",
                             coordinate_transformation_mode="asymmetric")  # fmt: skip
         if isinstance(layer, Route):
-            chunks = [self._part(source, layer) for source in sources]
+            chunks = [
+                source if layer.groups == 1 else self.add("Split", source, outputs=layer.groups, axis=1)[layer.group]
+                for source in sources
+            ]
             return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
         if isinstance(layer, Shortcut):
             return self.activation(layer.activation, self.add("Add", *sources))
@@ -122,9 +125,6 @@ class _NetworkGraph(Graph):
             pads=[vertical, horizontal, vertical, horizontal],
             group=layer.groups,
         )
-
-    def _part(self, source: str, layer: Route) -> str:
-        return source if layer.groups == 1 else self.add("Split", source, outputs=layer.groups, axis=1)[layer.group]
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
         """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""

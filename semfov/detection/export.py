@@ -28,19 +28,21 @@ def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool =
     if not isinstance(detector, YoloV3):
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
     model = network_model(detector.network, detector.name, detector.input_size if static else None)
-    model.metadata_props.add(key=METADATA_KEY, value=json.dumps(_settings(detector, static)))
+    model.metadata_props.add(
+        key=METADATA_KEY,
+        value=json.dumps(
+            {
+                "name": detector.name,
+                "head": "candidates",
+                "classes": list(detector.classes),
+                "input_size": list(detector.input_size),
+                "background": detector.background,
+                "preprocessing": {"fill": detector.fill},
+            }
+            | ({} if static else {"stride": detector.stride})
+        ),
+    )
     write_bytes(path, model.SerializeToString())
-
-
-def _settings(detector: YoloV3, static: bool) -> dict[str, object]:
-    return {
-        "name": detector.name,
-        "head": "candidates",
-        "classes": list(detector.classes),
-        "input_size": list(detector.input_size),
-        "background": detector.background,
-        "preprocessing": {"fill": detector.fill},
-    } | ({} if static else {"stride": detector.stride})
 
 
 def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:

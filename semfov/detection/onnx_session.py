@@ -86,22 +86,18 @@ class OnnxSession:
         except Exception as error:  # onnxruntime's own exceptions share no base class
             raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
         try:
-            self._describe()
+            meta = self._session.get_modelmeta()
+            self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
+            self.producer: str = meta.producer_name
+            for output in self._session.get_outputs():
+                if output.type not in _FLOATS:
+                    what = f"{self.path.name}: output {output.name!r}"
+                    raise InputError(f"{what}: expected floating-point numbers, got {output.type}")
+            self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
+            self.image, self.shape, self._dtype, self._extra = self._inputs()
         except UnicodeDecodeError as error:
             raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are not text ({error})") from None
         check((self.shape[0] or 1) <= MOST_BATCH, "batch", f"at most {MOST_BATCH} images at once", self.shape[0])
-
-    def _describe(self) -> None:
-        """Read the model's description of itself."""
-        meta = self._session.get_modelmeta()
-        self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
-        self.producer: str = meta.producer_name
-        for output in self._session.get_outputs():
-            if output.type not in _FLOATS:
-                what = f"{self.path.name}: output {output.name!r}"
-                raise InputError(f"{what}: expected floating-point numbers, got {output.type}")
-        self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
-        self.image, self.shape, self._dtype, self._extra = self._inputs()
 
     def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
         """Name, shape and dtype of the image input, and the names of the other inputs."""

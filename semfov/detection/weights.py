@@ -101,20 +101,16 @@ class _SourceDistribution:
         with (folder / "log.txt").open("w+", encoding="utf-8", errors="replace") as log:
             process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
             try:
-                self._watch(process, folder)
+                with tqdm(total=self.size, unit="B", unit_scale=True, desc=f"pip: {self.project}", disable=None) as bar:
+                    while process.poll() is None:
+                        time.sleep(0.1)
+                        bar.update(min(self.size, _largest(folder)) - bar.n)
             finally:
                 process.kill()
                 process.wait()
             log.seek(0)
             if process.returncode != 0:
                 raise DataError(f"pip: {_reason(log.read())}")
-
-    def _watch(self, process: subprocess.Popen[bytes], folder: Path) -> None:
-        """Show how much of the archive has been downloaded, until pip ends."""
-        with tqdm(total=self.size, unit="B", unit_scale=True, desc=f"pip: {self.project}", disable=None) as bar:
-            while process.poll() is None:
-                time.sleep(0.1)
-                bar.update(min(self.size, _largest(folder)) - bar.n)
 
 
 def _largest(folder: Path) -> int:

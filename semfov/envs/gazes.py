@@ -69,7 +69,8 @@ class Gazes(ABC):
         if belief:
             entries["belief"] = self.belief_space
         if glimpse is not None:
-            entries["glimpse"] = glimpse_space(glimpse)
+            check_whole(glimpse, "glimpse", 1, 4096)
+            entries["glimpse"] = spaces.Box(0, 255, (glimpse, glimpse, 3), np.uint8)
         self.observation_space = spaces.Dict(entries)
 
     @property
@@ -179,12 +180,6 @@ class Gazes(ABC):
     @abstractmethod
     def _view(self, row: int) -> Tensor:
         """The image that the eye sees in a row, `(1, 3, h, w)`."""
-
-
-def glimpse_space(side: int) -> spaces.Box:
-    """Space of the image that the eye sees, `side` pixels wide and high."""
-    check_whole(side, "glimpse", 1, 4096)
-    return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
 
 def _detection_arrays(detections: Detections, detector: Detector) -> Arrays:

@@ -236,7 +236,21 @@ def _write_report(
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
-    write_text(config.out / "manifest.json", json.dumps(_fit_manifest(model, figures), indent=2) + "\n")
+    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
+    write_text(
+        config.out / "manifest.json",
+        json.dumps(
+            {
+                "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
+                "commit": commit(),
+                "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
+                "model": metadata,
+                "held_out": {name: asdict(figure) for name, figure in figures.items()},
+            },
+            indent=2,
+        )
+        + "\n",
+    )
     last = list(models)[-1]
     classes = ("background", *model.classes)
     counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
@@ -316,18 +330,6 @@ def _figures_by_level(
         raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
         rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
     return rows
-
-
-def _fit_manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
-    """Record the command, the commit, the versions and the model that the measures come from."""
-    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
-    return {
-        "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
-        "commit": commit(),
-        "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
-        "model": metadata,
-        "held_out": {name: asdict(figure) for name, figure in figures.items()},
-    }
 
 
 class ObservationFit(PartFit):

@@ -19,7 +19,6 @@ from semfov.fit.verification import (
     choose_confirm,
     examine,
     fit,
-    mean_of,
     verification_report,
     verify,
 )
@@ -143,13 +142,6 @@ def _mosaic_searches(
         objects = annotation.boxes[annotation.labels == target]
         likely = model.thresholds.confirm
         yield _MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
-
-
-def shipped_verification() -> Verification:
-    """Return the mean of the verifications of all shipped evidence, without thresholds."""
-    files = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-    verifications = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
-    return mean_of([each for each in verifications if each is not None])
 
 
 def fit_closer(

@@ -84,7 +84,10 @@ class GazePrediction:
     @cached_property
     def density(self) -> Tensor:
         """Probability of a fixation in each pixel of the picture, `(H, W)`, with sum 1."""
-        return self._over_pixels(self._log()).exp()
+        log = self._log()
+        size = self.size[::-1]
+        over = F.interpolate(log[None, None], size, mode="bilinear", align_corners=False)[0, 0]
+        return (over - over.logsumexp((0, 1))).exp()
 
     @cached_property
     def cells(self) -> Tensor:
@@ -325,9 +328,3 @@ class GazePrediction:
     def _log(self) -> Tensor:
         """Log density over the cells, up to a constant."""
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
-
-    def _over_pixels(self, log: Tensor) -> Tensor:
-        """Log density over the pixels from one over the cells."""
-        size = self.size[::-1]
-        over = F.interpolate(log[None, None], size, mode="bilinear", align_corners=False)[0, 0]
-        return over - over.logsumexp((0, 1))

@@ -346,7 +346,8 @@ def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor
     """Pool the hints in a window of cells; scores `(rows, columns, K)` → `(K,)`."""
     x1, y1, x2, y2 = box
     cells = scores[max(y1, 0) : y2, max(x1, 0) : x2].flatten(0, 1)
-    return cells.amax(0), _summary(cells.amax(-1))
+    best = cells.amax(-1)
+    return cells.amax(0), torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])
 
 
 def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
@@ -390,7 +391,3 @@ def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:
         values = torch.maximum(values.narrow(axis, 0, length), values.narrow(axis, step, length))
         have += step
     return values
-
-
-def _summary(best: Tensor) -> Tensor:
-    return torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])

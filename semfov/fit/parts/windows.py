@@ -14,6 +14,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, mean_percent, section
 from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.verification import mean_of
 from semfov.fit.windows import (
     FitZoomConfig,
     fit_closer_looks,
@@ -28,7 +29,6 @@ from semfov.fit.windows import (
     survey_again,
 )
 from semfov.fit.windows_choice import open_all
-from semfov.fit.windows_verification import shipped_verification
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
@@ -181,7 +181,11 @@ def fit_mosaics(
     survey_again(config, model, examples)
     lines = [judge_windows(model, examples["judged"])[0]]
     lines += fit_decision(config, model, eye, mosaics, store)
-    lines += fit_closer_looks(config, model, eye, mosaics, store, shipped_verification())
+    files = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
+    verifications = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
+    lines += fit_closer_looks(
+        config, model, eye, mosaics, store, mean_of([each for each in verifications if each is not None])
+    )
     lines += fit_counts(config, model, eye, mosaics, store)
     return model, "\n".join(lines)
 

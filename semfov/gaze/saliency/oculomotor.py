@@ -85,7 +85,10 @@ class OculomotorBias(nn.Module):
         distance = _norm(places[:, None] - torch.where(seen[..., None], earlier, 0.0)[:, None])
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
         tables = torch.cat([self.back, self.back.new_zeros(_AGES, 1)], 1)[ages]
-        return bias + (_rowwise(tables, near, distance) * seen[:, None]).sum(-1)
+        low, share = _position(near, distance)
+        row = torch.arange(len(tables), device=tables.device)
+        below = tables[row, low]
+        return bias + ((below + (tables[row, low + 1] - below) * share) * seen[:, None]).sum(-1)
 
     def gains(self, number: Tensor) -> Tensor:
         """Gains of the map and of the centre bias.
@@ -117,11 +120,3 @@ def _interpolated(tables: Tensor, knots: Tensor, distance: Tensor) -> Tensor:
     low, share = _position(knots, distance)
     values = tables.t()
     return (values[low] + (values[low + 1] - values[low]) * share[..., None]).movedim(-1, -2)
-
-
-def _rowwise(tables: Tensor, knots: Tensor, distance: Tensor) -> Tensor:
-    """Values of tables `(T, K)`, each at its own distances `(B, N, T)`: `(B, N, T)`."""
-    low, share = _position(knots, distance)
-    row = torch.arange(len(tables), device=tables.device)
-    below = tables[row, low]
-    return below + (tables[row, low + 1] - below) * share
