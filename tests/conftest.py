@@ -1,12 +1,17 @@
-"""Fixtures of all tests: devices, photographs, killing commands, and a hypothesis profile without deadlines."""
+"""Fixtures of all tests: devices, photographs, other processes, and a hypothesis profile without deadlines."""
 
+import atexit
+import gc
+import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,6 +26,17 @@ settings.register_profile("semfov", deadline=None, derandomize=True, suppress_he
 settings.load_profile("semfov")
 
 
+# What is imported and collected stays to the end: to look through it for garbage again and again takes long.
+gc.disable()
+atexit.register(gc.unfreeze)
+
+
+def pytest_collection_finish() -> None:
+    """From here on look for garbage among what the tests make."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_configure() -> None:
     """Give each worker and the processes that it starts one thread, as all workers share the cores."""
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -32,12 +48,18 @@ RUNS = {"finished", "fitted", "home", "trained", "whole"}
 """Fixtures that run a command to its end."""
 LAB = {"lab", "eval"}
 """Folders of tests of the laboratory: studies, the fits that only studies need, benchmarks."""
+NO_CALL = SimpleNamespace(params={})
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests of the laboratory and of the built site, and as slow those that use a fixture that runs a command."""
+    """Mark tests of the laboratory and of the built site, and as slow those that use a fixture that runs a command.
+
+    A test of both precisions and both devices uses the GPU in single precision alone.
+    """
     here = Path(__file__).parent
+    doubled = {"device": "cuda", "dtype": torch.float64}
+    items[:] = [each for each in items if not doubled.items() <= getattr(each, "callspec", NO_CALL).params.items()]
     for item in items:
         fixtures = set(item.fixturenames) if isinstance(item, pytest.Function) else set()
         if RUNS & fixtures:
@@ -112,6 +134,49 @@ def kill_when() -> Iterator[Callable[..., None]]:
     for process in started:
         process.kill()
         process.wait()
+
+
+FRESH = """
+import json, os, sys
+import semfov, torch
+for line in sys.stdin:
+    code, folder = json.loads(line)
+    child = os.fork()
+    if not child:
+        for name, stream in (("out", sys.stdout), ("err", sys.stderr)):
+            os.dup2(os.open(f"{folder}/{name}", os.O_CREAT | os.O_TRUNC | os.O_WRONLY), stream.fileno())
+        try:
+            exec(code, {"__name__": "__main__"})
+            status = 0
+        except SystemExit as stopped:
+            status = stopped.code or 0
+        except BaseException:
+            status = 1
+            sys.excepthook(*sys.exc_info())
+        sys.stdout.flush()
+        os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+"""A process that has imported semfov and nothing else, and runs code in copies of itself."""
+
+
+@pytest.fixture(scope="session")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], str]]:
+    """Runs code in a process of its own, in which semfov has just been imported, and returns what it prints."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    folder = tmp_path_factory.mktemp("fresh")
+    call, ways = [sys.executable, "-c", FRESH], {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(call, cwd=Path(__file__).parents[1], **ways) as process:  # type: ignore[call-overload]
+
+        def run(code: str) -> str:
+            process.stdin.write(json.dumps([code, str(folder)]) + "\n")
+            process.stdin.flush()
+            assert process.stdout.readline().strip() == "0", (folder / "err").read_text()
+            return (folder / "out").read_text()
+
+        yield run
+        process.stdin.close()
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """The package as a whole: its public names, the cost of importing it, and the direction of imports."""
 
 import ast
-import os
 import subprocess
 import sys
 from collections import Counter
@@ -59,10 +58,9 @@ HEAVY = [
 ]
 
 
-def test_import_is_light():
+def test_import_is_light(fresh):
     code = f"import sys, semfov; print([m for m in {[*HEAVY, 'jsonargparse']} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    assert fresh(code).strip() == "[]"
 
 
 COMMANDS = [
@@ -79,31 +77,23 @@ COMMANDS = [
     ("train.fit_map", ["--steps", "-1"]),
 ]
 
-# Each command runs in a separate fork: all start with the package imported, and their imports stay separate.
-EACH = f"""
-import importlib, os, sys
-import semfov
-for number, (command, arguments) in enumerate({COMMANDS}):
-    sys.stdout.flush()
-    if not os.fork():
-        try:
-            code = importlib.import_module(command).main(arguments)
-        except SystemExit as stopped:
-            code = stopped.code
-        print("\\nends", number, code, [m for m in {HEAVY} if m in sys.modules], flush=True)
-        os._exit(0)
-    os.wait()
+IMPORTED = f"""
+import importlib, sys
+try:
+    code = importlib.import_module(%r).main(%r)
+except SystemExit as stopped:
+    code = stopped.code
+print()
+print(code, [m for m in {HEAVY} if m in sys.modules])
 """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_help_and_wrong_arguments_import_no_heavy_packages():
+@pytest.mark.parametrize(("command", "words"), COMMANDS, ids=str)
+def test_help_and_wrong_arguments_import_no_heavy_packages(fresh, command, words):
     """The start takes long because of imports, so the test checks them instead of the time."""
-    result = subprocess.run([sys.executable, "-c", EACH], capture_output=True, text=True, check=True, cwd=ROOT)
-    ends = [line for line in result.stdout.splitlines() if line.startswith("ends")]
-    wanted = [0 if "--help" in " ".join(arguments) else 1 for _, arguments in COMMANDS]
-    assert ends == [f"ends {number} {code} []" for number, code in enumerate(wanted)], result.stderr
+    wanted = 0 if "--help" in " ".join(words) else 1
+    assert fresh(IMPORTED % (command, words)).splitlines()[-1] == f"{wanted} []"
 
 
 def imports(source: str, module: str, *, package: bool = False) -> list[tuple[str, str]]:

@@ -1,6 +1,4 @@
 import hashlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -117,14 +115,13 @@ def test_photographs_are_files_of_the_installed_packages():
 
 
 @pytest.mark.slow
-def test_a_seed_gives_bit_identical_scenes_in_another_process(scenes):
+def test_a_seed_gives_bit_identical_scenes_in_another_process(fresh, scenes):
     program = (
         "from semfov.data import EmbeddedScenes\n"
         f"s = EmbeddedScenes({CLASSES!r}, count={COUNT})\n"
         "print(s.fingerprint, s.digest(5), s.digest(1))"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert run.stdout.split() == [scenes.fingerprint, scenes.digest(5), scenes.digest(1)]
+    assert fresh(program).split() == [scenes.fingerprint, scenes.digest(5), scenes.digest(1)]
     assert torch.equal(scenes[5].image, scenes[5].image)
 
 

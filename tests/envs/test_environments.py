@@ -1,9 +1,5 @@
 """The environments against Gymnasium's own checker, its own vectorised environments, and the annotations of scenes."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
@@ -12,19 +8,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from semfov import DataError, EmbeddedScenes, Grid, InputError
-from semfov.envs import (
-    GazeExplore,
-    GazeSearch,
-    GazeVectorEnv,
-    open_scenery,
-)
+from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
 from semfov.envs.registration import IDS
 from semfov.metrics.search import random_search
 from tests.envs.agents import MaskedRandom, run_agent
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
-ROOT = Path(__file__).parents[2]
 KINDS = {"search": GazeSearch, "exploration": GazeExplore}
 TASKS = list(KINDS)
 
@@ -36,9 +26,8 @@ def equal(one, other):
     return np.array_equal(one, other)
 
 
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize(
-    "more", [{}, {"belief": True, "glimpse": 32, "render_mode": "rgb_array"}], ids=["plain", "all"]
+    ("task", "more"), [("search", {"belief": True, "glimpse": 32, "render_mode": "rgb_array"}), ("exploration", {})]
 )
 def test_environments_pass_the_checker_of_gymnasium(world, task, more):
     """Warnings are errors."""
@@ -282,24 +271,23 @@ def test_ended_environments_stay_idle_until_they_are_reset(sceneries):
     assert infos["passes"].tolist() == [1, 3]
 
 
-def test_importing_registers_the_names_once():
+def test_importing_registers_the_names_once(fresh):
     """In a separate process, where nothing was registered before."""
     code = (
-        "import gymnasium, semfov.envs\n"
+        "import gymnasium, warnings\n"
+        "warnings.simplefilter('error', UserWarning)\n"
+        "import semfov.envs\n"
         "from semfov.envs.registration import register\n"
         "register()\n"
         "print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
     )
-    call = [sys.executable, "-W", "error::UserWarning", "-c", code]
-    output = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert output.strip() == str(sorted(IDS.values()))
+    assert fresh(code).strip() == str(sorted(IDS.values()))
 
 
-def test_without_gymnasium_the_error_has_the_install_command():
+def test_without_gymnasium_the_error_has_the_install_command(fresh):
     code = (
         "import sys; sys.modules['gymnasium'] = None\n"
         "from semfov.errors import DataError\n"
         "try:\n    import semfov.envs\nexcept DataError as error:\n    print(error)"
     )
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert 'pip install "semfov[envs]"' in output
+    assert 'pip install "semfov[envs]"' in fresh(code)

@@ -1,8 +1,5 @@
 """A figure as the last value of a notebook cell."""
 
-import subprocess
-import sys
-
 import pytest
 
 CODE = """
@@ -20,9 +17,7 @@ print("image/png" in plain, drawn["image/png"][:4] == b"\\x89PNG", drawn["image/
 """
 
 
-@pytest.mark.slow
-def test_a_figure_is_displayed_before_pyplot_is_imported():
+def test_a_figure_is_displayed_before_pyplot_is_imported(fresh):
     """Plain Matplotlib figures are not: notebooks can display them only after pyplot is imported."""
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "True", "1"]
+    assert fresh(CODE).split() == ["False", "True", "1"]
