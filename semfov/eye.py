@@ -1,8 +1,8 @@
 """The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,8 +18,7 @@ from semfov.sensor.base import Sensor
 from semfov.sensor.glimpse import glimpse, window_around
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """An opened image: everything that does not depend on the fixation; canvas `(1, 3, h, w)`."""
 
     canvas: Tensor

@@ -74,7 +74,7 @@ class BeliefCalibrationRun(PolicyLooking):
         evidence_map = if_shipped(
             partial(make_learned, MapEvidence), belief.map_model, self.eye, partial(leave_out, MAP)
         )
-        self.models = replace(self.models, evidence=evidence, map=evidence_map)
+        self.models = self.models._replace(evidence=evidence, map=evidence_map)
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in _ALL_CLASSES.items()
         }

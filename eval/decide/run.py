@@ -149,7 +149,7 @@ class DecisionRun(PolicyLooking):
         self.compared[RANDOM] = random, self._by_thresholds
         model = if_shipped(make_observation, config.belief.model, self.eye)
         if model is not None:
-            self.models = replace(self.models, observation=model)
+            self.models = self.models._replace(observation=model)
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
             name = CALIBRATED if model.metadata.get("method") == "discriminative" else PUBLISHED
             self.compared |= {

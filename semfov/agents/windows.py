@@ -1,11 +1,11 @@
 """Looks at windows of a picture larger than the detector's input, or of the frames of a stream."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from math import inf, isfinite
 from time import perf_counter
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -241,8 +241,7 @@ class ZoomAgent(nn.Module):
         return WindowEpisode(self.classes, evidence, target, targets, eye=self.eye, **settings)
 
 
-@dataclass(frozen=True)
-class _Look:
+class _Look(NamedTuple):
     """A look at a window: the number of its pass, the value that it was chosen for, and the time at its end."""
 
     number: int
@@ -374,7 +373,7 @@ class WindowEpisode(Episode[ZoomPath]):
             candidate = None if self._decisions is None else self._decisions.candidate
             if self._decisions is not None and candidate is not None:
                 self._decisions.look()
-                self._looks[-1] = replace(self._looks[-1], value=candidate.probability)
+                self._looks[-1] = self._looks[-1]._replace(value=candidate.probability)
             elif not self._turn():
                 return None
             if self.forgetting is None:

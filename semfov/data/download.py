@@ -12,9 +12,9 @@ import time
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
@@ -26,8 +26,7 @@ _TIMEOUT = 30.0
 _ATTEMPTS = 3
 
 
-@dataclass(frozen=True)
-class _Archive:
+class _Archive(NamedTuple):
     """A zip file on the server."""
 
     path: str

@@ -1,7 +1,7 @@
 """Pictures larger than a detector's input, composed of annotated photographs by a seed."""
 
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +16,10 @@ from semfov.io.files import json_sha256
 _VERSION = 1  # raise it whenever the same seed would give another picture
 
 
-@dataclass(frozen=True)
-class _Tile:
+class _Tile(NamedTuple):
     """The place of a photograph in a mosaic."""
 
-    index: int
+    scene: int
     slot: tuple[int, int, int, int]
     box: tuple[int, int, int, int]
 
@@ -93,7 +92,7 @@ class Mosaics(ComposedScenes):
         canvas = torch.full((3, self.size[1], self.size[0]), self.fill)
         for tile in self.tiles(index):
             x1, y1, x2, y2 = tile.box
-            image = self.scenes[tile.index].image[None]
+            image = self.scenes[tile.scene].image[None]
             if image.shape[-2:] != (y2 - y1, x2 - x1):
                 image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)
             canvas[:, y1:y2, x1:x2] = image[0]
@@ -101,14 +100,14 @@ class Mosaics(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        pairs = [(tile, self.scenes.annotation(tile.index)) for tile in self.tiles(index)]
+        pairs = [(tile, self.scenes.annotation(tile.scene)) for tile in self.tiles(index)]
         boxes = torch.cat([_moved(annotation, tile) for tile, annotation in pairs])
         labels = torch.cat([annotation.labels for _, annotation in pairs])
         return Annotation(boxes, labels, torch.cat([annotation.crowd for _, annotation in pairs]), self.size)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""
-        tiles = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
+        tiles = [(self.scenes.digest(tile.scene), tile.box) for tile in self.tiles(index)]
         return json_sha256([_VERSION, self.size, self.fill, tiles])
 
 

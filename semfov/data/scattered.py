@@ -1,8 +1,8 @@
 """Large pictures of one scene, composed by a seed: parts of photographs scattered over one ground."""
 
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,11 +29,10 @@ _PLAIN = 0.2
 _Box = tuple[int, int, int, int]
 
 
-@dataclass(frozen=True)
-class _Cutout:
+class _Cutout(NamedTuple):
     """A part of a photograph and its place in a picture."""
 
-    index: int
+    scene: int
     part: _Box
     place: _Box
 
@@ -129,7 +128,7 @@ class Scattered(ComposedScenes):
         for cutout in self.cutouts(index):
             x1, y1, x2, y2 = cutout.place
             left, top, right, bottom = cutout.part
-            image = self.scenes[cutout.index].image[None, :, top:bottom, left:right]
+            image = self.scenes[cutout.scene].image[None, :, top:bottom, left:right]
             image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)[0]
             fade = 1.0 if self.whole else _fading(y2 - y1)[:, None] * _fading(x2 - x1)
             canvas[:, y1:y2, x1:x2] += (image - canvas[:, y1:y2, x1:x2]) * fade
@@ -139,7 +138,7 @@ class Scattered(ComposedScenes):
         """Return the objects of a picture, without composing its image."""
         boxes, labels, crowd = [torch.zeros(0, 4)], [torch.zeros(0, dtype=torch.long)], [torch.zeros(0).bool()]
         for cutout in self.cutouts(index):
-            annotation = self.scenes.annotation(cutout.index)
+            annotation = self.scenes.annotation(cutout.scene)
             low, high = (annotation.boxes.new_tensor(cutout.part[n : n + 2]) for n in (0, 2))
             centre = (annotation.boxes[:, :2] + annotation.boxes[:, 2:]) / 2
             inside = ((centre >= low) & (centre <= high)).all(-1)

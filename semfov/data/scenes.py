@@ -6,11 +6,10 @@ without touching each other, so every box is known by construction.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,8 +34,7 @@ _DISTRIBUTIONS = {"skimage": "scikit-image", "matplotlib": "matplotlib"}
 _Box = tuple[int, int, int, int]
 
 
-@dataclass(frozen=True)
-class Photograph:
+class Photograph(NamedTuple):
     """A crop of a photograph from an installed package."""
 
     title: str
@@ -69,8 +67,7 @@ _DISTRACTORS = (
 _TEXTURES = ("brick.png", "grass.png", "gravel.png")
 
 
-@dataclass(frozen=True)
-class Item:
+class Item(NamedTuple):
     """The place of a photograph in a scene."""
 
     photograph: Photograph

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,8 +26,7 @@ _PLAYLIST = b"#EXTM3U"
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`."""
 
     name: str
@@ -77,8 +75,7 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
     )
 
 
-@dataclass(frozen=True)
-class Stream:
+class Stream(NamedTuple):
     """A video or a camera."""
 
     name: str

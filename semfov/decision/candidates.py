@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import replace
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,8 +30,7 @@ LookAt = Callable[[Tensor], Detections]
 """Looks closely at a box `(4,)`; gives the detections, a batch of one (`semfov.Eye.close_up`)."""
 
 
-@dataclass(frozen=True)
-class CandidatePlace:
+class CandidatePlace(NamedTuple):
     """A place that seems to hold the target; box `(4,)`."""
 
     box: Tensor

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Generic
+from typing import Generic, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,8 +23,7 @@ _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a 
 _FLOOR = 1e-6
 
 
-@dataclass(frozen=True)
-class _Verdict:
+class _Verdict(NamedTuple):
     """A closer look at a place, and the number of frames since then."""
 
     look: CloseUp
@@ -103,7 +101,7 @@ class Verifier(Generic[LookType]):
     def wait(self) -> None:
         """Let the time of a frame pass. In a stream, call it before every frame."""
         self.places.wait()
-        aged = (replace(verdict, age=verdict.age + 1) for verdict in self.verdicts)
+        aged = (verdict._replace(age=verdict.age + 1) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def see(self, look: LookType, *, last: bool = False) -> None:
@@ -227,8 +225,8 @@ class Verifier(Generic[LookType]):
     def _followed(self, verdict: _Verdict) -> _Verdict:
         """The verdict at the place to which a look has followed its target."""
         look = verdict.look
-        return replace(
-            verdict, look=self.places.move(look, _follow_target(look.box, self.places.detections, look.target))
+        return verdict._replace(
+            look=self.places.move(look, _follow_target(look.box, self.places.detections, look.target))
         )
 
     def _recent(self, verdict: _Verdict) -> bool:

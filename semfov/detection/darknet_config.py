@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 from semfov.errors import DataError
 from semfov.io.files import check_regular
@@ -13,8 +14,7 @@ from semfov.io.schema import excerpt
 _MOST_BYTES = 2**20
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first.
 
     >>> Section("yolo", {"mask": "1,2,3"}).integers("mask")

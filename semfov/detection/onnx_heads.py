@@ -5,6 +5,7 @@ Boxes are `(x1, y1, x2, y2)` in canvas pixels, edges between pixels (0 is the le
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -249,8 +250,7 @@ _OTHER_TASKS = ("segment", "pose", "obb", "classify")
 _DETR_LOGITS = ("logits", "pred_logits")
 
 
-@dataclass(frozen=True)
-class _DetectionHead:
+class _DetectionHead(NamedTuple):
     """The head of a family of networks; `decode` takes outputs, `(width, height)` and the number of names, if known."""
 
     decode: Callable[[Outputs, _Canvas, int | None], Candidates]

@@ -10,6 +10,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from tqdm import tqdm
 
@@ -35,8 +36,7 @@ class __legacy__:
 """
 
 
-@dataclass(frozen=True)
-class _Address:
+class _Address(NamedTuple):
     """A file at a web address."""
 
     url: str
@@ -132,8 +132,7 @@ def _reason(log: str) -> str:
     return ([*lines, *errors] or ["ended without a message"])[-1].removeprefix("ERROR: ")
 
 
-@dataclass(frozen=True)
-class _Weights:
+class _Weights(NamedTuple):
     """A weights file that is downloaded by name."""
 
     file: str

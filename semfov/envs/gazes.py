@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +22,7 @@ from semfov.errors import check, check_number, check_whole
 Arrays = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Reward and end of n episodes after a gaze shift; reward `(n,)`, terminated `(n,)`, truncated `(n,)`."""
 
     reward: Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -206,8 +206,7 @@ def maps_of(model: FixationDensity, group: Viewed, pictures: Sequence[int], batc
     return torch.cat([model.map(group.some(part), group.size) for part in parts])
 
 
-@dataclass(frozen=True)
-class Events:
+class Events(NamedTuple):
     """Fixations to be predicted in a picture, all but the first of each path: fixations before, cell and person.
 
     Shapes: before `(E, N, 2)`, NaN before a shorter path; cell `(E,)`; person `(E,)`.

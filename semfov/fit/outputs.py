@@ -2,9 +2,8 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from torch import Tensor
 
@@ -45,8 +44,7 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
     print("written:", *(f"  {path}" for path in written), sep="\n")
 
 
-@dataclass(frozen=True)
-class Fit(Generic[_Model]):
+class Fit(NamedTuple, Generic[_Model]):
     """The result of a fit."""
 
     model: _Model

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar, Generic
 
@@ -147,7 +146,7 @@ def open_photographs(
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
         wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
-        search_targets = tuple(replace(search, spare=number >= len(targets)) for number, search in enumerate(wide))
+        search_targets = tuple(search._replace(spare=number >= len(targets)) for number, search in enumerate(wide))
         if targets:
             photographs.append(
                 SearchedPhotograph(eye, scenes, index, len(photographs), grid, search_targets, store, everywhere)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -98,8 +98,7 @@ class FitVerificationConfig(FitConfig):
     out: Path = Path("runs/fit_verification")
 
 
-@dataclass(frozen=True)
-class _VerifiedSearch:
+class _VerifiedSearch(NamedTuple):
     """A search in which all closer looks were made, whatever they showed."""
 
     picture: int
@@ -122,8 +121,7 @@ class _VerifiedSearch:
         return self.places[chances.index(max(chances))][1], self.looks
 
 
-@dataclass(frozen=True)
-class _CloserLooks:
+class _CloserLooks(NamedTuple):
     """Closer looks at places that seemed to hold a target.
 
     Shapes: features `(N, 7)`, right `(N,)`, present `(N,)`, fold `(N,)`.
@@ -135,8 +133,7 @@ class _CloserLooks:
     fold: Tensor
 
 
-@dataclass(frozen=True)
-class VerificationResult:
+class VerificationResult(NamedTuple):
     """A fitted model and its evaluation in folds."""
 
     model: Verification

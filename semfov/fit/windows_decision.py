@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,8 +28,7 @@ _JUDGED = (1, 4, 8, 16)
 """Numbers of looks after which the probability of presence is evaluated."""
 
 
-@dataclass(frozen=True)
-class Searches:
+class Searches(NamedTuple):
     """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
 
     Shapes: best `(E, n)`, case `(E, n, 10)`, looked `(E, n)`, left `(E, n)`, there `(E,)`.
@@ -44,7 +43,7 @@ class Searches:
     @classmethod
     def join(cls, searches: Sequence[Searches]) -> Searches:
         """Join several sets of searches."""
-        return cls(*(torch.cat([getattr(some, name) for some in searches]) for name in cls.__dataclass_fields__))
+        return cls(*map(torch.cat, zip(*searches, strict=True)))
 
 
 @torch.inference_mode()

@@ -3,8 +3,7 @@
 import logging
 import random
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +22,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 
 
-@dataclass(frozen=True)
-class WindowResult:
+class WindowResult(NamedTuple):
     """A look at a window and its results; show `(K,)`, found `(M,)`."""
 
     window: Window
@@ -33,8 +31,7 @@ class WindowResult:
     found: Tensor
 
 
-@dataclass(frozen=True)
-class ZoomExample:
+class ZoomExample(NamedTuple):
     """A mosaic with looks at many windows; labels `(M,)`."""
 
     lattice: Lattice
@@ -85,8 +82,7 @@ def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LE
     return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
 
 
-@dataclass(frozen=True)
-class Windows:
+class Windows(NamedTuple):
     """N pairs of a look and a closer window inside it, as one table.
 
     Shapes: scores `(N, K)`, summary `(N, 3)`, steps `(N,)`, presence `(N, K)`, before `(N,)`, slot `(N,)`, mosaic

@@ -3,7 +3,8 @@
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,8 +68,7 @@ def live(eye: Eye, views: Views) -> Detect:
     return detect
 
 
-@dataclass(frozen=True)
-class HeadStep:
+class HeadStep(NamedTuple):
     """One step of an episode: a look, the time it ends, its detections, and the belief after it."""
 
     action: int

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,11 +23,10 @@ _RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))
 """For each ring, its latitude in degrees and its number of photographs."""
 
 
-@dataclass(frozen=True)
-class _Patch:
+class _Patch(NamedTuple):
     """The position of a photograph on the sphere."""
 
-    index: int
+    scene: int
     pose: tuple[float, float, float]
     box: tuple[float, float, float, float]
 
@@ -129,7 +128,7 @@ class Panoramas:
         x1, y1, x2, y2 = patch.box
         # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
         scale = self.size[0] / (2 * math.pi) / float(camera.focal)
-        image = self.scenes[patch.index].image[None]
+        image = self.scenes[patch.scene].image[None]
         shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
         image = F.interpolate(image, shape, mode="bilinear", antialias=True)
 
@@ -158,7 +157,7 @@ class Panoramas:
         """
         poses, boxes = [], []
         for patch in self.patches(index):
-            annotation, (x1, y1, x2, y2) = self.scenes.annotation(patch.index), patch.box
+            annotation, (x1, y1, x2, y2) = self.scenes.annotation(patch.scene), patch.box
             width, height = annotation.size
             scale = annotation.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
             boxes.append(annotation.boxes * scale + annotation.boxes.new_tensor([x1, y1] * 2))
@@ -175,7 +174,7 @@ class Panoramas:
             Classes of the objects, and the smallest boxes around them in pixels of the panorama. A box that crosses the
             seam extends beyond the right border.
         """
-        annotations = [self.scenes.annotation(patch.index) for patch in self.patches(index)]
+        annotations = [self.scenes.annotation(patch.scene) for patch in self.patches(index)]
         labels = torch.cat([annotation.labels for annotation in annotations])
         crowd = torch.cat([annotation.crowd for annotation in annotations])
         return Annotation(self.regions(index).panorama_boxes(self.size), labels, crowd, self.size)
@@ -200,5 +199,5 @@ class Panoramas:
         Returns:
             64 hexadecimal digits.
         """
-        patches = [(self.scenes.digest(patch.index), patch.pose, patch.box) for patch in self.patches(index)]
+        patches = [(self.scenes.digest(patch.scene), patch.pose, patch.box) for patch in self.patches(index)]
         return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, patches]).encode()).hexdigest()

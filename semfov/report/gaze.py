@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _MOST_STEPS = 12
 """Largest number of fixations of the slider."""
 
 
-@dataclass(frozen=True)
-class DrawnGaze:
+class DrawnGaze(NamedTuple):
     """A prediction with the scanpaths that are drawn from it."""
 
     prediction: GazePrediction

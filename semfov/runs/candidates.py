@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -49,8 +49,7 @@ class Candidate:
         return SaliencyPrior(policy(target, grid), salient, weight=self.weight)
 
 
-@dataclass(frozen=True)
-class _Models:
+class _Models(NamedTuple):
     """Fitted models that the policies of a run need; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None

@@ -1,7 +1,7 @@
 """The protocol of explorations: the episodes of a scene, and their results."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,8 +15,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
 
 
-@dataclass(frozen=True)
-class Exploration:
+class Exploration(NamedTuple):
     """One exploration of a scene."""
 
     scene: int

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -97,8 +98,7 @@ def choose_classes(
     return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
 
 
-@dataclass(frozen=True)
-class DrawnSearch:
+class DrawnSearch(NamedTuple):
     """A search for a drawn class, which the photograph may hold or not; `spare` ones serve only some purposes of a fit.
 
     Shapes: goal `(X·Y,)`, start `(1,)`, noise `(1, shifts+1, X·Y)`.

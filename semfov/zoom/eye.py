@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -49,8 +49,7 @@ class WindowView:
     lattice: Lattice
 
 
-@dataclass(frozen=True)
-class WindowLooks:
+class WindowLooks(NamedTuple):
     """The result of several looks; cut `(F, L)`, windows `(F, 4)`."""
 
     detections: Detections

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +22,7 @@ DETECTION_SCORE = 0.1
 """Score from which on a detection counts as a found object."""
 
 
-@dataclass(frozen=True)
-class Hints:
+class Hints(NamedTuple):
     """The hints of one look: boxes with class scores, in no order; several may be of one object.
 
     Shapes: boxes `(N, 4)`, scores `(N, K)`.

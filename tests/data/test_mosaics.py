@@ -18,15 +18,15 @@ def make(**changes):
 def test_a_mosaic_depends_only_on_seed_and_index():
     assert torch.equal(make()[1].image, make(count=9)[1].image)
     assert make().fingerprint != make(seed=2).fingerprint
-    assert [tile.index for tile in make().tiles(0)] != [tile.index for tile in make(seed=2).tiles(0)]
+    assert [tile.scene for tile in make().tiles(0)] != [tile.scene for tile in make(seed=2).tiles(0)]
     assert make().digest(0) == make().digest(0) != make().digest(1)
 
 
 def test_no_photograph_is_repeated_if_there_are_enough():
     for index in range(3):
-        numbers = [tile.index for tile in make().tiles(index)]
+        numbers = [tile.scene for tile in make().tiles(index)]
         assert len(set(numbers)) == 4
-    assert sorted(tile.index for tile in make(columns=5, rows=2).tiles(0)) == sorted([*range(5)] * 2)
+    assert sorted(tile.scene for tile in make(columns=5, rows=2).tiles(0)) == sorted([*range(5)] * 2)
 
 
 def test_boxes_move_with_the_pixels_of_their_tile():
@@ -36,7 +36,7 @@ def test_boxes_move_with_the_pixels_of_their_tile():
     start = 0
     for tile in mosaics.tiles(0):
         x1, y1, x2, y2 = tile.box
-        part = SCENES[tile.index]
+        part = SCENES[tile.scene]
         assert (x2 - x1, y2 - y1) == part.size
         assert torch.equal(scene.image[:, y1:y2, x1:x2], part.image)
         stop = start + len(part.boxes)
@@ -53,9 +53,9 @@ def test_boxes_are_scaled_with_their_photographs():
     assert (annotation.boxes >= 0).all()
     assert (annotation.boxes <= limit).all()
     tile = mosaics.tiles(0)[0]
-    count = len(SCENES.annotation(tile.index).boxes)
+    count = len(SCENES.annotation(tile.scene).boxes)
     corner = torch.tensor([*tile.box[:2], *tile.box[:2]])
-    torch.testing.assert_close(annotation.boxes[:count], SCENES.annotation(tile.index).boxes / 2 + corner)
+    torch.testing.assert_close(annotation.boxes[:count], SCENES.annotation(tile.scene).boxes / 2 + corner)
 
 
 class OneEach:

@@ -122,9 +122,9 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
         # When all slices were looked at, recall stays the same.
         assert len(looks) < _RECALL_PASSES[-1]
         found = torch.cat([found, found[:, -1:].expand(-1, _RECALL_PASSES[-1] - len(looks))], -1).double()
-        counts = [len(scenes.annotation(tile.index).boxes) for tile in tiles]
+        counts = [len(scenes.annotation(tile.scene).boxes) for tile in tiles]
         for tile, part in zip(tiles, found.split(counts), strict=True):
-            shares.setdefault(tile.index, []).append(part.mean(0))
+            shares.setdefault(tile.scene, []).append(part.mean(0))
     expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
     assert expected.amax() > 0
     torch.testing.assert_close(torch.from_numpy(_photograph_recalls(mosaics, opened, _in_raw_order)), expected)

@@ -25,12 +25,12 @@ def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
     panorama = panoramas[0].image[None]
     for patch in panoramas.patches(0):
         seen = perspective(panorama, torch.tensor([patch.pose]), (320, 240))[0]
-        photograph = F.interpolate(scenes[patch.index].image[None], (240, 320), mode="bilinear", antialias=True)[0]
+        photograph = F.interpolate(scenes[patch.scene].image[None], (240, 320), mode="bilinear", antialias=True)[0]
         inner = slice(6, -6)
         apart = (seen - photograph)[:, inner, inner].abs()
         assert apart.mean() < 0.02
         # Another photograph differs much more.
-        other = scenes[(patch.index + 1) % 5].image[None]
+        other = scenes[(patch.scene + 1) % 5].image[None]
         other = F.interpolate(other, (240, 320), mode="bilinear", antialias=True)[0]
         assert (seen - other)[:, inner, inner].abs().mean() > 3 * apart.mean()
 
@@ -43,7 +43,7 @@ def test_regions_match_the_boxes_of_the_photographs(scenes):
     from semfov.sensor.sphere import Camera
 
     for patch in panoramas.patches(1):
-        annotation = scenes.annotation(patch.index)
+        annotation = scenes.annotation(patch.scene)
         own = regions[torch.arange(start, start + len(annotation.boxes))]
         assert torch.equal(labels[start : start + len(own)], annotation.labels)
         start += len(own)
@@ -63,7 +63,7 @@ def test_a_seed_repeats_a_panorama_and_uses_each_photograph_once(scenes):
     assert one.fingerprint == same.fingerprint != other.fingerprint
     assert one.digest(2) == same.digest(2) != one.digest(1)
     assert one.patches(0) != other.patches(0)
-    assert sorted(patch.index for patch in one.patches(0)) == [0, 1, 2, 3, 4]
+    assert sorted(patch.scene for patch in one.patches(0)) == [0, 1, 2, 3, 4]
 
 
 def test_no_two_photographs_overlap(scenes):

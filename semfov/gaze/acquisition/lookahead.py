@@ -1,7 +1,7 @@
 """One-step lookahead: the belief about the whole map after the scores that are expected of a fixation, or drawn."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,8 +17,7 @@ from semfov.threads import one_thread_if_small
 _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, however many there are
 
 
-@dataclass(frozen=True)
-class Outlook:
+class Outlook(NamedTuple):
     """The present belief, and the belief after one more look from each of N levels of distance.
 
     The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
