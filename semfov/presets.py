@@ -52,11 +52,7 @@ def recommended_arguments(
 
 
 def published_model(detector: str, sensor: str, threshold: float) -> str:
-    """Name the observation model of the published agent.
-
-    >>> published_model("yolox-nano", "published", 0.02), published_model("yolox-nano", "published", 0.03)
-    ('yolox-nano-published', 'yolox-nano-published')
-    """
+    """Name the observation model of the published agent."""
     name = f"{detector}-{sensor}"
     own = f"{name}-{threshold:g}"
     return own if (FovealObservationModel.shipped / f"{own}.safetensors").is_file() else name

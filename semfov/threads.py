@@ -20,12 +20,6 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
 
     PyTorch divides an operation on more than 32,768 elements among its threads, and waits for the last one. If another
     program uses a core, that thread waits for its turn, at each of the many operations of a fixation.
-
-    >>> @one_thread_if_small
-    ... def threads(x):
-    ...     return torch.get_num_threads()
-    >>> threads(torch.zeros(9)), threads(torch.zeros(_MANY_ELEMENTS)) == torch.get_num_threads()
-    (1, True)
     """
 
     @wraps(function)

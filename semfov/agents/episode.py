@@ -28,12 +28,7 @@ OnLook = Callable[[Any], object]
 
 @dataclass(frozen=True)
 class EpisodeLimits:
-    """Limits of one episode. It ends at the first one that is reached.
-
-    >>> limits = EpisodeLimits(passes=3, on_look=lambda record: record != "enough")
-    >>> [limits.reached(1, lambda: "more"), limits.reached(1, lambda: "enough"), limits.reached(3, lambda: "more")]
-    [None, 'stopped', 'passes']
-    """
+    """Limits of one episode. It ends at the first one that is reached."""
 
     passes: int | None = None
     seconds: float | None = None
@@ -193,12 +188,7 @@ def without_none(**values: Any) -> dict[str, Any]:
 
 
 def on_cpu(module: _Module) -> _Module:
-    """A module on the CPU, without moving the given one, which other parts of the agent may share.
-
-    >>> layer = nn.Linear(2, 1)
-    >>> on_cpu(layer) is layer
-    True
-    """
+    """A module on the CPU, without moving the given one, which other parts of the agent may share."""
     if all(each.device.type == "cpu" for each in (*module.parameters(), *module.buffers())):
         return module
     return copy.deepcopy(module).cpu()

@@ -72,9 +72,6 @@ def open_picture(source: "PictureLike | OpenedPicture", color: Color = "rgb") ->
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
     """Tell whether a picture is large enough for windows to pay: whether there are two octaves or more to zoom in.
 
-    >>> pays((3840, 2160), (416, 416)), pays((640, 480), (416, 416))
-    (True, False)
-
     Shapes: size `(width, height)`, canvas `(width, height)`.
     """
     return Lattice.over(size, canvas).levels >= 3

@@ -140,11 +140,7 @@ def canonical_name(name: str) -> str:
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
-    """Index the classes by their canonical names.
-
-    >>> class_indices(("person", "sofa"))
-    {'person': 1, 'couch': 2}
-    """
+    """Index the classes by their canonical names."""
     indices = {canonical_name(name): index for index, name in enumerate(classes, 1)}
     if len(indices) != len(classes):
         raise InputError(f"classes: expected {len(classes)} different names, got {len(indices)}")
@@ -194,11 +190,7 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
 def class_numbers(
     names: str | int | Sequence[str | int] | None, classes: Sequence[str], argument: str = "class"
 ) -> tuple[int, ...]:
-    """Look up the indices of one class, of several, or of all classes.
-
-    >>> class_numbers(["cups", 1, "cup"], ("person", "cup")), class_numbers(None, ("person", "cup"))
-    ((2, 1), ())
-    """
+    """Look up the indices of one class, of several, or of all classes."""
     if names is None:
         return ()
     if isinstance(names, str) or not isinstance(names, Sequence):
@@ -251,11 +243,7 @@ def _other_numbers(key: str) -> set[str]:
 
 
 def alike(name: str, names: Sequence[str]) -> list[int]:
-    """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms.
-
-    >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
-    ([1], [0, 1], [0])
-    """
+    """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms."""
     name_key, keys = _plain_key(name), [_plain_key(other) for other in names]
     forms = {name_key, *_other_numbers(name_key)}
     same = [place for place, key in enumerate(keys) if key in forms or name_key in _other_numbers(key)]

@@ -33,14 +33,6 @@ def _read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
     `height`. Every category needs `id` and `name`. Every annotation needs `id`, `image_id`, `category_id` and `bbox` =
     `[x, y, width, height]`, and may have `iscrowd`. Other keys are ignored.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder, "instances.json")
-    ...     _ = path.write_text('{"images": [], "annotations": [], "categories": []}')
-    ...     coco, digest = _read_annotations(path)
-    >>> coco.getImgIds()
-    []
     """
     name = f"annotations {Path(path)}"
     raw = _read(path, name)

@@ -363,9 +363,6 @@ def open_large(source: LargePicture | ImageLike, *, color: Color = "rgb") -> Lar
     they have overviews or are of a kind that `tifffile` leaves; else as other photographs. Rasters `.vrt` and `.jp2`
     need rasterio. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows of a
     `numpy.memmap` are read.
-
-    >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
-    torch.Size([3, 10, 20])
     """
     if isinstance(source, LargePicture):
         return source
@@ -439,13 +436,7 @@ def _is_converted(path: str | PathLike[str]) -> bool:
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
-    """Size of a picture of any common type, without decoding a file.
-
-    >>> picture_size(np.zeros((48, 64, 3), np.uint8))
-    (64, 48)
-
-    Shapes: → `(width, height)`.
-    """
+    """Size of a picture of any common type, without decoding a file; → `(width, height)`."""
     from PIL import Image as Pillow
 
     if isinstance(source, LargePicture):

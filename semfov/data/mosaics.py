@@ -31,11 +31,6 @@ class Mosaics(ComposedScenes):
     depends only on the seed, on `i` and on the photographs. No photograph is in a mosaic twice, unless there are fewer
     photographs than slots.
 
-    >>> from semfov.data import EmbeddedScenes
-    >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)
-    >>> mosaics[0].size
-    (640, 480)
-
     Shapes: tile `(width, height)`.
     """
 

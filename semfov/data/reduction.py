@@ -79,11 +79,6 @@ class ReducedCopies:
     A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
     borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
 
-    >>> picture = np.full((40, 64, 3), 7, np.uint8)
-    >>> copies = ReducedCopies((64, 40), lambda box: picture[box[1] : box[3], box[0] : box[2]])
-    >>> copies.window((16, 8, 48, 40), 4).shape
-    torch.Size([3, 8, 8])
-
     Shapes: size `(width, height)`, read `(h, w, 3)`.
     """
 

@@ -45,11 +45,6 @@ class Scattered(ComposedScenes):
     picture: between `sides` on the longer side. They stand in groups. Picture `i` depends only on the seed, on `i` and
     on the photographs.
 
-    >>> from semfov.data import EmbeddedScenes
-    >>> pictures = Scattered(EmbeddedScenes(("person", "cat"), count=3), whole=True, size=(640, 480), sides=(90, 120))
-    >>> pictures[0].size, len(pictures[0].boxes) > 0
-    ((640, 480), True)
-
     Shapes: size `(width, height)`.
     """
 

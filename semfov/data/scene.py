@@ -223,14 +223,7 @@ class ComposedScenes(ABC):
 
 
 class Crowded:
-    """The given share of a set's scenes, those with the most objects; among equals the first scenes count.
-
-    >>> from semfov.data import EmbeddedScenes
-    >>> scenes = EmbeddedScenes(("person", "cat"), count=6)
-    >>> crowded = Crowded(scenes, 1 / 3)
-    >>> len(crowded), set(crowded.ids) <= set(scenes.ids)
-    (2, True)
-    """
+    """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
 
     def __init__(self, scenes: Scenes, share: float) -> None:
         check(0 < share <= 1, "share", "above 0 and at most 1", share)

@@ -124,11 +124,7 @@ class WordVectors:
 
 
 def words_of(name: str) -> list[str]:
-    """Split a name or a description into words, and leave out common words such as `the` and `something`.
-
-    >>> words_of("Wine_Glass"), words_of("something to drink from")
-    (['wine', 'glass'], ['drink'])
-    """
+    """Split a name or a description into words, and leave out common words such as `the` and `something`."""
     words = re.findall(r"[^\W_]+(?:'[^\W_]+)?", canonical_name(name))
     return [word for word in words if word not in _IGNORED] or words
 

@@ -72,10 +72,6 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
 def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Thresholds) -> Tensor:
     """Apply the thresholds of `decide` to the probabilities of searches.
 
-    >>> settle(torch.tensor([0.95, 0.95, 0.2]), torch.tensor([True, False, False]), torch.tensor([0.1, 0.1, 0.01]),
-    ...        Thresholds(confirm=0.9, give_up=0.05)).tolist()
-    [1, 0, 2]
-
     Shapes: presence `(A,)`, looked `(A,)`, left `(A,)` → `(A,)`.
     """
     rest = torch.where(left < thresholds.give_up, torch.where(presence < ABSENT, 2, 3), 0)
@@ -106,17 +102,6 @@ def conclude(
     .. math:: x = \arg\max_x P(t \in x) \max_l s_{lt} w_l(x)
 
     where l runs over the detections of all looks, with scores s and `soft` footprints w.
-
-    Args:
-        outcome: number of the outcome in `OUTCOMES`.
-        belief: belief of one episode after the last look.
-        looks: the detections of each look, batches of one.
-        grid: the cells.
-        target: class 1..K.
-        cell: cell in which the target was found; None computes it.
-
-    Returns:
-        The decision.
     """
     probability = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
@@ -138,11 +123,6 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
 
     It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
     enough; otherwise the target is absent if the picture holds it with a probability below `ABSENT`.
-
-    >>> verified([0.3, 0.96], 0.9, 0.9, over=False), verified([0.92], 0.9, 0.9, over=False)
-    (1, 0)
-    >>> [OUTCOMES[verified([place], presence, 0.9, over=True)] for place, presence in ((0.92, 0.9), (0.2, 0.3))]
-    ['found', 'absent']
     """
     best = max(places, default=0.0)
     if places and best >= (confirm if over else surely(confirm)):

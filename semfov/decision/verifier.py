@@ -52,27 +52,7 @@ class Verifier(Generic[LookType]):
     place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
     and the boxes of the verdicts follow the detections of each look.
 
-    Args:
-        model: gives the probabilities after closer looks.
-        places: source of candidates.
-        close_up: looks closely at a box `(4,)`; gives the detections, a batch of one.
-        thresholds: see `Verification`; None takes those of the model.
-        most: largest number of closer looks; in a scene that changes, in :math:`\ln 2 / r` frames.
-
-    Attributes:
-        verdicts: the closer looks that are not forgotten, in order.
-        candidate: the place that is to be looked at closely now; None if there is none.
-
-    Raises:
-        InputError: no thresholds are given and the model has none, or `most` is out of range.
-
-    Example::
-
-        places, close_up = CandidateCells(grid, target), partial(eye.close_up, image)
-        verifier = Verifier(Verification.from_pretrained("yolox-nano"), places, close_up)
-        for step in rollout(looks, observer, policy, start, choice, most=31, ends=lambda step: verifier(step) > 0):
-            ...
-        print(verifier.conclude(), verifier.looks)
+    Shapes: close_up `(4,)`.
     """
 
     def __init__(

@@ -20,12 +20,6 @@ def merge_crops(
     of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole box is
     kept rather than a cut one, and otherwise the one in the finer crop.
 
-    >>> boxes = torch.tensor([[[6.0, 6, 14, 14]], [[6.0, 6, 14, 15]]])
-    >>> detections = Detections(boxes, torch.tensor([[[0.2, 0.8]], [[0.1, 0.9]]]), torch.ones(2, 1, dtype=torch.bool))
-    >>> windows = torch.tensor([[2.0, 2, 18, 18], [-6, -6, 26, 26]])
-    >>> merge_crops(detections, windows, 2, 16, (40, 40), 100).boxes
-    tensor([[[ 6.,  6., 14., 14.]]])
-
     Shapes: windows `(F·L, 4)`, size `(width, height)`.
     """
     merged = []

@@ -327,10 +327,6 @@ class Darknet(nn.Module):
         - input: `(B, C, H, W)`
         - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
 
-    >>> from semfov.detection.darknet_config import _yolov3_tiny
-    >>> [tuple(m.shape) for m in Darknet(_yolov3_tiny())(torch.zeros(1, 3, 64, 96))]
-    [(1, 255, 2, 3), (1, 255, 4, 6)]
-
     Shapes: input_size `(width, height)`.
     """
 

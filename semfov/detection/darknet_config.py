@@ -15,11 +15,7 @@ _MOST_BYTES = 2**20
 
 
 class Section(NamedTuple):
-    """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first.
-
-    >>> Section("yolo", {"mask": "1,2,3"}).integers("mask")
-    (1, 2, 3)
-    """
+    """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first."""
 
     kind: str
     options: Mapping[str, str] = field(default_factory=dict)
@@ -70,19 +66,6 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
     Lines are `[kind]`, `key=value`, comments (`#` or `;`) or blank. Where a key is repeated in a section, the first
     value counts, as in Darknet.
-
-    Args:
-        text: the text.
-        source: name of the file, for messages.
-
-    Returns:
-        The sections in the order of the text.
-
-    Raises:
-        DataError: a line is none of these.
-
-    >>> [s.kind for s in _parse_cfg("[net]\nwidth=416\n\n[maxpool]\nsize=2")]
-    ['net', 'maxpool']
     """
     sections: list[Section] = []
     options: dict[str, str] = {}

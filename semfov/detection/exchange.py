@@ -61,11 +61,7 @@ def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
 def category_ids(
     categories: Sequence[int] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
 ) -> list[int]:
-    """Find the category id of each class.
-
-    >>> category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "tvmonitor"])
-    [1, 72]
-    """
+    """Find the category id of each class."""
     ids = [category for category in categories if not isinstance(category, Mapping)]
     if len(ids) == len(categories):
         return ids

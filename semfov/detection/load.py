@@ -140,11 +140,7 @@ def loader_options() -> list[str]:
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
-    """Check without loading it that a detector exists.
-
-    >>> check_detector("YOLOX-Nano")[:2]
-    ('person', 'bicycle')
-    """
+    """Check without loading it that a detector exists."""
     name = detector_name(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         if not Path(name).exists():
@@ -154,11 +150,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
 
 
 def detector_name(name_or_path: str | PathLike[str]) -> str:
-    """Return a name as it is written in tables, and the path of a file as it is.
-
-    >>> detector_name("YOLOv3-tiny"), detector_name("Mine.onnx")
-    ('yolov3-tiny', 'Mine.onnx')
-    """
+    """Return a name as it is written in tables, and the path of a file as it is."""
     name = fspath(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         return name

@@ -272,13 +272,7 @@ def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
 
 
 def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[_Index, _Index]:
-    """Pairs of intervals of which the second starts within the first.
-
-    >>> neighbours(np.array([0.0, 1.0, 5.0]), np.array([2.0, 3.0, 6.0]))
-    (array([0]), array([1]))
-
-    Shapes: start `(N,)`, end `(N,)` → `(P,)`.
-    """
+    """Pairs of intervals of which the second starts within the first; start `(N,)`, end `(N,)` → `(P,)`."""
     stop = start.searchsorted(end, side="right")
     count = np.maximum(stop - np.arange(1, len(start) + 1), 0)
     first = np.arange(len(start)).repeat(count)
@@ -297,9 +291,6 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
 
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
     """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
-
-    >>> _survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
-    array([0, 2])
 
     Shapes: better `(P,)`, worse `(P,)`.
     """

@@ -48,11 +48,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
 
 
 def check_file(path: Path) -> bool:
-    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone.
-
-    Returns:
-        Whether sizes or the number of steps cannot be known from the file, as they may depend on values.
-    """
+    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
     import onnx
 
     check_regular(path, f"ONNX model {str(path)!r}")

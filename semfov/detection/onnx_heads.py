@@ -46,9 +46,6 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
 
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
 
-    >>> decode_yolox(torch.zeros(1, 1, 6), (32, 32), strides=(32,)).boxes
-    tensor([[[-16., -16.,  16.,  16.]]])
-
     Shapes: raw `(B, N, 5 + K)`, canvas `(width, height)`.
     """
     check_shape(raw, "raw", None, None, None)
@@ -59,25 +56,13 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
 
 
 def decode_yolov5(rows: Tensor) -> Candidates:
-    """Decode YOLOv5-style rows, whose boxes the network itself has decoded.
-
-    >>> decode_yolov5(torch.tensor([[[8.0, 8.0, 4.0, 2.0, 0.5, 1.0]]])).boxes
-    tensor([[[ 6.,  7., 10.,  9.]]])
-
-    Shapes: rows `(B, N, 5 + K)`.
-    """
+    """Decode YOLOv5-style rows, whose boxes the network itself has decoded; rows `(B, N, 5 + K)`."""
     check_shape(rows, "rows", None, None, None)
     return Candidates(_corners(rows[..., :4]), rows[..., 5:], rows[..., 4])
 
 
 def decode_yolov8(columns: Tensor) -> Candidates:
-    """Decode YOLOv8-style columns, whose boxes the network itself has decoded.
-
-    >>> decode_yolov8(torch.tensor([[[8.0], [8.0], [4.0], [2.0], [1.0]]])).boxes
-    tensor([[[ 6.,  7., 10.,  9.]]])
-
-    Shapes: columns `(B, 4 + K, N)`.
-    """
+    """Decode YOLOv8-style columns, whose boxes the network itself has decoded; columns `(B, 4 + K, N)`."""
     check_shape(columns, "columns", None, None, None)
     rows = columns.transpose(1, 2)
     return Candidates(_corners(rows[..., :4]), rows[..., 4:])
@@ -85,9 +70,6 @@ def decode_yolov8(columns: Tensor) -> Candidates:
 
 def decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
     """Decode rows `x1 y1 x2 y2 score class` that a network has selected itself (YOLOv10): all other scores are 0.
-
-    >>> decode_end_to_end(torch.tensor([[[1.0, 2.0, 5.0, 4.0, 0.9, 1.0]]]), 3).classes
-    tensor([[[0.0000, 0.9000, 0.0000]]])
 
     Shapes: rows `(B, N, 6)`.
     """
@@ -127,18 +109,7 @@ def decode_distances(
     The distance from the point `p = (cell + offset) s` to the left, upper, right or lower side is
     `d = s Σ_b b softmax(t)_b`.
 
-    Args:
-        classes: class scores `(B, N, K)` in [0, 1], for the cells of all levels.
-        distances: `(B, N, 4 bins)`, the logits t of each side.
-        canvas: `(width, height)` of the network's input.
-        strides: canvas pixels per cell of each level, s.
-        offset: position of the point in its cell: 0.5 for PicoDet and NanoDet, 0 for NanoDet-Plus.
-
-    Returns:
-        All boxes with their scores.
-
-    >>> decode_distances(torch.ones(1, 1, 2), torch.zeros(1, 1, 12), (8, 8), strides=(8,)).boxes
-    tensor([[[-4., -4., 12., 12.]]])
+    Shapes: classes `(B, N, K)`, distances `(B, N, 4 bins)`, canvas `(width, height)`.
     """
     check_shape(classes, "classes", None, None, None)
     check_shape(distances, "distances", None, classes.shape[1], None)
@@ -154,9 +125,6 @@ def decode_distances(
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
 
-    >>> decode_detr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).background
-    tensor([[0.2500]])
-
     Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
     """
     check_shape(logits, "logits", None, None, None)
@@ -166,9 +134,6 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candi
 
 def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
-
-    >>> decode_rtdetr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).boxes
-    tensor([[[0., 2., 8., 6.]]])
 
     Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
     """
@@ -206,11 +171,7 @@ def _fractions(boxes: Tensor, canvas: tuple[int, int]) -> Tensor:
 
 
 def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
-    """What boxes `(B, N, 4)` of one pass look like if another head has made them, in words; None for boxes in place.
-
-    >>> misplaced(torch.tensor([[[0.1, 0.2, 0.8, 0.9]]]), (640, 640))
-    'fractions of the canvas instead of pixels'
-    """
+    """What boxes `(B, N, 4)` of one pass look like if another head has made them, in words; None for boxes in place."""
     rows = boxes.detach().reshape(-1, 4).double()
     rows = rows[(rows != 0).any(-1)]  # empty rows of a network that selects boxes itself
     if not len(rows):
@@ -273,11 +234,7 @@ class Signature:
 
 
 def recognise(signature: Signature, run: Callable[[], Outputs] | None = None) -> str:
-    """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes.
-
-    >>> recognise(Signature("images", (("output0", (1, 84, 8400)),), (640, 640)))
-    'yolov8'
-    """
+    """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes."""
     task = signature.metadata.get("task", "detect")
     check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
     names = list(_fitting(signature))

@@ -25,17 +25,7 @@ def decode_yolo(
 
     Objectness and class scores are `σ(t)`.
 
-    Args:
-        raw: `(B, A (5 + K), h, w)`; the channels of each anchor are x, y, width, height, objectness and classes.
-        anchors: A pairs `(width, height)` in canvas pixels.
-        canvas: `(width, height)` of the network's input.
-        scale: the centre's σ(t) is replaced by `scale · σ(t) - (scale - 1) / 2`.
-
-    Returns:
-        `h · w · A` boxes for each image, row by row, with the anchors of a cell together.
-
-    >>> decode_yolo(torch.zeros(1, 6, 1, 1), [(8, 4)], (32, 32)).boxes
-    tensor([[[12., 14., 20., 18.]]])
+    Shapes: raw `(B, A (5 + K), h, w)`, anchors `(width, height)`, canvas `(width, height)`.
     """
     batch, channels, rows, columns = raw.shape
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))

@@ -179,11 +179,7 @@ class WindowGaze(Gazes):
 
 
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
-    """The window of the lattice that is nearest to an action.
-
-    >>> _window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
-    (12, 8, 20, 16)
-    """
+    """The window of the lattice that is nearest to an action."""
     level = round(float(action[2]) * (lattice.levels - 1))
     places, pitch, window = lattice.places(level), lattice.pitch, lattice.window(level)
     column, row = (
@@ -196,14 +192,7 @@ def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
 
 
 def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
-    """The action that looks at a window.
-
-    >>> lattice = Lattice.over((2560, 1920), (416, 416))
-    >>> float(action_of(lattice, on_lattice(lattice, (lattice.levels - 1, 0, 0)))[2])
-    1.0
-
-    Shapes: → `(x, y, magnification)`.
-    """
+    """The action that looks at a window; → `(x, y, magnification)`."""
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)
     return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)

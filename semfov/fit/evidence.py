@@ -198,13 +198,7 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
     high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
     they have a term of their own.
 
-    Args:
-        config: the weights of the terms.
-        step: the step after the look.
-        goal: `(E, X·Y)` boolean, cells with the target.
-
-    Returns:
-        The loss, a scalar.
+    Shapes: goal `(E, X·Y)`.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)

@@ -287,16 +287,7 @@ def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None)
 
     This is the maximum a posteriori estimate for normal distributions around :math:`w'_0` and :math:`b'_0`.
 
-    Args:
-        closer: the closer looks.
-        chosen: `(N,)` boolean, the closer looks to fit to.
-        prior: model at the centre of the prior; None fits without.
-
-    Returns:
-        The model, without thresholds.
-
-    Raises:
-        DataError: fewer than two closer looks are chosen.
+    Shapes: chosen `(N,)`.
     """
     phi = closer.features[chosen].double()
     if len(phi) < 2:

@@ -25,21 +25,13 @@ _LIBRARIES = {"site-packages", "dist-packages"}
 
 @cache
 def package_digest() -> str:
-    """Compute a sha256 over all modules of the package; comments and docstrings do not count.
-
-    >>> len(package_digest())
-    64
-    """
+    """Compute a sha256 over all modules of the package; comments and docstrings do not count."""
     return _digest(Path(__file__).parents[1].rglob("*.py"))
 
 
 @cache
 def modules_digest(*modules: str) -> str:
-    """Compute a sha256 over modules of the package and every module of it that they import, directly or not.
-
-    >>> modules_digest("semfov.errors") == modules_digest("semfov.io.files")
-    False
-    """
+    """Compute a sha256 over modules of the package and every module of it that they import, directly or not."""
     return _digest(closure(modules, lambda name: name.partition(".")[0] == _PACKAGE))
 
 

@@ -69,15 +69,7 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Part:
-    """One fitted part of an agent.
-
-    Attributes:
-        file: its file in the folder; None where the part consists of settings only, or could not be fitted.
-        sha256: sha256 of the file.
-        used: whether the agent uses the part. Where it does not, it acts as an agent without this model.
-        why: the reason for that choice, in a sentence.
-        settings: JSON values that belong to the part in addition to its file.
-    """
+    """One fitted part of an agent."""
 
     file: str | None
     sha256: str | None

@@ -195,11 +195,7 @@ METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(other
 
 @dataclass(frozen=True)
 class Schema:
-    """Requirements of a whole file.
-
-    >>> schema = Schema({"weight": Field(("K", 2), low=0)}, {"classes": Array(Text(), "K")})
-    >>> schema.check({"weight": torch.ones(3, 2)}, {"classes": ["cat", "cup", "tv"]})
-    """
+    """Requirements of a whole file."""
 
     tensors: Mapping[str, Field]
     record: Mapping[str, Json] = field(default_factory=dict)
@@ -233,11 +229,7 @@ def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, larges
 
 
 def interval(low: float, high: float, above: float = -math.inf) -> str:
-    """Write a range in words.
-
-    >>> interval(0, 1), interval(-math.inf, 5, above=0)
-    ('numbers from 0 to 1', 'numbers above 0, up to 5')
-    """
+    """Write a range in words."""
     least, most = (f"{bound:,}" if isinstance(bound, int) else f"{bound:g}" for bound in (low, high))
     if above > -math.inf:
         return f"numbers above {above:g}" + (f", up to {most}" if high < math.inf else "")
@@ -257,11 +249,7 @@ def is_number(value: object, *, whole: bool = False) -> bool:
 
 
 def is_plain(text: str) -> bool:
-    """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs.
-
-    >>> is_plain("dining table"), is_plain("a" + chr(0)), is_plain(chr(0xD800))
-    (True, False, False)
-    """
+    """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs."""
     return not re.search("[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text)
 
 

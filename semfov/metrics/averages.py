@@ -10,16 +10,6 @@ def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
     r"""Standard error of the mean along one axis.
 
     .. math:: \mathrm{SE} = \sqrt{\frac{1}{n (n - 1)} \sum_i (x_i - \bar x)^2}
-
-    Args:
-        values: n numbers along `axis`, any shape.
-        axis: the axis to average over.
-
-    Returns:
-        The shape of `values` without `axis`; NaN where n is less than 2.
-
-    >>> standard_error(np.array([1.0, 3.0]))
-    array(1.)
     """
     values = np.asarray(values, dtype=np.float64)
     count = values.shape[axis]

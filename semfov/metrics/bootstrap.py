@@ -23,14 +23,7 @@ class Bootstrap:
 
     The difference of two figures of the same samples is paired.
 
-    Attributes:
-        value: `(...)`, the figures of all cases.
-        samples: `(B, ...)`, the figures of each sample; NaN where a sample has none.
-
-    >>> cases = torch.tensor([1.0, 3.0])
-    >>> drawn = Bootstrap.of(lambda index: cases[index].mean(), ["one", "other"])
-    >>> drawn.value, drawn.interval()
-    (tensor(2.), tensor([1., 3.]))
+    Shapes: samples `(B, ...)`.
     """
 
     value: Tensor

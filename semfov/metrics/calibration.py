@@ -15,11 +15,7 @@ _ROUNDING = 1e-3
 
 @dataclass(frozen=True)
 class Calibration:
-    """Scoring rules and calibration errors of a set of predictions.
-
-    >>> calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0])).count
-    2
-    """
+    """Scoring rules and calibration errors of a set of predictions."""
 
     count: int
     nll: float
@@ -31,10 +27,6 @@ class Calibration:
 
 def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Calibration:
     """Compute all measures of `Calibration` for predictions over K + 1 classes.
-
-    >>> figures = calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0]))
-    >>> figures.accuracy, round(figures.brier, 3)
-    (0.5, 0.37)
 
     Shapes: probabilities `(M, K+1)`, labels `(M,)`.
     """
@@ -83,9 +75,6 @@ def surprisal(probability: Tensor) -> Tensor:
     """Negative logarithm of probabilities, in nats.
 
     A probability that has underflowed to 0 counts as the smallest positive float32, so that the result stays finite.
-
-    >>> surprisal(torch.tensor([1.0, 0.5]))
-    tensor([-0.0000, 0.6931])
     """
     return -probability.clamp(min=torch.finfo(torch.float32).tiny).log()
 
@@ -95,16 +84,7 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
 
     .. math:: \sum_b \frac{n_b}{n} \, | \mathrm{acc}_b - \mathrm{conf}_b |
 
-    Args:
-        confidence: `(M,)`, predicted probabilities.
-        correct: `(M,)` boolean, whether the prediction came true.
-        bins: number of bins.
-
-    Returns:
-        The error, a float64 scalar from 0 to 1.
-
-    >>> calibration_error(torch.tensor([0.9, 0.9]), torch.tensor([True, False])).round(decimals=4)
-    tensor(0.4000, dtype=torch.float64)
+    Shapes: confidence `(M,)`, correct `(M,)`.
     """
     return _error_of(reliability(confidence, correct, bins))
 
@@ -116,17 +96,7 @@ def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000,
 
     .. math:: y_i \sim \mathrm{Bernoulli}(p_i)
 
-    Args:
-        confidence: `(M,)`, predicted probabilities p.
-        bins: number of bins.
-        samples: number of draws of all outcomes.
-        seed: random seed of the outcomes.
-
-    Returns:
-        `(samples,)`, float64, the errors.
-
-    >>> errors_by_chance(torch.tensor([1.0, 0.0])).max()
-    tensor(0., dtype=torch.float64)
+    Shapes: confidence `(M,)` → `(samples,)`.
     """
     p = _probabilities(confidence, "confidence").detach().cpu()
     generator = torch.Generator().manual_seed(seed)
@@ -148,11 +118,6 @@ def _error_of(bins: Tensor) -> Tensor:
 
 def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
     """Sums for a reliability diagram: what was predicted and what came true, by bin of confidence.
-
-    >>> reliability(torch.tensor([0.2, 0.9, 0.8]), torch.tensor([False, True, True]), 2)
-    tensor([[1.0000, 2.0000],
-            [0.2000, 1.7000],
-            [0.0000, 2.0000]], dtype=torch.float64)
 
     Shapes: confidence `(M,)`, correct `(M,)` → `(3, bins)`.
     """
@@ -181,15 +146,7 @@ class BinarySums:
     Where nearly all probabilities are small, the first of 15 equally wide bins holds nearly all predictions. It is
     therefore divided into 7 bins for reliability diagrams.
 
-    Attributes:
-        bins: `(3, 21)`, float64: number of predictions, sum of their probabilities, and number that came true, by bin
-            of probability.
-        surprisal: sum of negative log likelihoods, in nats.
-        square: sum of squared errors.
-
-    >>> sums = BinarySums.of(torch.tensor([0.9, 0.2]), torch.tensor([True, False]))
-    >>> (sums + sums).count, round(sums.brier, 3)
-    (4, 0.025)
+    Shapes: bins `(3, 21)`.
     """
 
     bins: Tensor

@@ -15,16 +15,7 @@ _Array = NDArray[np.float64]
 
 
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
-    """The classes that are correct for each cell: those of the objects whose boxes overlap it.
-
-    >>> import torch
-    >>> objects = Annotation(torch.tensor([[0.0, 0, 8, 8]]), torch.tensor([1]), torch.tensor([False]), (20, 10))
-    >>> answers_of(objects, Grid(2, 1, (20, 10)), components=3).int()
-    tensor([[0, 1, 0],
-            [0, 0, 0]], dtype=torch.int32)
-
-    Shapes: → `(X·Y, K+1)`.
-    """
+    """The classes that are correct for each cell: those of the objects whose boxes overlap it; → `(X·Y, K+1)`."""
     overlap = grid.footprint(annotation.boxes)
     classes = F.one_hot(annotation.labels, components)
     return overlap.T.float() @ classes.float() > 0
@@ -34,11 +25,6 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
     """Number of cells whose most probable class is that of an overlapping object.
 
     A cell where several classes are tied for the most probable one counts as wrong, so a cell without information does.
-
-    >>> import torch
-    >>> beta = torch.tensor([[[0.5, 0.7], [0.9, 0.1], [0.5, 0.5]]])
-    >>> count_right(beta, torch.tensor([[False, True]] * 3))
-    tensor([1])
 
     Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B,)`.
     """
@@ -60,9 +46,5 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
 
 
 def success_rate(right: Sequence[int], cells: int) -> _Array:
-    """Fraction of the cells with objects whose most probable class is correct, after each gaze shift.
-
-    >>> success_rate([1, 3, 4], 4)
-    array([0.25, 0.75, 1.  ])
-    """
+    """Fraction of the cells with objects whose most probable class is correct, after each gaze shift."""
     return np.asarray(right) / cells

@@ -27,9 +27,6 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
     .. math:: P(s_+ > s_-) + P(s_+ = s_-) / 2
 
-    >>> area_under_roc(torch.tensor([0.9, 0.4, 0.4, 0.1]), torch.tensor([True, True, False, False]))
-    0.875
-
     Shapes: score `(M,)`, present `(M,)`.
     """
     hit, miss = _cases(score, present)
@@ -40,9 +37,6 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
 def _threshold_for(absent: Tensor, share: float) -> float:
     """The lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
-
-    >>> _threshold_for(torch.tensor([0.1, 0.2, 0.3, 0.9]), 0.25) <= 0.31
-    True
 
     Shapes: absent `(M,)`.
     """
@@ -60,9 +54,6 @@ def _threshold_for(absent: Tensor, share: float) -> float:
 def hits_at(score: Tensor, present: Tensor, share: float) -> float:
     """Hit rate at a given false alarm rate: the fraction of the cases with the target that reach the threshold.
 
-    >>> hits_at(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]), 0.0)
-    0.5
-
     Shapes: score `(M,)`, present `(M,)`.
     """
     hit, miss = _cases(score, present)
@@ -71,9 +62,6 @@ def hits_at(score: Tensor, present: Tensor, share: float) -> float:
 
 def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
     """The receiver operating characteristic: false alarm rate and hit rate at every threshold.
-
-    >>> roc(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]))
-    ([0.0, 0.0, 0.5, 0.5, 1.0], [0.0, 0.5, 0.5, 1.0, 1.0])
 
     Shapes: score `(M,)`, present `(M,)`.
     """

@@ -11,9 +11,6 @@ _Array = NDArray[np.float64]
 def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> _Array:
     """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
 
-    >>> cumulative_performance(np.array([1, 3, -1, 1]), 3)
-    array([0.  , 0.5 , 0.5 , 0.75])
-
     Shapes: found_at `(..., episodes)` → `(..., shifts+1)`.
     """
     steps = np.arange(shifts + 1)
@@ -29,16 +26,7 @@ def random_search(targets: int, shifts: int, cells: int = 100) -> _Array:
 
     .. math:: P(n) = 1 - \binom{N - m}{n} \Big/ \binom{N}{n}
 
-    Args:
-        targets: number of target cells, m.
-        shifts: last gaze shift.
-        cells: number of cells of the grid.
-
-    Returns:
-        `(shifts+1,)`.
-
-    >>> random_search(1, 2, cells=5)
-    array([0.  , 0.25, 0.5 ])
+    Shapes: → `(shifts+1,)`.
     """
     others = cells - 1
     misses = [comb(others - targets, n) / comb(others, n) if n <= others else 0.0 for n in range(shifts + 1)]

@@ -176,9 +176,5 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
 
 
 def in_bytes(image: Tensor) -> Tensor:
-    """Convert pixels in [0, 1] to bytes, on the CPU.
-
-    >>> in_bytes(torch.tensor([0.0, 0.5, 1.0])).tolist()
-    [0, 128, 255]
-    """
+    """Convert pixels in [0, 1] to bytes, on the CPU."""
     return (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)

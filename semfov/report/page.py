@@ -143,12 +143,6 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
 def json_script(data: Any) -> str:
     r"""JSON text that is safe inside a script element.
 
-    Args:
-        data: JSON values.
-
-    Returns:
-        The text, in which `&`, `<` and `>` are escaped.
-
     >>> json_script({"class": "</script>"})
     '{"class":"\\u003c/script\\u003e"}'
     """

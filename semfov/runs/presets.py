@@ -116,11 +116,7 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
 
 
 def label(choice: PolicyChoice, task: Task) -> str:
-    """The name of a policy in tables: the preset that it is based on, and the settings that differ from it.
-
-    >>> label(PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre"), "search")
-    'non-predictive-raw, tempering 0.25, footprint box_centre'
-    """
+    """The name of a policy in tables: the preset that it is based on, and the settings that differ from it."""
     settings = resolve(choice, task)
     names = {
         preset: name

@@ -18,14 +18,6 @@ class WholeBar:
     """One bar for several stages of different duration, each of which consists of tasks.
 
     While it is open, `track` and `task_bar` move this bar instead of opening a bar for each task.
-
-    >>> with WholeBar("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
-    ...     with whole.stage("one"):
-    ...         _ = list(track(range(5), "half", "unit"))
-    ...         half = whole.done
-    ...     one = whole.done
-    >>> half, one
-    (0.25, 0.5)
     """
 
     def __init__(self, title: str, stages: Mapping[str, Mapping[str, float]]) -> None:

@@ -112,10 +112,7 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
 
 
 class DetectionStore(LookStore[Any, Detections]):
-    """Looks that consist of detections.
-
-    An action is a number, such as that of a cell, or the box of a closer look.
-    """
+    """Looks that consist of detections. An action is a number, such as that of a cell, or the box of a closer look."""
 
     width = 5
 

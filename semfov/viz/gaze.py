@@ -21,16 +21,7 @@ MASSES = (0.8, 0.5, 0.25)
 
 @styled
 def plot_gaze(prediction: GazePrediction, *, ax: Axes | None = None, scanpaths: Sequence[Fixations] = ()) -> Figure:
-    """Draw the density of fixations over the grey picture, its peaks in order, and scanpaths.
-
-    Args:
-        prediction: the prediction.
-        ax: axes to draw in; None makes a figure.
-        scanpaths: scanpaths to draw over it.
-
-    Returns:
-        The figure.
-    """
+    """Draw the density of fixations over the grey picture, its peaks in order, and scanpaths."""
     width, height = prediction.size
     figure, (axes,) = make_figure(1, 1, width=6.4, height=6.4 * height / width + 0.35, axes=only(ax))
     draw_image(axes, prediction.image, Grid(1, 1, prediction.size), grey=True)

@@ -13,9 +13,6 @@ def place_labels(
 ) -> list[LabelBox]:
     """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
 
-    >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
-    [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
-
     Shapes: sizes `(width, height)`, frame `(width, height)` → `(x1, y1, x2, y2)`.
     """
     placed: list[LabelBox] = list(obstacles)
@@ -41,10 +38,6 @@ def place_numbers(
 
     No number covers another number or another point. The first and the last point are placed first.
 
-    >>> first, second = place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
-    >>> first[2] <= second[0]
-    True
-
     Shapes: sizes `(width, height)`, frame `(width, height)`.
     """
     placed: list[LabelBox] = []
@@ -69,9 +62,6 @@ def place_within(
     """Rectangles for labels whose middle may be at any of several points: at the first free one.
 
     Where none is free, the label is moved down from the first point.
-
-    >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
-    [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
 
     Shapes: sizes `(width, height)`, frame `(width, height)`.
     """

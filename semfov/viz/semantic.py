@@ -137,11 +137,7 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
 
 
 def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
-    """Sides of cells that bound a region.
-
-    >>> len(borders(Grid(3, 2, (30, 20)), [0, 1]))
-    6
-    """
+    """Sides of cells that bound a region."""
     cells, edges = set(region), grid.edges.tolist()
     lines = []
     for cell in region:
@@ -186,13 +182,7 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
 
 
 def regions(labels: Tensor) -> list[list[int]]:
-    """Regions of cells that touch at a side and share a label other than 0.
-
-    >>> regions(torch.tensor([[1, 1, 0], [2, 1, 1]]))
-    [[0, 1, 4, 5], [3]]
-
-    Shapes: labels `(Y, X)`.
-    """
+    """Regions of cells that touch at a side and share a label other than 0; labels `(Y, X)`."""
     rows, columns = labels.shape
     flat, seen, groups = labels.flatten().tolist(), set[int](), []
     for first in range(len(flat)):

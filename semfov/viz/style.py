@@ -160,9 +160,6 @@ def overlay_colours() -> Colormap:
     r"""Colour map of probabilities over a photograph: transparent at 0, with opacity :math:`\alpha = 0.85 \sqrt{p}`.
 
     The square root makes small probabilities visible on a scale that ends at 1.
-
-    Returns:
-        A matplotlib colour map of 256 colours.
     """
     import numpy as np
     from matplotlib import colormaps

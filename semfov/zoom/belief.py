@@ -55,15 +55,7 @@ class ZoomBelief:
 
     Sums over windows (`WindowSums`) and log odds (`WindowOdds`) are kept, and computed anew where cells have changed.
 
-    Args:
-        lattice: lattice of the picture.
-        evidence: learned evidence. An explorer that looks for all objects needs its rates alone.
-        target: class 1..K, or 0 for any.
-
-    Attributes:
-        source: `(rows, columns)`, level of the closest look at each cell that has closer ones; -1 for none.
-        left: `(rows, columns)`, share of each cell that is left to see, 0 or 1.
-        gists: gists of the looks so far.
+    Shapes: source `(rows, columns)`, left `(rows, columns)`.
     """
 
     def __init__(self, lattice: Lattice, evidence: Rates, target: int) -> None:
@@ -236,11 +228,7 @@ class ZoomBelief:
 
         .. math:: p(w) = u(w) \, P(w)
 
-        Args:
-            level: level of the windows.
-
-        Returns:
-            `(down, across)`.
+        Shapes: → `(down, across)`.
         """
         probability: Cells = torch.from_numpy(self._level_odds(level)).sigmoid().numpy()
         return probability * self.unseen(level)

@@ -53,20 +53,6 @@ class Certainty:
         R = R_1 + w R_2, \qquad
         E[c] = \frac{k c_0 + F}{k + u W}, \qquad
         \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
-
-    Attributes:
-        offset: a.
-        weights: b, one for each of `FACTS`.
-        scale: :math:`c_0`, the mean scale in the pictures of the fit.
-        strength: k, the promised objects after which the looks of a picture count as much as the pictures of the fit.
-        faint: w, the share of what cells promise little that counts.
-        promise: u, the share of what looks promise that counts. Looks are made where it is highest by chance, too.
-
-    >>> certainty = Certainty.of([0.0, 1.0])
-    >>> certainty.probability(torch.eye(len(FACTS))[:2])
-    tensor([0.7311, 0.5000])
-    >>> Certainty.of([0.0, 1.0]).unseen((10.0, 4.0), promised=5.0, discoveries=3.0)
-    (0.0, 0.0)
     """
 
     offset: float

@@ -31,13 +31,6 @@ def closer_window(lattice: Lattice, box: Tensor) -> Window:
     magnification is at most one octave above that of the last level: pictures show no more beyond it. In a photograph
     it is twice as large, and at least 0.6 of the longer side: it shows other places, too.
 
-    >>> lattice = Lattice.over((2560, 1920), (416, 416))
-    >>> closer_window(lattice, torch.tensor([600.0, 600.0, 800.0, 700.0])).within
-    (400.0, 350.0, 1000.0, 950.0)
-    >>> x1, _, x2, _ = closer_window(lattice, torch.tensor([600.0, 600.0, 610.0, 620.0])).within
-    >>> x2 - x1, 416 / (2 * lattice.magnifications[-1])
-    (320.0, 320.0)
-
     Shapes: box `(4,)`.
     """
     context, least = _AROUND, PART
@@ -92,12 +85,6 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     In a stream the scores of earlier frames count less, and detections and examined places are forgotten when half of
     the evidence is left (`semfov.episode.Forgetting`).
-
-    Args:
-        target: class 1..K.
-        likely: probability from which on a place is examined at once: without closer looks the search would end with
-            `found`.
-        forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
     least = DETECTION_SCORE

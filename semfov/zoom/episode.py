@@ -108,25 +108,6 @@ def look_by_look(
     its evidence would fade at the rate r, or until the next look at its window. The window is then free again. The
     overview is renewed after as many frames. The episode has no end: where the order has no window left, the window
     that was looked at longest ago is looked at again.
-
-    Args:
-        glances: source of looks at the picture.
-        order: chooses the windows; those that it chooses together are looked at together.
-        belief: belief that every look updates; None keeps none.
-        ends: tells whether a look ends the episode.
-        hints: whether hints are needed in windows of the last level, too (`Glances.see`).
-        forgetting: forgetting between the frames of a stream; None for a picture, of which all looks count.
-
-    Yields:
-        Each turn.
-
-    Example::
-
-        def row_by_row(looks, windows):
-            return [(slices[len(looks) - 1], 0.0)] if len(looks) <= len(slices) else []
-
-        for turn in look_by_look(glances, row_by_row, None):
-            print(turn.glance.window)
     """
     recent, first = _Recent(belief, forgetting), overview(glances.lattice)
 

@@ -33,14 +33,7 @@ class Hints(NamedTuple):
 
 
 def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float = FAINT) -> Hints:
-    """Take the hints from all boxes of a detector's head.
-
-    >>> import torch
-    >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.001], [0.01], [0.9]]]))
-    >>> hints_of(found, 0, "residual").scores
-    tensor([[0.0100],
-            [0.9000]])
-    """
+    """Take the hints from all boxes of a detector's head."""
     confidence = candidates.confidence[image].detach()
     index = (confidence >= faint).nonzero()[:, 0]
     selected = candidates.take(image, index)

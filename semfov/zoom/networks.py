@@ -125,15 +125,6 @@ class Survey(nn.Module):
     The rate λ is a network over the hints about a cell. Which classes these are matters, because some come in numbers.
     The network therefore reads, besides the strongest hint, a few sums over the hints of all classes with learned
     weights, in the cell itself and averaged over its neighbours.
-
-    Args:
-        classes: number of classes of the detector, without background.
-        foresight: share of what still closer looks would find in a window that counts towards its value.
-
-    >>> survey = Survey(3)
-    >>> look = Gist(0, (0, 0), 1, torch.rand(8, 8, 3), torch.rand(8, 8), torch.zeros(8, 8, 3, dtype=torch.bool))
-    >>> survey.rates(look, torch.tensor([0])).shape
-    torch.Size([1, 3, 8, 8])
     """
 
     def __init__(self, classes: int, *, foresight: float = 0.35) -> None:

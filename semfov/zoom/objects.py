@@ -115,21 +115,7 @@ def fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Ten
     Solovyev, R., Wang, W. and Gabruseva, T. (2021), Weighted boxes fusion: ensembling boxes from different object
     detection models, Image and Vision Computing 107:104117.
 
-    Args:
-        index: `(M,)`, indices of the boxes that stand for objects.
-        boxes: `(L, 4)`, all boxes of all looks, in picture pixels.
-        scores: `(L,)`, their scores.
-        labels: `(L,)`, their classes.
-        cut: `(L,)`, boolean, boxes that the border of their window cuts. They count for nothing, and stay as they are.
-        magnifications: `(L,)`, of their looks.
-
-    Returns:
-        `(M, 4)`.
-
-    >>> boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 14], [50, 50, 60, 60]])
-    >>> scores, labels, whole = torch.tensor([0.6, 0.2, 0.9]), torch.ones(3), torch.zeros(3).bool()
-    >>> fused(torch.tensor([0]), boxes, scores, labels, whole, torch.ones(3))
-    tensor([[ 0.,  0., 10., 11.]])
+    Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, cut `(L,)`, magnifications `(L,)` → `(M, 4)`.
     """
     first, second, shared, area = overlapping(boxes.float().numpy())
     chosen, kinds, whole = index.numpy(), labels.numpy(), ~cut.numpy()

@@ -136,12 +136,7 @@ class WindowOdds:
 
     The hints s of each look count for the share u of their cell that is left to see.
 
-    Args:
-        lattice: lattice of the picture.
-        evidence: learned evidence.
-        target: class 1..K.
-        gists: gists of all looks so far, in their order; more may be appended.
-        left: `(rows, columns)`, u of the cells of the lattice, which may change.
+    Shapes: left `(rows, columns)`.
     """
 
     def __init__(

@@ -22,14 +22,6 @@ def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> 
 
     for windows w of all levels k but the first. The second term counts only cells that were not looked at from level k
     yet: a look at the other cells gives no new information about where to look more closely.
-
-    Args:
-        belief: belief about the objects that are looked for.
-        done: windows that were looked at.
-        foresight: κ, share of what looks one octave closer would find that counts.
-
-    Returns:
-        The window and its value; None if nothing is left to find.
     """
     lattice = belief.lattice
     best: WindowChoice | None = None

@@ -16,11 +16,7 @@ _OVERLAP = 0.2
 
 
 def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
-    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them.
-
-    >>> [window.within for window in slices(Lattice.over((900, 400), (416, 416)), 500, 0.2)]
-    [(0.0, 0.0, 500.0, 400.0), (400.0, 0.0, 900.0, 400.0)]
-    """
+    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
     return _squares(lattice, side, max(1, int(side * (1 - overlap))))
 
 
@@ -34,16 +30,6 @@ def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
 
     Zhang, H. et al. (2023), Adaptive slicing-aided hyper inference for small object detection in high-resolution remote
     sensing images, Remote Sensing 15(5):1249.
-
-    Args:
-        lattice: lattice of the picture.
-        overlap: share of a slice by which neighbours overlap.
-
-    Returns:
-        The slices, row by row: fewer than 4 × 3 or 3 × 2 where the picture is narrower than these.
-
-    >>> [len(adaptive_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1600, 1200), (3840, 600))]
-    [12, 6, 4]
     """
     many = max(lattice.size) > 512 * (4 - 3 * overlap) + 1
     counts = (4, 3) if many else (3, 2)
@@ -67,9 +53,6 @@ def usual_slices(lattice: Lattice) -> list[Window]:
 
     In a picture that is not four times as long as the canvas they have the largest magnification itself. A photograph
     has four, each 0.6 as long as its longer side.
-
-    >>> [len(usual_slices(Lattice.over(size, (416, 416)))) for size in ((3840, 2160), (1200, 900), (640, 480))]
-    [28, 6, 4]
     """
     if lattice.levels == 1:
         return slices(lattice, max(1, round(PART * max(lattice.size))), _OVERLAP)

@@ -25,21 +25,7 @@ class WindowSums:
     A sum along an axis is a product with a banded matrix. Only the windows that hold a cell which has changed are
     summed again. A window that reaches beyond the cells sums those that it holds.
 
-    Args:
-        weight: `(span,)`, r, weights of the cells along a side of a window.
-        shape: `(rows, columns)` of the cells.
-        cells: returns x in some rows and columns.
-
-    >>> x = np.arange(9, dtype=np.float32).reshape(3, 3)
-    >>> sums = WindowSums(np.ones(2, np.float32), (3, 3), x.__getitem__)
-    >>> sums.update()
-    array([[ 8., 12.],
-           [20., 24.]], dtype=float32)
-    >>> x[0, 0] = 5
-    >>> sums.mark((0, 0, 1, 1))
-    >>> sums.update()
-    array([[13., 12.],
-           [20., 24.]], dtype=float32)
+    Shapes: weight `(span,)`, shape `(rows, columns)`.
     """
 
     def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[Place], Cells]) -> None:
@@ -78,12 +64,6 @@ def union(box: Box, other: Box | None) -> Box:
 
 
 def extent(marked: NDArray[np.bool_]) -> Box:
-    """Find the smallest box that contains all marked cells.
-
-    >>> extent(np.array([[False, True, True], [False, False, True]]))
-    (1, 0, 3, 2)
-
-    Shapes: marked `(rows, columns)`.
-    """
+    """Find the smallest box that contains all marked cells; marked `(rows, columns)`."""
     rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

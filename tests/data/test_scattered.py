@@ -62,7 +62,7 @@ def test_whole_photographs_keep_all_their_objects():
     for index in range(len(pictures)):
         cutouts, told = pictures.cutouts(index), pictures.annotation(index)
         assert len(told.boxes) == 3 * len(cutouts)
-        assert len({cutout.index for cutout in cutouts}) == len(cutouts)
+        assert len({cutout.scene for cutout in cutouts}) == len(cutouts)
         assert {cutout.part for cutout in cutouts} <= {(0, 0, 200, 150)}
 
 

@@ -101,9 +101,6 @@ def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
 
     The centre of the first cell has coordinate 0 in cells. With cells of 50 pixels it is at 24.5 in pixels:
 
-    >>> _resized_points(np.array([[0.0, 1.0]]), (32, 24), (1600, 1200))
-    array([[24.5, 74.5]])
-
     Shapes: points `(n, 2)`, size `(width, height)`, new `(width, height)` → `(n, 2)`.
     """
     return np.asarray((points + 0.5) * (np.array(new) / np.array(size)) - 0.5)

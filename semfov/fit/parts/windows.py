@@ -202,7 +202,7 @@ def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: 
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
         photograph = np.repeat(
-            [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.index).boxes) for tile in tiles]
+            [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.scene).boxes) for tile in tiles]
         )
         np.add.at(there, photograph, 1)
         history: list[Glance] = []

@@ -19,17 +19,7 @@ def gaussian_kernel(sigma: float) -> Tensor:
     weights are computed by Kornia. The blur is not, because Kornia's takes more than twice as long on a CPU
     (`benchmarks.pyramid`).
 
-    Args:
-        sigma: σ in pixels, positive.
-
-    Returns:
-        `(2r+1,)`, float64, with sum 1.
-
-    Raises:
-        InputError: σ is not positive.
-
-    >>> gaussian_kernel(0.25)
-    tensor([3.3524e-04, 9.9933e-01, 3.3524e-04], dtype=torch.float64)
+    Shapes: → `(2r+1,)`.
     """
     check(sigma > 0, "sigma", "a positive number of pixels", sigma)
     # Imported when first needed: Kornia takes a quarter of a second.
@@ -40,9 +30,6 @@ def gaussian_kernel(sigma: float) -> Tensor:
 
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
     """Blur with a Gaussian, where the border pixels are repeated: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
-
-    >>> gaussian_blur(torch.ones(1, 3, 5, 7), 2.0, halve=True).shape
-    torch.Size([1, 3, 2, 3])
 
     Shapes: image `(B, C, H, W)` → `(B, C, H, W)`.
     """
@@ -55,9 +42,6 @@ def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Enlarge an image by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
-
-    >>> enlarge(torch.rand(1, 2, 3), (4, 5)).shape
-    torch.Size([1, 4, 5])
 
     Shapes: image `(..., h, w)`, size `(height, width)` → `(..., height, width)`.
     """

@@ -17,9 +17,6 @@ def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion =
 
     Fusion within and then across features gives the same result, because all features have the same number of maps.
 
-    >>> combine_maps([torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 3)], (4, 6)).mean()
-    tensor(0.5000)
-
     Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
     """
     lookup(fusion, get_args(Fusion), "fusion")
@@ -34,14 +31,7 @@ def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion =
 
 
 def rescale(saliency: Tensor, flat: float = 0.0) -> Tensor:
-    """Shift and scale maps to [0, 1].
-
-    >>> rescale(torch.tensor([[1.0, 3.0], [2.0, 1.0]]))
-    tensor([[0.0000, 1.0000],
-            [0.5000, 0.0000]])
-
-    Shapes: saliency `(..., H, W)`.
-    """
+    """Shift and scale maps to [0, 1]; saliency `(..., H, W)`."""
     low, high = saliency.amin((-2, -1), keepdim=True), saliency.amax((-2, -1), keepdim=True)
     span = high - low
     # Division by infinity sets a flat map to 0, and its gradient too.

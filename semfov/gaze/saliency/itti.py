@@ -30,13 +30,7 @@ _FLAT = 32
 
 
 def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
-    """Dyadic Gaussian pyramid (`cv2.pyrDown`).
-
-    >>> [tuple(level.shape[-2:]) for level in _dyadic_pyramid(torch.rand(1, 3, 9, 12), 3)]
-    [(9, 12), (5, 6), (3, 3), (2, 2)]
-
-    Shapes: channels `(B, C, H, W)`.
-    """
+    """Dyadic Gaussian pyramid (`cv2.pyrDown`); channels `(B, C, H, W)`."""
     check(levels >= 0, "levels", "0 or more", levels)
     pyramid = [channels]
     for _ in range(levels):
@@ -53,14 +47,7 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     The mean is subtracted, and the absolute values are scaled to sum to 1. At 0° the wave runs along x, and vertical
     bars give the largest response.
 
-    Args:
-        orientations: angles θ in degrees, with y pointing down.
-
-    Returns:
-        `(2n, 9, 9)` for n angles, float64, the even and the odd filter of each in turn.
-
-    >>> _gabor_kernels([0.0]).shape
-    torch.Size([2, 9, 9])
+    Shapes: → `(2n, 9, 9)`.
     """
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
     y, x = place[:, None], place[None, :]
@@ -74,9 +61,6 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
 
 def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
-
-    >>> _orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
-    tensor(3)
 
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
@@ -102,14 +86,7 @@ def _promote(maps: Tensor) -> Tensor:
     maximum exceeds 0.1 and is no less than its eight neighbours; of equal neighbours the first counts. A map whose
     range is no more than the rounding errors of values up to 1 becomes 0.
 
-    Args:
-        maps: `(..., h, w)`, each normalised alone.
-
-    Returns:
-        The same shape, from 0 to 1.
-
-    >>> _promote(torch.tensor([[4.0, 0.0, 0.0, 2.0]]))
-    tensor([[0.2500, 0.0000, 0.0000, 0.1250]])
+    Shapes: maps `(..., h, w)`.
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
     peaks = local_maxima(maps) & (maps > _PEAK)
@@ -121,10 +98,6 @@ def _promote(maps: Tensor) -> Tensor:
 
 def local_maxima(maps: Tensor) -> Tensor:
     """Local maxima: pixels above their earlier neighbours and no less than their later ones, in row-major order.
-
-    >>> local_maxima(torch.tensor([[1.0, 3.0, 3.0], [0.0, 2.0, 1.0]])).int()
-    tensor([[0, 1, 0],
-            [0, 0, 0]], dtype=torch.int32)
 
     Shapes: maps `(..., h, w)`.
     """
@@ -150,11 +123,7 @@ def conspicuity(image: Tensor) -> Tensor:
     Koch and Niebur has G - R in the surround. Taken literally, it responds most to a uniform colour, while their text
     means the contrast. The same holds for B - Y and their equation 3.
 
-    Args:
-        image: `(B, 3, H, W)`, RGB in [0, 1].
-
-    Returns:
-        `(B, 3, h, w)`.
+    Shapes: image `(B, 3, H, W)` → `(B, 3, h, w)`.
     """
     levels = max(CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)

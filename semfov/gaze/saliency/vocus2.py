@@ -38,21 +38,7 @@ def _twin_pyramids(
 
     Scale S of a layer has twice the blur of scale 0, and every second pixel of it is scale 0 of the next layer.
 
-    Args:
-        channels: `(B, C, H, W)`.
-        centre_sigma: :math:`\sigma_c` in pixels of a layer.
-        surround_sigma: :math:`\sigma_s`, larger than `centre_sigma`.
-        layers: number of layers; fewer where the shorter side of the image cannot be halved so often.
-        scales: number of scales of a layer, S.
-
-    Returns:
-        For each layer a list of its scales.
-
-    Raises:
-        InputError: the channels are empty or of another shape, or a setting is out of range.
-
-    >>> [len(layer) for layer in _twin_pyramids(torch.rand(1, 3, 9, 20))]
-    [2, 2, 2, 2]
+    Shapes: channels `(B, C, H, W)`.
     """
     check_shape(channels, "channels", None, None, None, None)
     check(min(channels.shape[-2:]) > 0, "channels", "at least one pixel", tuple(channels.shape))

@@ -67,9 +67,6 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
     """The clusters of `cluster_labels` as a fitted `sklearn.cluster.MeanShift`, to label fixations more than once.
 
-    >>> len(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5).cluster_centers_)
-    2
-
     Shapes: others `(m, 2)`.
     """
     try:
