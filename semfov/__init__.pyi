@@ -21,6 +21,7 @@ from .belief import MapEvidence as MapEvidence
 from .belief import TargetEvidence as TargetEvidence
 from .belief import fusion as fusion
 from .belief import observers as observers
+from .cli.search import run as run
 from .data import EmbeddedScenes as EmbeddedScenes
 from .data import as_image as as_image
 from .data import read_image as read_image

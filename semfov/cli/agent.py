@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+import torch
 
 from semfov.agent import ActivePerception
 from semfov.cli.options import AgentOptions
 from semfov.data.classes import class_index
-from semfov.detection.load import check_detector, detector_name
+from semfov.detection.load import check_detector, class_lines, detector_name
 from semfov.detection.weights import WEIGHTS
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import SENSORS
@@ -18,9 +21,14 @@ from semfov.sensor.named import SENSORS
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     """Names of the detector's classes, or None where they are known only after it is loaded."""
+    check_device(options.device)
     if options.models is not None:
         return Manifest.read(options.models).classes
     classes, weights = check_detector(options.detector), options.weights
+    given = _class_names(options)
+    named = f"none for {options.detector}, which has its own; --target names the class to look for"
+    check(given is None or classes is None, "classes", named, given and ", ".join(given))
+    classes = classes or given
     own = WEIGHTS.get(detector_name(options.detector))
     mixed = weights is not None and weights.suffix == ".onnx" and own is not None and not own.file.endswith(".onnx")
     expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
@@ -28,9 +36,39 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     return classes
 
 
+def _class_names(options: AgentOptions) -> tuple[str, ...] | None:
+    """The class names of `--classes`: words, or the lines of a text file."""
+    names = options.classes
+    return class_lines(names[0]) if names is not None and len(names) == 1 and Path(names[0]).is_file() else names
+
+
 def make_agent(options: AgentOptions) -> ActivePerception:
-    """The agent that the options name."""
-    loaded: dict[str, Any] = {} if options.weights is None else {"weights": options.weights}
+    """The agent that the options name, on the device that they name."""
+    device = options.device
+    agent = _load_agent(options, {} if device is None else {"device": device})
+    if options.half:
+        name = agent.eye.detector.settings()["name"]
+        check(
+            any(True for _ in agent.eye.detector.parameters()), "half", "a detector of PyTorch", f"{name}, an ONNX file"
+        )
+        agent = agent.half()
+    return agent if device is None else agent.to(device)
+
+
+def check_device(name: str | None) -> str | None:
+    """The name of a device, which PyTorch must have."""
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError):
+        have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
+        raise InputError(f"device: expected one that PyTorch has here ({', '.join(have)}), got {name!r}") from None
+    return name
+
+
+def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
+    """The agent that the options name, with further options of `load_detector`."""
+    given = {"weights": options.weights, "classes": _class_names(options)}
+    loaded |= {name: value for name, value in given.items() if value is not None}
     if options.models is not None:
         check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
         moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}

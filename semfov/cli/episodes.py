@@ -51,9 +51,13 @@ class PictureJob(ABC):
 
     def __init__(self, options: Any) -> None:
         self.options: Any = options
-        sources = picture_sources(options.pictures)
-        self.several = len(sources) > 1
-        self._sources = sources
+        self._sources = picture_sources(options.pictures, recursive=options.recursive)
+        self.several = len(self._sources) > 1
+        for name in ("crops", "labels"):
+            places = Counter(str(source.place.with_suffix("")) for source in self._sources)
+            again = [place for place, times in places.items() if times > 1]
+            expected = f"pictures of different names with --{name}, whose files have their names"
+            check(not again or getattr(options, name) is None, name, expected, ", ".join(again[:3]))
 
     @property
     def sources(self) -> list[PictureSource]:
@@ -134,6 +138,7 @@ class _PictureFiles:
     folder: Path | None = None
     written: list[Path] = field(default_factory=list)
     episodes: dict[int, dict[str, Any]] = field(default_factory=dict)
+    rows: dict[int, dict[str, Any]] = field(default_factory=dict)
     finished: SceneResults | None = None
 
     def __post_init__(self) -> None:
@@ -161,8 +166,11 @@ class _PictureFiles:
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""
-        if self.results is not None and outcome.row is not None:
+        self.rows[number] = outcome.row["picture"]
+        if self.results is not None:
             self.results.add(number, outcome.row)
+        for path, content in outcome.files.items():
+            write_bytes(path, content)
         if self.folder is not None:
             name = Path(self.job.sources[number].name).name
             folder = self.folder / f"{number:03d}-{plain_name(name)}" if self.job.several else self.folder
@@ -174,6 +182,12 @@ class _PictureFiles:
         if self.finished is not None and not before:
             self.finished.save(number, [outcome.values()], {})
 
+    def skip(self, number: int, reason: str) -> None:
+        """Note a picture that could not be read, and the reason."""
+        self.rows[number] = {"picture": self.job.sources[number].name, "error": reason}
+        if self.results is not None:
+            self.results.skip(number, self.rows[number]["picture"], reason)
+
     def finish(self, *, complete: bool) -> None:
         """Write the results and the page of all pictures so far, and list what was written."""
         written = self.written
@@ -183,17 +197,25 @@ class _PictureFiles:
         if self.episodes:
             episodes = [self.episodes[number] for number in sorted(self.episodes)]
             written = [*written, write_page(self.job.options.report, f"semfov: {self.job.title}", episodes)]
+        options = self.job.options
+        written = [*written, *(folder for folder in (options.crops, options.labels) if folder is not None)]
         if written:
             print("written:", *(f"  {path}" for path in written), sep="\n")
-        if complete and self.finished is not None:
+        if self.finished is None:
+            return
+        if complete:
             shutil.rmtree(self.finished.folder.parent, ignore_errors=True)
+        else:
+            count = f"{len(self.rows)} of {len(self.job.sources)} pictures were looked at"
+            print(f"{count}; the same command continues", file=sys.stderr)
 
 
-def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
+def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream.
 
-    A picture that cannot be read is reported and left out, unless it is the only one. With a file of results, a command
-    that was stopped continues.
+    Returns the entry of each picture in a file of results, or its `error`, in the order of the pictures. A picture that
+    cannot be read is reported and left out, unless it is the only one. With a file of results, a command that was
+    stopped continues.
     """
     wanted = job.options.draw or ()
     for source in job.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
@@ -206,7 +228,7 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")
     outputs = _PictureFiles(job, stream)
-    skipped, complete, endings = 0, False, Counter[str]()
+    complete, endings = False, Counter[str]()
     before = outputs.before()
     if before:
         print(f"continuing: {len(before)} of {len(sources)} pictures were looked at before")
@@ -217,10 +239,8 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
                 # A wrong argument is not the fault of a picture.
                 if not several or (isinstance(outcome, InputError) and not endings):
                     raise outcome
-                skipped += 1
                 tqdm.write(f"skipped {name}: {outcome}", file=sys.stderr)
-                if outputs.results is not None:
-                    outputs.results.skip(number, name, str(outcome))
+                outputs.skip(number, str(outcome))
                 continue
             outputs.add(number, outcome, before=number in before)
             endings[outcome.ended] += 1
@@ -228,12 +248,13 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> int:
                 tqdm.write(outcome.text, file=sys.stdout)
         complete = True
     finally:
-        if endings or skipped:
+        if outputs.rows:
             outputs.finish(complete=complete)
+    skipped = len(sources) - endings.total()
     if several:
         counts = ", ".join(f"{count} {name}" for name, count in endings.items())
         print(f"{len(sources)} pictures: {counts}{f'; {skipped} skipped' if skipped else ''}")
-    return 1 if skipped else 0
+    return [outputs.rows[number] for number in range(len(sources))]
 
 
 def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tuple[int, PictureOutcome | SemfovError]]:
@@ -251,6 +272,7 @@ def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tu
         settings=(type(job), job.options),
         title="pictures",
         unit="picture",
+        hidden=job.options.quiet,
     )
     with closing(done):
         yield from done

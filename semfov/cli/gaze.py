@@ -8,6 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from semfov.cli.agent import check_device
 from semfov.cli.options import GazeOptions
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
@@ -26,7 +27,7 @@ _DENSITIES = (".npy", ".tif", ".tiff", ".png")
 
 def predict_gaze(options: GazeOptions) -> int:
     """Predict where people look in all pictures; returns the exit code, 1 if a picture was left out."""
-    sources = picture_sources(options.pictures)
+    sources = picture_sources(options.pictures, recursive=options.recursive)
     kind = None if options.out is None or options.out.is_dir() else options.out.suffix.lower()
     check(kind in (None, "", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", options.out)
     check(
@@ -35,7 +36,8 @@ def predict_gaze(options: GazeOptions) -> int:
     if options.report is not None:
         check_writable(page_path(options.report))
     check_detector(options.detector)
-    loaded: dict[str, Any] = {} if options.weights is None else {"weights": options.weights}
+    given = {"weights": options.weights, "device": check_device(options.device)}
+    loaded: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     detector = load_detector(options.detector, **loaded)
     if not sources:
         print("no picture was given: looking at an embedded scene")

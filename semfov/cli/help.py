@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 OVERVIEW = """\
 semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
@@ -26,12 +26,13 @@ Commands:
   detectors   list detectors, or the classes of one
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
+`eval "$(semfov completion bash)"` lets the shell complete commands and options (also zsh and fish).
 Without a picture, search, find, explore and gaze take an embedded scene, so `semfov search --target cup` tries it out.
 """
 
 _AGENT = """\
   --detector NAME      yolov3-tiny (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
-  --models FOLDER      models of your own detector, which semfov fit made
+  --models FOLDER      models of your own detector, from semfov fit; --classes cat,dog: names that its file lacks
   --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
 
 _LOOKS = """\
@@ -43,12 +44,12 @@ _OUTPUT = """\
   --out FILE           .json, .jsonl, .csv, .geojson, or for COCO .coco.json, written as it runs; - is standard output
   --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
                        also views,belief, and in a search belief_bars
-  --report PAGE.html   a page in which to step through the looks; --looks prints them
-  --quiet              errors and warnings alone
-  --workers N          processes that look at several pictures; --scheduler tcp://HOST:8786 for those of a Dask cluster
+  --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: errors alone
+  --crops FOLDER       what the box of each object shows, as JPEG; --labels FOLDER: labels in the format of YOLO
+  --workers N          processes (--scheduler tcp://HOST:8786: of a Dask cluster); --device cuda; --half: 16 bits
 
-A picture of several that cannot be read is reported and skipped; the exit code is then 1. If the command is stopped,
-the same command continues with the pictures that are left. --help-all: all options."""
+A picture of several that cannot be read is reported and skipped; the exit code is then 1. If a command with --out is
+stopped, the same command continues with the pictures that are left. --help-all: all options."""
 
 HELP = {
     "search": f"""\
@@ -61,7 +62,7 @@ semfov search: is it there, and where?
 
 usage: semfov search [PICTURE ...] --target CLASS [options]
 
-  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
   --target CLASS       class to search for (semfov detectors NAME lists them)
   --embeddings FILE    word vectors; the target may then be a description, such as "something to drink from"
 {_AGENT}
@@ -82,7 +83,7 @@ semfov find: all objects, and how many
 
 usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 
-  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
   --target CLASSES     a class, or several with commas (default: all classes)
 {_AGENT}
 {_LOOKS}
@@ -101,7 +102,7 @@ semfov explore: what is where
 
 usage: semfov explore [PICTURE ...] [options]
 
-  PICTURE              photographs or large pictures of any size, or folders of them (none: an embedded scene)
+  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
 {_AGENT}
 {_LOOKS}
   --worth N            a look is worth a pass if it is expected to name this many more cells right, or in a large
@@ -194,6 +195,67 @@ shipped models runs with --agent raw, or after semfov fit.
 }
 """The help of each subcommand: one screen."""
 
+SYNONYMS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("conf", "confidence", "conf_thres", "threshold", "score"), ("least", "confirm")),
+    **dict.fromkeys(("class", "label", "query"), ("target",)),
+    **dict.fromkeys(("model", "yolo"), ("detector",)),
+    **dict.fromkeys(("gpu", "cuda"), ("device",)),
+    **dict.fromkeys(("fp16", "float16"), ("half",)),
+    **dict.fromkeys(("output", "save", "csv", "json", "project"), ("out",)),
+    **dict.fromkeys(("html", "page"), ("report",)),
+    **dict.fromkeys(("save_crop", "save_crops", "crop"), ("crops",)),
+    **dict.fromkeys(("save_txt", "txt", "label_dir", "yolo_labels"), ("labels",)),
+    **dict.fromkeys(("max_passes", "steps"), ("passes",)),
+    **dict.fromkeys(("max_shifts", "fixations", "saccades"), ("shifts",)),
+    **dict.fromkeys(("time", "timeout", "max_seconds"), ("seconds",)),
+    **dict.fromkeys(("jobs", "processes", "num_workers", "threads"), ("workers",)),
+    **dict.fromkeys(("verbose", "silent"), ("quiet",)),
+    **dict.fromkeys(("batch_size",), ("batch",)),
+    **dict.fromkeys(("names",), ("classes",)),
+}
+"""Words that other programs have for an option, and what it may be here."""
+
+_SHELLS = {
+    "bash": """\
+_semfov() {{
+  local words=""
+  case "${{COMP_WORDS[1]}}" in
+{cases}
+  esac
+  if [ "$COMP_CWORD" -eq 1 ]; then words="{commands}"; fi
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o bashdefault -o default -F _semfov semfov
+""",
+    "fish": """\
+complete -c semfov -n __fish_use_subcommand -a "{commands}"
+{lines}
+""",
+}
+"""Scripts of shells that complete commands and options; that of zsh is that of bash."""
+
+
+def completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
+    """The script with which a shell completes the command, from the options of each subcommand.
+
+    >>> print(completion("fish", {"find": ["give_up"]}), end="")
+    complete -c semfov -n __fish_use_subcommand -a "find"
+    complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up
+    """
+    script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
+    if script is None:
+        return 'usage: semfov completion bash|zsh|fish, for example: eval "$(semfov completion bash)"\n'
+    named = {name: [each.replace("_", "-") for each in several] for name, several in options.items()}
+    cases = "\n".join(f'    {name}) words="{" ".join(f"--{each}" for each in some)}";;' for name, some in named.items())
+    lines = "\n".join(
+        f'complete -c semfov -n "__fish_seen_subcommand_from {name}" -l {each}'
+        for name, some in named.items()
+        for each in some
+    )
+    start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
+    return start + script.format(cases=cases, commands=" ".join(named), lines=lines)
+
+
 _COMMANDS = {
     "agent.classes lists": "`semfov detectors NAME` lists",
     "ActivePerception.from_pretrained('mymodels')": "--models mymodels",
@@ -212,13 +274,16 @@ def in_command_words(message: str, options: Iterable[str]) -> str:
     'use --how windows or --give-up 0.1, or `semfov find`'
     >>> in_command_words("give its path as weights=", ["weights"])
     'give its path as --weights'
+    >>> in_command_words("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"])
+    '--recursive, or --detector.classes cat,dog'
     """
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)
-    names = "|".join(map(re.escape, options))
+    by_name = {name.rpartition(".")[2]: name for name in options}
+    names = "|".join(map(re.escape, by_name))
 
     def option(match: re.Match[str]) -> str:
-        value = (match[2] or "").strip("'\"")
-        return f"--{match[1].replace('_', '-')}{' ' if value else ''}{value}"
+        value = (match[2] or "").strip("'\"").removeprefix("True")
+        return f"--{by_name[match[1]].replace('_', '-')}{' ' if value else ''}{value}"
 
     return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

@@ -92,16 +92,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command_line[:1] == ["help"]:
         command_line = [*command_line[1:2], "--help"]
     name, *rest = command_line or ["--help"]
-    if name in ("--version", "-V"):
-        print(f"semfov {__version__}")
+    text = _text(name, rest)
+    if text is not None:
+        print(text, end="")
         return 0
-    if name in ("--help", "-h", "--help-all"):
-        print(texts.OVERVIEW, end="")
-        return 0
-    if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
-        print(texts.HELP[name], end="")
-        return 0
-    refused = _of_other_commands(name, rest) if name in _SUBCOMMANDS else _unknown(name)
+    refused = _of_others(name, rest) if name in _SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
@@ -112,10 +107,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         usage = texts.HELP[name].partition("\nusage:")[0]
         make_parser(options, usage, positional, program).print_help()
         return 0
-    words = partial(texts.in_command_words, options=[field.name for field in fields(options)])
+    dotted = ["detector.classes"] if name == "fit" else []
+    words = partial(texts.in_command_words, options=[*dotted, *(field.name for field in fields(options))])
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": GOES_ON if name == "fit" else ""}
     with _plain_warnings(words):
         return run_command(partial(_run, name), options, texts.HELP[name], rest, words=words, **names)
+
+
+def _text(name: str, rest: Sequence[str]) -> str | None:
+    """The text of a command line that asks for one: the version, help, or the script of a shell."""
+    if name in ("--version", "-V", "version"):
+        return f"semfov {__version__}\n"
+    if name in ("--help", "-h", "--help-all"):
+        return texts.OVERVIEW
+    if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
+        return texts.HELP[name]
+    if name == "completion":
+        return texts.completion(rest[0] if rest else None, {each: _option_names(each) for each in _SUBCOMMANDS})
+    return None
 
 
 def _unknown(name: str) -> str:
@@ -129,13 +138,21 @@ def _unknown(name: str) -> str:
     return f"unknown command {name!r}; {hint}"
 
 
-def _of_other_commands(own: str, rest: Sequence[str]) -> str | None:
-    """What to say about an option that only other subcommands have; None if there is none."""
+def _option_names(name: str) -> list[str]:
+    """Names of the options of a subcommand, without the positional one."""
+    return [field.name for field in fields(options_of(name)) if field.name != _SUBCOMMANDS[name][0]]
+
+
+def _of_others(own: str, rest: Sequence[str]) -> str | None:
+    """What to say about an option that other subcommands or other programs have; None if there is none."""
     if own not in _LOOKING:
         return None
-    names = {each: {field.name for field in fields(options_of(each))} - {_SUBCOMMANDS[each][0]} for each in _LOOKING}
+    names = {each: set(_option_names(each)) for each in _LOOKING}
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
+        meant = next((each for each in texts.SYNONYMS.get(option, ()) if each in names[own]), None)
+        if meant is not None and option not in names[own]:
+            return f"unknown option --{option.replace('_', '-')}; did you mean --{meant.replace('_', '-')}?"
         having = [each for each in _LOOKING if option in names[each] - names[own]]
         if having:
             return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"

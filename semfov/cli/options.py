@@ -35,6 +35,10 @@ class AgentOptions(Settings):
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
         weights: file of the weights, for a detector that is a `.cfg` file or whose weights are not downloaded.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
+        classes: names of the detector's classes in the order of its scores, for a detector whose file does not hold
+            them, or a text file with a name a line.
+        device: where the detector runs, such as `cuda` or `cuda:1` (none: the processor).
+        half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
         seed: seed of the random start, of ties and of the embedded scene.
@@ -45,6 +49,9 @@ class AgentOptions(Settings):
     detector: str = "yolov3-tiny"
     weights: Path | None = None
     models: Path | None = None
+    classes: tuple[str, ...] | None = None
+    device: str | None = None
+    half: bool = False
     sensor: SensorName | None = None
     start: str | None = None
     seed: Seed = 0
@@ -56,7 +63,8 @@ class PictureOptions(AgentOptions):
     """Looks at pictures, and what is written of them.
 
     Args:
-        pictures: photographs, large pictures, or folders of them (none: an embedded scene).
+        pictures: photographs, large pictures, folders of them, or patterns of names (none: an embedded scene).
+        recursive: also take the photographs of the folders in a folder.
         how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
             in front of the viewer), or `auto` for what suits the picture.
         passes: largest number of passes of the detector, closer looks included (none: 24 for windows, 40 for a head).
@@ -70,12 +78,15 @@ class PictureOptions(AgentOptions):
             if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are
             written into a folder of its name.
         report: HTML page to write, in which to step through the looks.
+        crops: folder for what the box of each object shows, as JPEG, with a folder for each class.
+        labels: folder for labels in the format of YOLO, a text file for each picture (`semfov.paths.Record.to_yolo`).
         looks: print every look.
         workers: number of processes that look at several pictures (each takes the memory of a detector).
         scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     pictures: tuple[str, ...] = ()
+    recursive: bool = False
     how: How = "auto"
     passes: Annotated[int, Range(1, MOST_PASSES)] | None = None
     shifts: Shifts | None = None
@@ -84,6 +95,8 @@ class PictureOptions(AgentOptions):
     out: Path | None = None
     draw: tuple[Drawing, ...] | None = None
     report: Path | None = None
+    crops: Path | None = None
+    labels: Path | None = None
     looks: bool = False
     workers: Workers = 1
     scheduler: str | None = None
@@ -186,9 +199,11 @@ class GazeOptions(Settings):
     """Predict where people look.
 
     Args:
-        pictures: photographs, or folders of them (none: an embedded scene).
+        pictures: photographs, folders of them, or patterns of names (none: an embedded scene).
+        recursive: also take the photographs of the folders in a folder.
         detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
         weights: file of the weights, for a detector whose weights are not downloaded.
+        device: where the detector runs, such as `cuda` (none: the processor).
         people: number of viewers whose scanpaths are drawn.
         seconds: time in seconds for which each views a picture.
         seed: seed of all draws.
@@ -199,8 +214,10 @@ class GazeOptions(Settings):
     """
 
     pictures: tuple[str, ...] = ()
+    recursive: bool = False
     detector: str = AgentOptions.detector
     weights: Path | None = None
+    device: str | None = None
     people: Annotated[int, Range(1, 1000)] = 15
     seconds: Annotated[float, Range(0.1, 60)] = 3.0
     seed: Seed = 0

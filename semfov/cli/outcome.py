@@ -13,8 +13,9 @@ from torch import Tensor
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of, result_row
 from semfov.cli.sources import PictureSource
-from semfov.cli.text import looks_text, outcome_text
+from semfov.cli.text import looks_text, outcome_text, plain_name
 from semfov.paths import GazeRecord, Scanpath
+from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief_bars, plot_belief_strip
 from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.semantic import plot_semantic_map
@@ -23,17 +24,21 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class PictureOutcome:
-    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), and figures."""
+    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), figures, and other files.
+
+    Figures lie in the folder of the picture, `files` where their paths say.
+    """
 
     ended: str
     text: str
-    row: dict[str, Any] | None = None
+    row: dict[str, Any]
     episode: dict[str, Any] | None = None
     names: tuple[str, ...] = ()
     figures: Mapping[str, bytes] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
     def values(self) -> dict[str, Any]:
-        """The JSON values, from which `PictureOutcome(**values)` makes the outcome again without its figures."""
+        """The JSON values, from which `PictureOutcome(**values)` makes the outcome again without its files."""
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
@@ -44,9 +49,9 @@ def picture_outcome(
     usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
     drawings = usual if options.draw is None else options.draw
     text = outcome_text(record, source.name, seconds)
-    row = episode = None
-    if options.out is not None:
-        row = result_row(record, source.name, seconds, kind_of(options.out), source.file)
+    episode = None
+    kind = None if options.out is None else kind_of(options.out)
+    row = result_row(record, source.name, seconds, kind, source.file)
     if options.report is not None:
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.
@@ -61,7 +66,21 @@ def picture_outcome(
         episode=episode,
         names=tuple(figures),
         figures=figures,
+        files=_cut_files(record, source, options),
     )
+
+
+def _cut_files(record: GazeRecord, source: PictureSource, options: PictureOptions) -> dict[str, bytes]:
+    """Labels in YOLO's format, and a JPEG of each object; a picture keeps its place in the folder that was named."""
+    files = {}
+    if options.labels is not None:
+        files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
+    if options.crops is not None:
+        crops = record.crops(source.file if source.scene is None else source.scene.image)
+        for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
+            folder = options.crops / plain_name(record.classes[label]) / source.place.parent
+            files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
+    return files
 
 
 def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

@@ -25,7 +25,8 @@ STDOUT = Path("-")
 
 _DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", "x1", "y1", "x2", "y2", "passes", "seconds")
 
-_OBJECTS = ("picture", "width", "height", *COLUMNS, "expected", "expected_error")
+_EXPECTED = ("expected", "expected_error")
+_OBJECTS = ("picture", "width", "height", *COLUMNS, *_EXPECTED)
 
 
 def kind_of(path: Path) -> str | None:
@@ -137,7 +138,8 @@ class ResultsFile:
 
     def _csv(self, pictures: list[dict[str, Any]]) -> str:
         rows = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
-        columns = _DECISIONS if self.searched else _OBJECTS
+        turned = ("pan", "tilt") if any("pan" in row for row in rows) else ()
+        columns = _DECISIONS if self.searched else (*_OBJECTS, *turned)
         return csv_text([columns, *([row.get(name) for name in columns] for row in rows)])
 
 
@@ -149,7 +151,7 @@ def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
     whole = {name: picture[name] for name in ("picture", "width", "height")}
     numbers = picture["expected"], picture["expected_error"]
     return [
-        {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_OBJECTS[-2:], numbers, strict=True)}}
+        {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
         for row in [*rows, *({"class": name} for name in missing)]
     ]
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any, TextIO, get_args
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, redirect_stdout, suppress
+from dataclasses import fields
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, Literal, TextIO, get_args
 
+from semfov.agent import ActivePerception
 from semfov.agents.picture import PictureLike
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
@@ -15,7 +20,7 @@ from semfov.cli.results import STDOUT, kind_of
 from semfov.cli.sources import PictureSource, start_beside
 from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, check_options, lookup
 from semfov.io.files import check_writable
 from semfov.paths import GazeRecord
 from semfov.report.page import page_path
@@ -26,15 +31,15 @@ class _SearchJob(PictureJob):
 
     drawings = get_args(Drawing)
 
-    def __init__(self, options: SearchOptions) -> None:
+    def __init__(self, options: SearchOptions, agent: ActivePerception | None = None) -> None:
         if not options.target:
             name = options.detector if options.models is None else options.models
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
         super().__init__(options)
         self.start = _check(options)
-        classes = detector_classes(options)
+        classes = detector_classes(options) if agent is None else agent.classes[1:]
         weights = None if classes is None else _meant(options, classes)
-        self.agent = make_agent(options)
+        self.agent = make_agent(options) if agent is None else agent
         self.weights = _meant(options, self.agent.classes[1:]) if weights is None else weights
         self.target = next(iter(self.weights))
         self.title = f"search for “{self.target}”"
@@ -63,15 +68,15 @@ class _FindJob(PictureJob):
 
     every = True
 
-    def __init__(self, options: FindOptions) -> None:
+    def __init__(self, options: FindOptions, agent: ActivePerception | None = None) -> None:
         if options.start is not None:
             raise InputError(
                 f"start: expected none for find, which begins with the whole picture, got {options.start!r}"
             )
         super().__init__(options)
         _check(options)
-        several_classes(options.target, detector_classes(options))
-        self.agent = make_agent(options)
+        several_classes(options.target, detector_classes(options) if agent is None else None)
+        self.agent = make_agent(options) if agent is None else agent
         self.targets = several_classes(options.target, self.agent.classes[1:])
         self.target = None if self.targets is None else self.targets[0]
         self.title = f"all objects{': ' if self.targets else ''}{', '.join(self.targets or [])}"
@@ -87,11 +92,12 @@ class _ExploreJob(PictureJob):
 
     title = "exploration"
 
-    def __init__(self, options: ExploreOptions) -> None:
+    def __init__(self, options: ExploreOptions, agent: ActivePerception | None = None) -> None:
         super().__init__(options)
         self.start = _check(options)
-        detector_classes(options)
-        self.agent = make_agent(options)
+        if agent is None:
+            detector_classes(options)
+        self.agent = make_agent(options) if agent is None else agent
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
         """Explore a picture."""
@@ -99,16 +105,81 @@ class _ExploreJob(PictureJob):
         return self.agent.explore(picture, start=self.start, **settings, **shared)
 
 
-_JOBS: dict[type[PictureOptions], Callable[[Any], PictureJob]] = {
+_JOBS: dict[type[PictureOptions], Callable[..., PictureJob]] = {
     SearchOptions: _SearchJob,
     FindOptions: _FindJob,
     ExploreOptions: _ExploreJob,
 }
 
+_TASKS: dict[str, type[PictureOptions]] = {"search": SearchOptions, "find": FindOptions, "explore": ExploreOptions}
+
 
 def look_at(options: PictureOptions, stream: TextIO) -> int:
     """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
-    return look_at_pictures(_JOBS[type(options)](options), stream)
+    return int(any("error" in row for row in look_at_pictures(_JOBS[type(options)](options), stream)))
+
+
+def run(
+    pictures: str | PathLike[str] | Sequence[str | PathLike[str]],
+    target: str | Sequence[str] | None = None,
+    *,
+    task: Literal["search", "find", "explore"] = "find",
+    agent: ActivePerception | Literal["recommended", "published", "raw"] = "recommended",
+    quiet: bool = True,
+    **options: Any,
+) -> list[dict[str, Any]]:
+    """Look at many pictures and write files, as the command `semfov search`, `find` or `explore` does.
+
+    A picture that cannot be read is left out, with its `error`. With `out=`, a call that was stopped continues where it
+    was when the same call is made again.
+
+    Args:
+        pictures: a picture, a folder, a pattern such as `"flight/*.jpg"`, or a list of these.
+        target: class to search for, or to find; for `find` also several, and None for all classes.
+        task: what to do.
+        agent: an agent that is made already, or the kind of agent that is made of `detector=`, `models=` and others.
+        quiet: print errors and warnings alone.
+        options: options of the command by their names with underscores, such as `out="people.csv"`, `passes=16`,
+            `recursive=True`, `report="page.html"`, `crops="crops"` and `workers=2`. More than one process takes a
+            script that calls this under `if __name__ == "__main__"`, and no `agent` that is made already.
+
+    Returns:
+        For each picture, in their order, what `semfov.paths.Record.to_dict` has without its looks, or its `error`.
+
+    Raises:
+        InputError: an option is unknown or out of range.
+        DataError: there is no such picture, or none of them can be read.
+
+    Example::
+
+        rows = semfov.run("flight", "person", out="people.csv", agent=agent, passes=16)
+        print(sum(row["expected"]["person"] for row in rows if "error" not in row))
+    """
+    kind = _TASKS[lookup(task, _TASKS, "task")]
+    listed = [pictures] if isinstance(pictures, str | PathLike) else list(pictures)
+    check(bool(listed), "pictures", "a picture, a folder, or a list of them", pictures)
+    known = {field.name for field in fields(kind)} - {"pictures", "target", "agent", "quiet", "stream"}
+    check_options(options, [*known], f"semfov {task}")
+    made = agent if isinstance(agent, ActivePerception) else None
+    own = {"detector", "weights", "models", "classes", "device", "half", "sensor"} & options.keys()
+    check(
+        made is None or not own, "agent", f"its kind beside {', '.join(sorted(own))}", "an agent that is made already"
+    )
+    several = options.get("workers", 1) != 1 or options.get("scheduler") is not None
+    check(made is None or not several, "workers", "1 for an agent that is made already", options.get("workers"))
+    for name in ("out", "report", "crops", "labels", "weights", "models", "embeddings"):
+        if options.get(name) is not None:
+            options[name] = Path(options[name])
+    wanted = "a class to search for; task='find' finds all objects"
+    check(task != "search" or target is not None, "target", wanted, target)
+    if not isinstance(agent, ActivePerception):
+        options["agent"] = agent
+    if target is not None:
+        options["target"] = target if isinstance(target, str) else ",".join(target)
+    settings = kind(pictures=tuple(fspath(each) for each in listed), quiet=quiet, **options)
+    stream = sys.stdout
+    with open(os.devnull, "w") as nothing, redirect_stdout(nothing) if quiet else nullcontext():
+        return look_at_pictures(_JOBS[kind](settings, made), stream)
 
 
 def _check(options: PictureOptions) -> Any:
@@ -117,6 +188,9 @@ def _check(options: PictureOptions) -> Any:
         check_writable(options.out, folder=kind_of(options.out) is None)
     if options.report is not None:
         check_writable(page_path(options.report))
+    for folder in (options.crops, options.labels):
+        if folder is not None:
+            check_writable(folder, folder=True)
     check(not options.draw or options.out not in (None, STDOUT), "draw", "--out FOLDER beside --draw", "none")
     return start_of(options.start)
 

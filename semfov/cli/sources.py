@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 
 import torch
@@ -20,11 +21,12 @@ from semfov.head import Flat, Panorama
 
 @dataclass(frozen=True)
 class PictureSource:
-    """A picture to look at."""
+    """A picture to look at; `place` is its path in the folder that was named."""
 
     name: str
     file: Path | None = None
     scene: Picture | None = None
+    place: Path = Path("embedded-scene")
 
     @property
     def boxes(self) -> Tensor | None:
@@ -50,14 +52,23 @@ class PictureSource:
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
 
-def picture_sources(pictures: Sequence[str]) -> list[PictureSource]:
-    """The pictures that are named, those of folders in the order of their names."""
+def picture_sources(pictures: Sequence[str], *, recursive: bool = False) -> list[PictureSource]:
+    """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: list[PictureSource] = []
-    for name in pictures:
+    matched = (sorted(glob(name, recursive=True)) if set(name) & set("*?[") else [] for name in pictures)
+    for name in (each for one, some in zip(pictures, matched, strict=True) for each in some or [one]):
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
+        there = path.exists() or bool(path.suffix) or len(path.parts) > 1
+        expected = f"a file or folder (a class is given by --target {name})"
+        check(there, "picture", expected, f"{name}, which does not exist")
         check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
-        sources += [PictureSource(printable(str(each)), each) for each in picture_files(path)]
+        sources += [
+            PictureSource(
+                printable(str(each)), each, place=each.relative_to(path) if path.is_dir() else Path(each.name)
+            )
+            for each in picture_files(path, recursive=recursive)
+        ]
     return sources
 
 

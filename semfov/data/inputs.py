@@ -127,7 +127,7 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
     elif isinstance(image, bytes | bytearray | memoryview):
         got = f"{got} of a file; open them with PIL.Image.open(io.BytesIO(…))"
     elif isinstance(image, Sequence):
-        got = f"a {got}; give pictures one by one"
+        got = f"a {got}; give pictures one by one, or all of them to semfov.run"
     raise InputError(f"{argument}: expected {expected}, got {got}")
 
 

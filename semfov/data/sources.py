@@ -34,17 +34,22 @@ class Picture(NamedTuple):
     boxes: Tensor | None = None
 
 
-def picture_files(source: Path) -> list[Path]:
-    """List a photograph, or the photographs of a folder in the order of their names."""
+def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
+    """List a photograph, or the photographs of a folder, of `recursive` also of those in it, in the order of names."""
     _check_there(source)
     if not source.is_dir():
         return [source]
     # Names that begin with a dot are notes of the system, such as the ._a.jpg of an Apple disk.
-    there = (path for path in source.iterdir() if not path.name.startswith("."))
-    files = sorted(path for path in there if path.suffix.lower() in PHOTOGRAPHS)
+    files = sorted(
+        path
+        for path in (source.rglob("*") if recursive else source.iterdir())
+        if path.suffix.lower() in PHOTOGRAPHS
+        and not any(part.startswith(".") for part in path.relative_to(source).parts)
+    )
     if not files:
-        kinds = f"({', '.join(PHOTOGRAPHS)})"
-        raise DataError(f"picture: expected photographs {kinds} in {source}, got none; folders in it are not searched")
+        where = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
+        expected = f"photographs ({', '.join(PHOTOGRAPHS)}) in {source}, {where}"
+        raise DataError(f"picture: expected {expected}, got none")
     return files
 
 

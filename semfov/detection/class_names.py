@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from semfov.detection.scores import Candidates
-from semfov.errors import check
+from semfov.errors import InputError, check
 
 _NAMES = """
 person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light,
@@ -24,6 +25,17 @@ COCO_CLASSES: tuple[str, ...] = tuple(name.strip() for name in _NAMES.split(",")
 
 _PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no object", "no-object")
 """Names of outputs that do not stand for a class, in lower case: gaps in COCO's category ids, and background."""
+
+
+class UnnamedClasses(InputError):
+    """A model has scores of so many classes, and no names for them."""
+
+    def __init__(self, count: int, file: Path) -> None:
+        super().__init__(
+            f"classes: expected the names of the {count} classes of {file.name} in the order of its scores, got None; "
+            f"give them by classes=cat,dog, or as the list “classes” in {file.with_suffix('.json')}"
+        )
+        self.count = count
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:

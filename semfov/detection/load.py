@@ -214,9 +214,14 @@ def _names(classes: Sequence[str] | str | PathLike[str] | None) -> tuple[str, ..
     """Class names from a list or from the lines of a file; COCO's by default."""
     if not isinstance(classes, str | PathLike):
         return COCO_CLASSES if classes is None else tuple(classes)
-    check_regular(classes)
+    return class_lines(classes)
+
+
+def class_lines(path: str | PathLike[str]) -> tuple[str, ...]:
+    """Class names from the lines of a file."""
+    check_regular(path)
     try:
-        lines = Path(classes).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the class names in {str(classes)!r}: {error}") from error
+        raise DataError(f"cannot read the class names in {str(path)!r}: {error}") from error
     return tuple(line.strip() for line in lines if line.strip())

@@ -97,8 +97,9 @@ class Objects:
         """
         return self[torch.isin(self.labels, torch.tensor(labels))] if len(labels) else self
 
-    def __getitem__(self, index: Tensor) -> Objects:
-        """Some of the objects."""
+    def __getitem__(self, index: Tensor | slice | int) -> Objects:
+        """Some of the objects, or by a number one of them."""
+        index = torch.tensor([index]) if isinstance(index, int) else index
         return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.class_names import COCO_CLASSES, keep_classes, named_outputs
+from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
 from semfov.detection.onnx_file import (
@@ -260,7 +260,7 @@ def load_onnx(
             "end2end=False (and without NMS) it has all scores, from which beliefs learn more",
             stacklevel=2,
         )
-    names = _coco_names(scores) if names is None else names
+    names = _coco_names(scores, file) if names is None else names
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
         session,
@@ -312,7 +312,7 @@ def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
     return session(torch.zeros(1, 3, size[1], size[0]))
 
 
-def _coco_names(count: int) -> Sequence[str]:
+def _coco_names(count: int, file: Path) -> Sequence[str]:
     """Names of 80 scores (COCO's classes) or of 91 scores (COCO's category ids with their gaps)."""
     if count == 80:
         return COCO_CLASSES
@@ -320,7 +320,7 @@ def _coco_names(count: int) -> Sequence[str]:
         from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
         return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
-    raise InputError(f"classes: expected the names of the model's {count} classes, got None")
+    raise UnnamedClasses(count, file)
 
 
 def _locate(name: str, weights: str | PathLike[str] | None) -> Path:

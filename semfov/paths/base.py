@@ -72,11 +72,6 @@ class Record(Conversion):
 
     _format: ClassVar[Format]
 
-    @property
-    @abstractmethod
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the picture in pixels."""
-
     @abstractmethod
     def _looks(self) -> Iterator[RecordedLook]:
         """The looks in their order, made anew."""

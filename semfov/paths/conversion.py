@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from os import PathLike, fspath
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from semfov.data.classes import canonical_name
+from semfov.data.inputs import ImageLike
+from semfov.data.large import LargePicture, open_large
 from semfov.detection.exchange import category_ids, coco_results, named_detections
 from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
@@ -38,6 +42,14 @@ class Conversion(ABC):
 
     classes: tuple[str, ...]
     source: str | None
+
+    _columns: ClassVar[tuple[str, ...]] = COLUMNS
+    """Columns of the table of objects."""
+
+    @property
+    @abstractmethod
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
 
     @property
     @abstractmethod
@@ -144,7 +156,7 @@ class Conversion(ABC):
         """Rows and columns of a table."""
         check(table in get_args(_Table), "table", "looks or objects", table)
         rows = self.rows() if table == "looks" else self.object_rows()
-        return rows, list(COLUMNS if table == "objects" else dict.fromkeys(name for row in rows for name in row))
+        return rows, list(self._columns if table == "objects" else dict.fromkeys(name for row in rows for name in row))
 
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
@@ -208,6 +220,57 @@ class Conversion(ABC):
             check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
             ids = dict(enumerate(category_ids(categories), 1))
         return coco_results(image_id, objects.boxes, objects.labels, objects.scores, ids)
+
+    def to_yolo(self, path: str | PathLike[str] | None = None) -> str:
+        """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
+
+        Classes are numbered from 0, without background. `x` and `y` are the middle of the box, and all four are shares
+        of the width and height of the picture. Boxes end at its borders.
+
+        Args:
+            path: the file to write; None writes none.
+
+        Returns:
+            The text of the file; empty without objects.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        width, height = self.size
+        lines = []
+        for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), self._inside(), strict=True):
+            shares = (x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height
+            lines.append(f"{label - 1} {' '.join(f'{share:.6f}' for share in shares)}\n")
+        return _written("".join(lines), path)
+
+    def crops(self, picture: LargePicture | ImageLike | None = None) -> list[Tensor]:
+        """Cut what the box of each object shows out of the picture.
+
+        Args:
+            picture: the picture in full size; None takes the file that the record comes from.
+
+        Returns:
+            `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.
+
+        Raises:
+            InputError: no picture is given, or the record's is not known, or it has another size.
+            DataError: the file cannot be read.
+        """
+        picture = self.source if picture is None else picture
+        if picture is None:
+            raise InputError("picture: expected the picture, as the record does not come from a file, got None")
+        opened, (width, height) = open_large(picture), self.size
+        check(opened.size == (width, height), "picture", f"the record's, {width} × {height} px", opened.size)
+        crops = []
+        for x1, y1, x2, y2 in self._inside():
+            left, top = min(int(x1), width - 1), min(int(y1), height - 1)
+            crops.append(opened.read((left, top, max(math.ceil(x2), left + 1), max(math.ceil(y2), top + 1))))
+        return crops
+
+    def _inside(self) -> list[list[float]]:
+        """Boxes of the objects, cut at the borders of the picture."""
+        width, height = self.size
+        return self.objects.boxes.minimum(torch.tensor([width, height] * 2)).clamp(min=0).tolist()
 
     def to_geojson(
         self, path: str | PathLike[str] | None = None, *, source: str | PathLike[str] | None = None

@@ -24,10 +24,12 @@ from semfov.head.views import Views
 from semfov.head.world import Places, World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
+from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
+from semfov.sensor.sphere import panorama_directions
 
 _BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
@@ -97,6 +99,7 @@ class HeadPath(GazeRecord):
 
     how = "head"
     _format = _FORMAT
+    _columns = (*COLUMNS, "pan", "tilt")
 
     @property
     def turns(self) -> int:
@@ -131,6 +134,15 @@ class HeadPath(GazeRecord):
     def around(self) -> float | None:
         """Width in pixels of a panorama, after which it repeats; None for other scenes."""
         return float(self.size[0]) if self.views.world.closed else None
+
+    def object_rows(self) -> list[dict[str, Any]]:
+        """The table of objects, with `pan` to the right and `tilt` up of the middle of each box, in degrees."""
+        rows = super().object_rows()
+        world = self.views.world
+        points = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2) - 0.5
+        places = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
+        angles = world.angles_of(places).tolist()
+        return [row | dict(zip(("pan", "tilt"), each, strict=True)) for row, each in zip(rows, angles, strict=True)]
 
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.

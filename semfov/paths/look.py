@@ -12,12 +12,13 @@ from semfov.belief.grid import Grid
 from semfov.data.large import LargePicture
 from semfov.data.reduction import reduction_for
 from semfov.detection.detections import Detections
+from semfov.detection.objects import box_text
 
 Box = tuple[float, float, float, float]
 """`(x1, y1, x2, y2)`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RecordedLook:
     """One look of a record, in pixels of the picture.
 
@@ -43,6 +44,12 @@ class RecordedLook:
     seconds: float | None = None
     value: float | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Number, point, region and number of detections in one line."""
+        (x, y), count = self.fixation, int(self.detections.count.sum())
+        seen = f"{count} detection{'s' if count != 1 else ''}"
+        return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {seen}"
 
 
 class LookView(NamedTuple):

@@ -22,16 +22,21 @@ from semfov.viz.semantic import cell_entropy
 Data = dict[str, Any]
 
 
-def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
-    """A picture `(3, H, W)` as a data URI, reduced to at most `width` pixels."""
+def jpeg(image: Tensor, quality: int) -> bytes:
+    """A picture `(3, H, W)`, of bytes or in [0, 1], as JPEG."""
     from PIL import Image
 
+    pixels = image if image.dtype == torch.uint8 else (image.detach().clamp(0, 1) * 255).round().byte()
+    file = io.BytesIO()
+    Image.fromarray(pixels.cpu().permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality, optimize=True)
+    return file.getvalue()
+
+
+def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
+    """A picture `(3, H, W)` as a data URI, reduced to at most `width` pixels."""
     if image.shape[-1] > width:
         image = resize(image[None], (width, max(1, round(width * image.shape[-2] / image.shape[-1]))))[0]
-    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=quality, optimize=True)
-    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode()
 
 
 def episode_data(

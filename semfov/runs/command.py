@@ -9,7 +9,7 @@ import sys
 import threading
 from argparse import SUPPRESS
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -42,7 +42,9 @@ GOES_ON = "; give the same command again to continue"
 _PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
              "skimage": "scikit-image", "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
 """Names under which packages are installed, where they are not those of their modules."""
-_ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+_HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)
+_ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", _HANGUP: "terminated"}
+"""What is said after each signal: a terminal that closes ends a command (SIGHUP) as SIGTERM does."""
 
 
 def make_parser(
@@ -74,7 +76,12 @@ def make_parser(
 
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
     parser = Parser(
-        prog=program, description=description, default_env=False, formatter_class=Formatter, exit_on_error=True
+        prog=program,
+        description=description,
+        default_env=False,
+        formatter_class=Formatter,
+        exit_on_error=True,
+        allow_abbrev=False,  # --conf would be --config
     )
     parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
     if positional is not None:
@@ -131,9 +138,11 @@ def run_command(
         exec("")
         print(f"{_ENDINGS[signal.SIGINT]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGINT
-    except _Terminated:
-        print(f"{_ENDINGS[signal.SIGTERM]}{goes_on}", file=sys.stderr)
-        return 128 + signal.SIGTERM
+    except _Terminated as ended:
+        number: int = ended.args[0]
+        with suppress(OSError):  # the terminal may be gone
+            print(f"{_ENDINGS[number]}{goes_on}", file=sys.stderr)
+        return 128 + number
     return code or 0
 
 
@@ -149,26 +158,26 @@ def command(
 
 
 class _Terminated(BaseException):
-    """SIGTERM was received; unfinished work is cleaned up before the process ends."""
+    """SIGTERM or SIGHUP was received; unfinished work is cleaned up before the process ends."""
 
 
 @contextmanager
 def _signals(goes_on: str) -> Iterator[None]:
-    """Let the first SIGINT or SIGTERM end the command in good order, and the second one at once."""
+    """Let the first SIGINT, SIGTERM or SIGHUP end the command in good order, and the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, _leave)
-        signal.signal(signal.SIGTERM, _leave)
+        for each in _ENDINGS:
+            signal.signal(each, _leave)
         if _importing(frame):
             # An exception from here would pass through the start of a native module, and some abort the process.
             os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{goes_on}\n".encode())
             _leave(number, frame)
-        raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
+        raise KeyboardInterrupt if number == signal.SIGINT else _Terminated(number)
 
-    signals = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
+    signals = [number for number in _ENDINGS if signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, end) for number in signals}
     try:
         yield

@@ -101,8 +101,9 @@ def run_tasks(
     settings: tuple[object, ...],
     title: str,
     unit: str,
+    hidden: bool = False,
 ) -> Generator[tuple[_Task, _Result], None, None]:
-    """Run `function(task)` for every task, and yield tasks and results in any order, with a progress bar.
+    """Run `function(task)` for every task, and yield tasks and results in any order; a bar shows the progress.
 
     Results come back to this process, which stores them: workers need not see its folders. Close the generator if you
     stop early: that ends the work.
@@ -110,7 +111,7 @@ def run_tasks(
     if not tasks:
         return
     processes = available_cores() if where is None else where
-    with closing(task_bar(len(tasks), title, unit)) as bar:
+    with closing(task_bar(len(tasks), title, unit, hidden=hidden)) as bar:
         if isinstance(processes, int):
             if processes <= 1 or len(tasks) == 1:
                 setup(*settings)

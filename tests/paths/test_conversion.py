@@ -48,6 +48,21 @@ def test_supervision_counts_classes_from_0_and_has_their_names(record):
     assert len(replace(record, least=0.95).to_supervision()) == 0
 
 
+def test_labels_of_yolo_are_shares_and_crops_the_pixels_of_the_boxes(record):
+    lines = [line.split() for line in record.to_yolo().splitlines()]
+    assert [line[0] for line in lines] == ["2", "0", "1"]
+    x, y, width, height = (float(share) for share in lines[2][1:])  # box 40, 5 to 60.5, 20 of 80 × 60 px
+    np.testing.assert_allclose([x * 80, y * 60, width * 80, height * 60], [50.25, 12.5, 20.5, 15], atol=1e-4)
+    picture = torch.randint(256, (3, 60, 80), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    crops = record.crops(picture)
+    assert torch.equal(crops[2], picture[:, 5:20, 40:61])
+    assert [tuple(crop.shape) for crop in crops] == [(3, 9, 8), (3, 30, 20), (3, 15, 21)]
+    with pytest.raises(InputError, match="picture: expected the record's, 80 × 60 px"):
+        record.crops(picture[:, :30])
+    with pytest.raises(InputError, match="as the record does not come from a file, got None"):
+        record.crops()
+
+
 def test_torchvision_draws_them(record):
     found = record.to_torchvision()
     assert found["labels"].tolist() == [3, 1, 2]

@@ -512,3 +512,23 @@ def test_a_head_path_from_a_file_has_the_geometry_of_its_scene(tmp_path):
     own = head_path(Own(torch.rand(3, 480, 640), (40, 30), degree=8))
     with pytest.raises(InputError, match="expected a scene that files can describe"):
         own.save(tmp_path / "own.safetensors")
+
+
+def test_objects_of_a_head_have_the_directions_to_turn_to():
+    """A panorama is 360 × 180 degrees, and a flat picture has its degree in pixels."""
+    record = head_path()
+    width, height = record.size
+    for row in record.object_rows():
+        pan, tilt = 360 * row["x"] / width - 180, 90 - 180 * row["y"] / height
+        assert (row["pan"] - pan) % 360 == pytest.approx(0, abs=1e-3) or (row["pan"] - pan) % 360 > 360 - 1e-3
+        assert row["tilt"] == pytest.approx(tilt, abs=1e-3)
+    flat = head_path(Flat(torch.rand(3, 48, 64), (40, 30), degree=1.0, fields=(30.0,)))
+    for row in flat.object_rows():
+        assert (row["pan"], row["tilt"]) == pytest.approx((row["x"] - 32, 24 - row["y"]), abs=1e-4)
+
+
+def test_a_look_and_an_object_are_one_line():
+    record = zoom_path()
+    assert [repr(record[number]).count("\n") for number in range(len(record))] == [0] * len(record)
+    assert record.objects[-1].boxes.equal(record.objects.boxes[-1:])
+    assert len(record.objects[:1]) == 1

@@ -1,0 +1,117 @@
+"""Many pictures by one call of Python: what the command writes, with files of each object."""
+
+import csv
+import os
+import signal
+
+import pytest
+import torch
+from PIL import Image
+
+import semfov
+from semfov import DataError, InputError
+from semfov.data import read_image
+from semfov.runs.command import run_command
+from semfov.runs.settings import Settings
+
+
+@pytest.fixture
+def flight(photo, tmp_path):
+    """Two pictures in folders of a folder, one of them without an object, and one that is none."""
+    folder = tmp_path / "flight"
+    (folder / "low" / "west").mkdir(parents=True)
+    photo.rename(folder / "low" / "west" / "a.png")
+    Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "low" / "b.png")
+    (folder / "c.png").write_bytes(b"no picture")
+    return folder
+
+
+def test_a_call_and_the_command_write_the_same(run, agent, flight, tmp_path, capsys):
+    rows = semfov.run(flight, "red", agent=agent, recursive=True, passes=1, out=tmp_path / "call.csv")
+    assert capsys.readouterr().out == ""
+    code, _ = run("find", flight, "--target", "red", "--recursive", "--passes", 1, "--out", tmp_path / "command.csv")
+    assert code == 1
+    assert (tmp_path / "call.csv").read_text() == (tmp_path / "command.csv").read_text()
+    assert ["error" in row for row in rows] == [True, False, False]
+    assert [len(row.get("objects", ())) for row in rows] == [0, 0, 1]
+    with (tmp_path / "call.csv").open() as file:
+        assert [row["class"] for row in csv.DictReader(file)] == ["red", "red"]
+
+
+def test_a_call_that_was_stopped_continues(agent, flight, tmp_path, monkeypatch):
+    find_all, seen = agent.find_all, []
+
+    def looks(picture, *arguments, **options):
+        seen.append(picture)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", looks)
+    wanted = {"agent": agent, "recursive": True, "out": tmp_path / "found.json"}
+    (flight / "c.png").unlink()
+    with pytest.raises(KeyboardInterrupt):
+        semfov.run(flight, "red", **wanted)
+    assert len(semfov.run(flight, "red", **wanted)) == 2
+    assert len(seen) == 3
+    assert list(tmp_path.glob("*.unfinished")) == []
+
+
+def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_path):
+    (flight / "c.png").unlink()
+    folders = {name: tmp_path / name for name in ("crops", "labels")}
+    (_, row) = semfov.run([flight / "low"], "red", agent=agent, recursive=True, **folders)
+    files = {str(path.relative_to(tmp_path)) for name in folders for path in (tmp_path / name).rglob("*.*")}
+    assert files == {"labels/b.txt", "labels/west/a.txt", "crops/red/west/a-000.jpg"}
+    assert (tmp_path / "labels/b.txt").read_text() == ""
+    (label, *shares) = (tmp_path / "labels/west/a.txt").read_text().split()
+    assert label == "0"
+    (found,) = row["objects"]
+    x, y, width, height = (float(share) * side for share, side in zip(shares, (160, 120) * 2, strict=True))
+    torch.testing.assert_close(
+        torch.tensor([x - width / 2, y - height / 2, x + width / 2, y + height / 2]),
+        torch.tensor([found[name] for name in ("x1", "y1", "x2", "y2")]), rtol=0, atol=1e-3,
+    )  # fmt: skip
+    crop = read_image(tmp_path / "crops/red/west/a-000.jpg")
+    assert crop.shape[-1] == pytest.approx(width, abs=2)
+    middle = crop[:, crop.shape[1] // 2, crop.shape[2] // 2]
+    torch.testing.assert_close(middle, torch.tensor([230.0, 20.0, 20.0]) / 255, rtol=0, atol=0.1)
+    again = [flight / "low" / "b.png", flight / "low" / "b.png"]
+    with pytest.raises(InputError, match=r"labels: expected pictures of different names .* got b"):
+        semfov.run(again, "red", agent=agent, labels=tmp_path / "labels")
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"pases": 2}, InputError, "did you mean passes="),
+        ({"task": "serch"}, InputError, "did you mean 'search'"),
+        ({"task": "search", "target": None}, InputError, "task='find' finds all"),
+        ({"workers": 2}, InputError, "workers: expected 1 for an agent that is made already"),
+        ({"detector": "yolox-nano"}, InputError, "agent: expected its kind beside detector"),
+        ({"pictures": []}, InputError, "pictures: expected a picture"),
+        ({"pictures": "no/such.png"}, DataError, "no such file or folder"),
+        ({"crops": __file__}, DataError, "is not a folder"),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_a_call_is_refused_before_the_first_look(agent, flight, options, error, said):
+    wanted = {"pictures": flight / "low", "target": "red", **options}
+    with pytest.raises(error, match=said):
+        semfov.run(agent=agent, **wanted)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs SIGHUP")
+def test_a_terminal_that_closes_ends_a_command_in_good_order(capsys):
+    cleaned = []
+
+    def work(_):
+        try:
+            os.kill(os.getpid(), signal.SIGHUP)
+            signal.pause()
+        finally:
+            cleaned.append(True)
+
+    assert run_command(work, Settings, "", []) == 128 + signal.SIGHUP
+    assert cleaned
+    assert "give the same command again" in capsys.readouterr().err
