@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import nullcontext
+from functools import wraps
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -76,13 +77,14 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
         yield torch.device(request.param)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def kept_scenes() -> Iterator[None]:
-    """Compose each embedded scene only once, as mosaics use each scene many times."""
+    """Compose each embedded scene only once."""
     compose, kept = EmbeddedScenes._pixels, {}
 
+    @wraps(compose)
     def once(scenes: EmbeddedScenes, index: int) -> Any:
-        key = scenes.fingerprint, scenes.ids[index]
+        key = scenes._generator(index).bit_generator.state["state"]["state"]
         if key not in kept:
             kept[key] = compose(scenes, index)
         return kept[key]

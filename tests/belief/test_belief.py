@@ -147,8 +147,15 @@ def test_padding_does_not_change_the_belief(kind, four):
     assert equal(observer(start[:1], nothing, fixations[2:3], GRID, 2), belief[2:3])
 
 
-@pytest.mark.parametrize("grid", [Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))], ids=str)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    ("grid", "dtype"),
+    [
+        (Grid(1, 5, (60, 90)), torch.float64),
+        (Grid(5, 1, (90, 60)), torch.float64),
+        (Grid(1, 1, (10, 10)), torch.float32),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("kind", OBSERVERS)
 def test_looks_without_detections_on_grids_of_one_row_or_column(kind, grid, dtype, device):
     observer = OBSERVERS[kind]().to(device, dtype)

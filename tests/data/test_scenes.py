@@ -14,6 +14,14 @@ CLASSES = ("person", "motorbike", "cat", "cup")
 COUNT = 40
 
 
+@pytest.fixture(scope="module", autouse=True)
+def composed():
+    """Compose scenes anew each time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EmbeddedScenes, "_pixels", EmbeddedScenes._pixels.__wrapped__)
+        yield
+
+
 @pytest.fixture(scope="module")
 def scenes():
     return EmbeddedScenes(CLASSES, count=COUNT)

@@ -22,8 +22,6 @@ from tests.envs.agents import WindowAgent
 KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 @given(
     size=st.tuples(st.integers(200, 9000), st.integers(200, 9000)),

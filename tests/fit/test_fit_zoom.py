@@ -29,8 +29,6 @@ from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, Tiles
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 @pytest.mark.slow
 @pytest.mark.lab

@@ -11,8 +11,6 @@ from semfov.sensor.perspective import perspective
 
 CLASSES = ("person", "cat", "cup")
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 @pytest.fixture(scope="module")
 def scenes():

@@ -16,8 +16,6 @@ from semfov.data.scene import Annotation, Scene
 from semfov.head.views import Views
 from tests.small import Tiles
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 class NoiseScenes:
     """Five pictures of coloured noise, each with one box."""

@@ -22,8 +22,6 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):

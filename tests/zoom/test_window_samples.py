@@ -15,8 +15,6 @@ from semfov.zoom.lattice import Lattice
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
-pytestmark = pytest.mark.usefixtures("kept_scenes")
-
 
 def test_octaves_are_logarithms_of_the_magnifications():
     assert LATTICE.octaves.tolist() == pytest.approx([-math.log2(m) for m in LATTICE.magnifications])
