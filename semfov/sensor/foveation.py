@@ -10,8 +10,11 @@ from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_poi
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
-from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions
+from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions, widened
 from semfov.threads import one_thread_if_small
+
+# Elements of all views from which they are made one at a time on a CPU.
+_MANY = 1 << 23
 
 
 @one_thread_if_small
@@ -72,14 +75,38 @@ def foveate(
         points = gaze[None] if gaze.ndim == 2 else gaze
         bands = laplacian_pyramid(as_images(image), levels, convention)
         return foveate(bands, points, sigma=sigma, growth=growth)[0]
-    bands = image if isinstance(image, Bands) else laplacian_pyramid(as_batch(image), levels, convention)
-    fixation, many = fixations(gaze, bands.base)
+    source = image if isinstance(image, Bands) else as_batch(image)
+    like = source.base if isinstance(source, Bands) else source
+    fixation, many = fixations(gaze, like)
     if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
         for name, value in (("sigma", sigma), ("growth", growth)):
             positive = bool((torch.as_tensor(value) > 0).all())
             check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
-    result = _collapse(bands, fixation, _widths(sigma, bands.base), growth)
-    return result if many else result[:, 0]
+    widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
+    size = source.size if isinstance(source, Bands) else tuple(source.shape[-2:])
+    elements = batch * number * like.shape[1] * size[0] * size[1]
+    given = (
+        (*source.details, like, fixation, widths, growth)
+        if isinstance(source, Bands)
+        else (like, fixation, widths, growth)
+    )
+    tensors = [each for each in given if isinstance(each, Tensor)]
+    recorded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    alone = batch * number > 1 and elements >= _MANY and like.device.type == "cpu" and not recorded
+    if not (alone and values_known(*tensors)):
+        bands = source if isinstance(source, Bands) else laplacian_pyramid(source, levels, convention)
+        result = _collapse(bands, fixation, widths, growth)
+        return result if many else result[:, 0]
+    # One view at a time stays in the processor's cache.
+    views = like.new_empty(batch, number, like.shape[1], *size)
+    for b in range(batch):
+        if isinstance(source, Bands):
+            own = Bands(tuple(band[b : b + 1] for band in source.details), source.base[b : b + 1], source.convention)
+        else:
+            own = laplacian_pyramid(source[b : b + 1], levels, convention)
+        for g in range(number):
+            _collapse(own, fixation[b : b + 1, g : g + 1], widths[b : b + 1], growth, views[b : b + 1, g : g + 1])
+    return views if many else views[:, 0]
 
 
 class Foveation(Sensor):
@@ -196,11 +223,16 @@ class Foveation(Sensor):
         )
 
 
-def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:
-    """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`."""
+def _collapse(
+    bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor, out: Tensor | None = None
+) -> Tensor:
+    """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`, into `out` if it is given."""
     batch, many = fixation.shape[:2]
     if not bands.details:
-        return bands.base[:, None].repeat(1, many, 1, 1, 1)
+        views = bands.base[:, None].repeat(1, many, 1, 1, 1)
+        return views if out is None else out.copy_(views)
+    dtype = bands.base.dtype
+    bands = Bands(tuple(map(widened, bands.details)), widened(bands.base), bands.convention)
     windows = _windows(bands, fixation, sigma, growth)
     result = bands.base
     for k in reversed(range(len(bands.details))):
@@ -213,10 +245,13 @@ def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Ten
             result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
         else:
             views = expanded.unflatten(0, (batch, many))
+            if k == 0 and out is not None and out.dtype == views.dtype:
+                return torch.addcmul(views, window, band[:, None], out=out)
             # In place where no graph is recorded, which avoids allocating memory.
             blend = views.addcmul_ if values_known(views, window, band) else views.addcmul
             result = blend(window, band[:, None]).flatten(0, 1)
-    return result.unflatten(0, (batch, many))
+    views = result.unflatten(0, (batch, many))
+    return views.to(dtype) if out is None else out.copy_(views)
 
 
 def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:

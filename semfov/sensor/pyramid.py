@@ -96,8 +96,9 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
     """`pyrdown` without the checks."""
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
-    down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
-    return separable(image, down, across)
+    wide = widened(image)
+    down, across = (_reducing(count, convention, wide.dtype, image.device) for count in image.shape[-2:])
+    return separable(wide, down, across).to(image.dtype)
 
 
 def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -132,9 +133,9 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
     """`pyrup` without the checks."""
     if _runs_in_kornia(image, convention, size):
         return _kornia().pyrup(image.contiguous())
-    lengths = zip(image.shape[-2:], size, strict=True)
-    down, across = (_expanding(count, length, convention, image.dtype, image.device) for count, length in lengths)
-    return separable(image, down, across)
+    lengths, wide = zip(image.shape[-2:], size, strict=True), widened(image)
+    down, across = (_expanding(count, length, convention, wide.dtype, image.device) for count, length in lengths)
+    return separable(wide, down, across).to(image.dtype)
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -152,10 +153,10 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     [(64, 48), (32, 24), (16, 12)]
     """
     _check(image, convention, levels)
-    pyramid = [image]
+    pyramid = [widened(image)]
     for _ in range(levels):
         pyramid.append(reduce(pyramid[-1], convention))
-    return tuple(pyramid)
+    return tuple(level.to(image.dtype) for level in pyramid)
 
 
 @one_thread_if_small
@@ -177,7 +178,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     ([(64, 48), (32, 24), (16, 12)], (8, 6))
     """
     _check(image, convention, levels)
-    details = []
+    details, dtype, image = [], image.dtype, widened(image)
     for _ in range(levels):
         smaller = reduce(image, convention)
         expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
@@ -185,7 +186,12 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
         fresh = expanded.requires_grad or not values_known(image, expanded)
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
-    return Bands(tuple(details), image, convention)
+    return Bands(tuple(band.to(dtype) for band in details), image.to(dtype), convention)
+
+
+def widened(image: Tensor) -> Tensor:
+    """An image of half precision in float32 on a CPU, which computes with it ten times faster."""
+    return image.float() if image.dtype in (torch.float16, torch.bfloat16) and image.device.type == "cpu" else image
 
 
 def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
