@@ -78,8 +78,9 @@ def as_images(
     """
     pixels = channels_first(pixels_of(images, argument), argument, choose=not isinstance(images, np.ndarray))
     pixels = in_rgb(pixels, images, color)
-    pixels = _in_unit(pixels, like, argument)
-    check_pixels(pixels, argument)
+    whole, pixels = not pixels.is_floating_point(), _in_unit(pixels, like, argument)
+    if not whole:
+        check_pixels(pixels, argument)
     return pixels
 
 
@@ -197,4 +198,4 @@ def _in_unit(pixels: Tensor, like: Tensor | None, argument: str) -> Tensor:
         return pixels.to(pixels.device if like is None else like.device, dtype)
     got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
     check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
-    return pixels.to(pixels.device if like is None else like.device, dtype) / _WHITE[pixels.dtype]
+    return pixels.to(pixels.device if like is None else like.device, dtype).div_(_WHITE[pixels.dtype])

@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.verification import closer_features
-from semfov.decision.evidence import cell_of, strength, strongest
+from semfov.decision.evidence import cell_of
 from semfov.decision.rule import CloseUp, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
@@ -109,6 +110,20 @@ class CandidatePlaces(ABC, Generic[LookType]):
         raise NotImplementedError(f"{type(self).__name__} has no belief towards which closer looks could fade")
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """A look of a search, whose footprints are computed once."""
+
+    frame: int
+    detections: Detections
+    grid: Grid
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """The `soft` footprints of the detections, `(L, X·Y)`."""
+        return self.grid.footprint(self.detections.boxes, "soft")[0]
+
+
 class CandidateCells(CandidatePlaces[Step]):
     """Cells that seem to hold the target of one search: those with the largest product of probability and evidence.
 
@@ -122,7 +137,7 @@ class CandidateCells(CandidatePlaces[Step]):
         super().__init__(forgetting)
         self.grid, self._target = grid, target
         self._frame = 0
-        self._looks: list[tuple[int, Detections]] = []  # with their frames
+        self._looks: list[_Seen] = []
         self._dismissed: list[tuple[int, Tensor, Tensor]] = []  # frame, boxes (2, 4) and cells (X·Y,) of each place
 
     _step: Step
@@ -130,12 +145,12 @@ class CandidateCells(CandidatePlaces[Step]):
     def see(self, look: Step) -> None:
         """Take in a step of the search."""
         self._step = look
-        self._looks.append((self._frame, look.detections))
+        self._looks.append(_Seen(self._frame, look.detections, self.grid))
 
     @property
     def detections(self) -> Detections:
         """Detections of the last look."""
-        return self._looks[-1][1]
+        return self._looks[-1].detections
 
     @property
     def target(self) -> int:
@@ -159,14 +174,16 @@ class CandidateCells(CandidatePlaces[Step]):
             cells = cells.masked_fill(examined, 0)
         if not (last or bool(place_known(cells, self._step.visited[0], least))):
             return None
-        looks, target = self._left(), self.target
-        strengths = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
-        value = cells * strengths.amax(0)
-        cell = int(value.argmax())
-        evidence, box = strongest(looks, self.grid, cell, target)
-        if box is None or float(value[cell]) <= 0 or float(cells[cell]) < least:
+        boxes = torch.cat([look.detections.boxes[0] for look in self._looks])
+        if not len(boxes):
             return None
-        return CandidatePlace(box, evidence, float(cells[cell]), cell)
+        evidence = self._scores(boxes, self.target)[:, None] * torch.cat([look.weights for look in self._looks])
+        value = cells * evidence.amax(0)
+        cell = int(value.argmax())
+        if float(value[cell]) <= 0 or float(cells[cell]) < least:
+            return None
+        best = int(evidence[:, cell].argmax())
+        return CandidatePlace(boxes[best], float(evidence[best, cell]), float(cells[cell]), cell)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Leave out the detections of both boxes, and the cells that they cover."""
@@ -183,7 +200,7 @@ class CandidateCells(CandidatePlaces[Step]):
         """Let a frame pass: drop looks, and list places again, of which less than half the evidence is left."""
         self._frame += 1
         oldest = self._frame - self.forgetting.span
-        self._looks = [(frame, look) for frame, look in self._looks[-_MOST_LOOKS:] if frame >= oldest]
+        self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look.frame >= oldest]
         self._dismissed = [place for place in self._dismissed if place[0] >= oldest]
 
     def move(self, look: CloseUp, box: Tensor) -> CloseUp:
@@ -194,13 +211,16 @@ class CandidateCells(CandidatePlaces[Step]):
         """Present probability that the target is in the cell of a closer look."""
         return float(self._step.belief.probability(self._target)[0, look.cell])
 
-    def _left(self) -> list[Detections]:
-        """The looks with faded scores, without the detections of objects that were examined."""
-        looks = [
-            replace(look, scores=look.scores * self.forgetting.keep ** (self._frame - frame))
-            for frame, look in self._looks
-        ]
+    def _scores(self, boxes: Tensor, target: int) -> Tensor:
+        """Faded scores of the detections of all looks, 0 for objects that were examined; boxes `(N, 4)` → `(N,)`."""
+        keep = self.forgetting.keep
+        scores = torch.cat(
+            [
+                look.detections.mask[0] * (look.detections.scores[0, :, target] * keep ** (self._frame - look.frame))
+                for look in self._looks
+            ]
+        )
         if not self._dismissed:
-            return looks
-        boxes = torch.cat([boxes for _, boxes, _ in self._dismissed])
-        return [replace(look, mask=look.mask & (box_iou(look.boxes[0], boxes) < SAME).all(-1)) for look in looks]
+            return scores
+        examined = torch.cat([boxes for _, boxes, _ in self._dismissed])
+        return scores * (box_iou(boxes, examined) < SAME).all(-1)

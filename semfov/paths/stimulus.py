@@ -177,4 +177,4 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
 
 def in_bytes(image: Tensor) -> Tensor:
     """Convert pixels in [0, 1] to bytes, on the CPU."""
-    return (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)
+    return image.detach().clamp(0, 1).mul_(255).round_().to("cpu", torch.uint8)

@@ -18,6 +18,9 @@ from semfov.errors import values_known
 # Lines of up to this many pixels are computed by one dense matrix, longer lines tile by tile.
 _SMALL = 160
 
+# Pixels of planes that are filtered together.
+_CACHED = 1 << 18
+
 _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
 
@@ -97,11 +100,13 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
         return down.first @ (image @ across.first.mT)
     planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
     result = planes.new_empty(len(planes), down.length, across.length)
-    between = planes.new_empty(planes.shape[-2], across.length)
-    # One plane at a time, with one memory in between, which stays in the cache.
-    for plane, filtered in zip(planes, result, strict=True):
-        _fill(between.mT, plane.mT, across)
-        _fill(filtered, between, down)
+    # So many planes at a time that what is between the two passes stays in the cache.
+    number = max(1, _CACHED // (planes.shape[1] * max(planes.shape[2], across.length)))
+    between = planes.new_empty(min(number, len(planes)), planes.shape[1], across.length)
+    for group, made in zip(planes.split(number), result.split(number), strict=True):
+        _fill(between[: len(group)].flatten(0, 1).mT, group.reshape(-1, group.shape[-1]).mT, across)
+        for plane, filtered in zip(between, made, strict=False):
+            _fill(filtered, plane, down)
     return result.reshape(*image.shape[:-2], *result.shape[-2:])
 
 
