@@ -21,6 +21,8 @@ from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
 from semfov.data.inputs import Color
+from semfov.data.large import Bands
+from semfov.data.tone import White
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
@@ -285,6 +287,8 @@ class ActivePerception(nn.Module):
         give_up: float | None = None,
         closer: int | None = None,
         color: Color = "rgb",
+        white: White | None = None,
+        bands: Bands = None,
     ) -> GazeRecord:
         """Search a picture for a target class, and decide whether it is there (`record.decision`).
 
@@ -329,6 +333,11 @@ class ActivePerception(nn.Module):
                 a photograph, and as many as there are passes for in a large picture. 0 decides without them, as does
                 an agent without a model of verification.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
+            white: for a thermal picture, reflectances or 12 bits: the value that is white where 0 is black, the values
+                `(black, white)`, or `auto` for the 1st and the 99th percentile. None takes the largest value of 8 or 16
+                bits, and 1 for floats.
+            bands: numbers of the bands of a TIFF or a raster that are red, green and blue, from 1, or of one as grey;
+                None takes those that the file names.
 
         Returns:
             The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
@@ -344,7 +353,7 @@ class ActivePerception(nn.Module):
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
         foveal = start is not None or boxes is not None or len(targets) > 1
         opened, kind, limits = self._begin(
-            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, foveal=foveal
         )
         only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
@@ -385,6 +394,8 @@ class ActivePerception(nn.Module):
         least: float | None = None,
         batch: int = 1,
         color: Color = "rgb",
+        white: White | None = None,
+        bands: Bands = None,
     ) -> GazeRecord:
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
@@ -406,6 +417,8 @@ class ActivePerception(nn.Module):
                 what suits the detector (`record.least`).
             batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+            white: the values that are black and white, as for `search`.
+            bands: the bands that are shown, as for `search`.
 
         Returns:
             The record with its objects: a `ZoomPath`, a `Scanpath` or a `HeadPath`.
@@ -416,7 +429,9 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        opened, kind, limits = self._begin(picture, color, how, passes, seconds, on_look, shifts, duration, every=True)
+        opened, kind, limits = self._begin(
+            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, every=True
+        )
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
@@ -443,6 +458,8 @@ class ActivePerception(nn.Module):
         start: Start = None,
         seed: int = 0,
         color: Color = "rgb",
+        white: White | None = None,
+        bands: Bands = None,
     ) -> GazeRecord:
         """Explore a picture: learn which classes are where, without a target.
 
@@ -465,6 +482,8 @@ class ActivePerception(nn.Module):
             start: first cell of a fovea or first action of a head, as for `search`.
             seed: seed of the generator that draws the start and breaks ties.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+            white: the values that are black and white, as for `search`.
+            bands: the bands that are shown, as for `search`.
 
         Returns:
             The record, without target and decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
@@ -476,7 +495,7 @@ class ActivePerception(nn.Module):
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
         foveal = start is not None
         opened, kind, limits = self._begin(
-            picture, color, how, passes, seconds, on_look, shifts, duration, foveal=foveal
+            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, foveal=foveal
         )
         if kind == "fovea":
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
@@ -489,12 +508,16 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
-    def gaze(self, picture: PictureLike, *, color: Color = "rgb") -> GazePrediction:
+    def gaze(
+        self, picture: PictureLike, *, color: Color = "rgb", white: White | None = None, bands: Bands = None
+    ) -> GazePrediction:
         """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
 
         Args:
             picture: a photograph, as for `search`.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
+            white: the values that are black and white, as for `search`.
+            bands: the bands that are shown, as for `search`.
 
         Returns:
             The density of fixations, from which scanpaths are drawn.
@@ -504,7 +527,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        image = open_picture(picture, color).image(self.eye.sensor.like)[0]
+        image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
         return GazePrediction.of(self.eye.detector, image, source=source)
 
     def live(
@@ -519,6 +542,7 @@ class ActivePerception(nn.Module):
         give_up: float | None = None,
         closer: int | None = None,
         color: Color = "rgb",
+        white: White | None = None,
     ) -> LivePerception:
         """Look at a camera or a video: one pass of the detector for every frame, and evidence that fades between them.
 
@@ -537,6 +561,7 @@ class ActivePerception(nn.Module):
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
                 evidence is forgotten (ln 2 / rate frames); None takes 2 for a fovea, and 100 for windows.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+            white: the values that are black and white in frames of other types than bytes, as for `search`.
 
         Returns:
             An object whose `step` takes the frames one by one.
@@ -561,12 +586,12 @@ class ActivePerception(nn.Module):
             give_up=give_up,
             closer=closer,
             color=color,
+            white=white,
         )
 
     def _begin(
         self,
-        picture: PictureLike,
-        color: Color,
+        picture: tuple[PictureLike, Color, White | None, Bands],
         how: How,
         passes: int | None,
         seconds: float | None,
@@ -578,7 +603,7 @@ class ActivePerception(nn.Module):
         foveal: bool = False,
     ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
         """Open the picture, choose the kind of look, and check the limits that suit it."""
-        opened = open_picture(picture, color)
+        opened = open_picture(*picture)
         kind = self.kind_of_look(opened, how, every=every, foveal=foveal or shifts is not None)
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)

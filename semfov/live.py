@@ -6,7 +6,8 @@ from semfov.agents.episode import Episode, without_none
 from semfov.agents.fovea import RATE, FoveaAgent, FoveaEpisode
 from semfov.agents.picture import open_picture
 from semfov.agents.windows import WINDOW_RATE, ZoomAgent
-from semfov.data.inputs import Color, ImageLike
+from semfov.data.inputs import Color, ImageLike, as_image
+from semfov.data.tone import White, check_white
 from semfov.errors import check, lookup
 from semfov.paths import Moment
 
@@ -32,6 +33,7 @@ class LivePerception:
         give_up: probability below which a look is not worth a frame; None takes that of the model.
         closer: largest number of closer looks in ln 2 / rate frames; None takes 2 for a fovea, and 100 for windows.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+        white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
 
     Attributes:
         how: the kind of look; `auto` before the first frame.
@@ -62,12 +64,15 @@ class LivePerception:
         give_up: float | None = None,
         closer: int | None = None,
         color: Color = "rgb",
+        white: White | None = None,
     ) -> None:
         check(how != "head", "how", "'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, "
               "and for a panoramic frame search or find_all of semfov.Panorama(frame)", how)  # fmt: skip
         several = "for all objects of several classes use how='windows', and for one of them a class without a list"
         check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
         self.how = "windows" if targets else how
+        check_white(white)
+        self._white = white
         self._start, self._canvas = start, windows.eye.detector.input_size
         evidence = windows.evidence
         self._photographs = start is None and evidence is not None and evidence.photograph is not None
@@ -96,6 +101,8 @@ class LivePerception:
             InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
             DataError: the file of the frame cannot be read.
         """
+        if self._white is not None:
+            frame = as_image(frame, argument="frame", white=self._white)
         picture = open_picture(frame)
         check(not picture.scene, "frame", "a picture; search and find_all take scenes", type(frame).__name__)
         if self.how == "auto":

@@ -2,12 +2,16 @@
 
 from contextlib import suppress
 from functools import cached_property
-from typing import Literal, cast, get_args
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
 
 from torch import Tensor
 
+from semfov.data.images import MAX_PIXELS
 from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.data.large import BY_WINDOWS, Bands, LargePicture, open_large, picture_size
+from semfov.data.tone import White
 from semfov.errors import SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
 from semfov.head.world import World
@@ -27,9 +31,13 @@ PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 class OpenedPicture:
     """A photograph, a large picture or a scene; what a kind of look needs of it is read when it is asked for."""
 
-    def __init__(self, source: PictureLike, color: Color = "rgb") -> None:
-        self.source, self.color = source, color
+    def __init__(
+        self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: Bands = None
+    ) -> None:
+        self.source, self.color, self.white, self.bands = source, color, white, bands
         self.scene = is_scene(source)
+        made = isinstance(source, World | LargePicture)
+        check(not made or white is bands is None, "white", "None for a picture that is open", white)
 
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
         """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""
@@ -43,30 +51,40 @@ class OpenedPicture:
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            size = picture_size(cast(ImageLike | LargePicture, self.source))
+            file = isinstance(self.source, str | PathLike)
+            size = self.large.size if file else picture_size(cast(ImageLike | LargePicture, self.source))
             return "windows" if photographs or pays(size, canvas) else "fovea"
         return "fovea"
 
     def image(self, like: Tensor) -> Tensor:
         """The pixels for a fovea, `(1, 3, H, W)`."""
-        if isinstance(self.source, LargePicture):
-            return as_image(self.source.read((0, 0, *self.source.size)), like=like, argument="picture")[None]
-        return as_image(cast(ImageLike, self.source), like=like, argument="picture", color=self.color)[None]
+        source, path = self.source, isinstance(self.source, str | PathLike)
+        if isinstance(source, LargePicture) or (path and Path(cast(str, source)).suffix.lower() in BY_WINDOWS):
+            width, height = self.large.size
+            most = f"at most {MAX_PIXELS:,} pixels for a fovea"
+            check(width * height <= MAX_PIXELS, "picture", most, f"{width} × {height}; use how='windows'")
+            return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
+        settings: dict[str, Any] = {"color": self.color, "white": self.white}
+        return as_image(cast(ImageLike, source), like=like, argument="picture", **settings)[None]
 
     @cached_property
     def large(self) -> LargePicture:
         """The picture for windows."""
-        return open_large(cast(ImageLike | LargePicture, self.source), color=self.color)
+        source = cast(ImageLike | LargePicture, self.source)
+        return open_large(source, color=self.color, white=self.white, bands=self.bands)
 
     @cached_property
     def world(self) -> World:
         """The scene for a head."""
-        return open_scene(self.source, self.color)
+        given = self.white is not None or self.bands is not None
+        return open_scene(self.large if given else self.source, self.color)
 
 
-def open_picture(source: "PictureLike | OpenedPicture", color: Color = "rgb") -> OpenedPicture:
+def open_picture(
+    source: "PictureLike | OpenedPicture", color: Color = "rgb", white: White | None = None, bands: Bands = None
+) -> OpenedPicture:
     """Open a picture of any kind; one that is open stays as it is."""
-    return source if isinstance(source, OpenedPicture) else OpenedPicture(source, color)
+    return source if isinstance(source, OpenedPicture) else OpenedPicture(source, color, white, bands)
 
 
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:

@@ -51,7 +51,7 @@ class PictureJob(ABC):
 
     def __init__(self, options: Any) -> None:
         self.options: Any = options
-        self._sources = picture_sources(options.pictures, recursive=options.recursive)
+        self._sources = picture_sources(options)
         self.several = len(self._sources) > 1
         for name in ("crops", "labels"):
             places = Counter(str(source.place.with_suffix("")) for source in self._sources)
@@ -90,7 +90,7 @@ class PictureJob(ABC):
                 picture = source.opened(self.options.how)
                 record = self.look(picture, self._shared(picture, source), source)
                 seconds = time.perf_counter() - began
-                return picture_outcome(record, source, self.options, seconds, self.agent.eye.settings())
+                return picture_outcome(record, picture, source, self.options, seconds, self.agent.eye.settings())
         except SemfovError as error:
             return error
         except Exception as error:

@@ -6,14 +6,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
+from semfov.agents.picture import open_picture
 from semfov.cli.agent import check_device
 from semfov.cli.options import GazeOptions
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.fixations import write_table
-from semfov.data.inputs import as_image
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import SemfovError, check
@@ -27,7 +28,7 @@ _DENSITIES = (".npy", ".tif", ".tiff", ".png")
 
 def predict_gaze(options: GazeOptions) -> int:
     """Predict where people look in all pictures; returns the exit code, 1 if a picture was left out."""
-    sources = picture_sources(options.pictures, recursive=options.recursive)
+    sources = picture_sources(options)
     kind = None if options.out is None or options.out.is_dir() else options.out.suffix.lower()
     check(kind in (None, "", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", options.out)
     check(
@@ -49,7 +50,7 @@ def predict_gaze(options: GazeOptions) -> int:
         sources, unit="picture", leave=False, disable=len(sources) == 1 or options.quiet or not sys.stderr.isatty()
     ):
         try:
-            image = as_image(str(source.file), argument="picture") if source.scene is None else source.scene.image
+            image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
             prediction = GazePrediction.of(detector, image, source=None if source.file is None else str(source.file))
         except SemfovError as error:
             if len(sources) == 1:

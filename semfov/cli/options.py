@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from semfov.agents.episode import MOST_PASSES
 from semfov.agents.picture import How
@@ -71,6 +71,10 @@ class PictureOptions(AgentOptions):
         shifts: largest number of gaze shifts of a fovea (none: 30 for a search, 20 otherwise, without limit of passes).
         seconds: longest time in seconds for each picture on this machine.
         duration: longest time in seconds that eye and head move in a scene (none: 30).
+        white: values that are black and white in thermal pictures, reflectances or 12 bits: the white, `4095`, both as
+            `300,3000`, or `auto` for percentiles (none: 0 and the largest value of 8 or 16 bits).
+        bands: bands of a TIFF or a raster that are red, green and blue, as `4,3,2`, or one as grey (none: those that
+            the file names).
         out: file of results, `.json`, `.jsonl`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and
             results; `-` writes JSON lines to standard output, and everything else to standard error.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
@@ -92,6 +96,8 @@ class PictureOptions(AgentOptions):
     shifts: Shifts | None = None
     seconds: Positive | None = None
     duration: Positive | None = None
+    white: str | None = None
+    bands: str | None = None
     out: Path | None = None
     draw: tuple[Drawing, ...] | None = None
     report: Path | None = None
@@ -206,6 +212,8 @@ class GazeOptions(Settings):
         device: where the detector runs, such as `cuda` (none: the processor).
         people: number of viewers whose scanpaths are drawn.
         seconds: time in seconds for which each views a picture.
+        white: values that are black and white, as for `semfov search`.
+        bands: bands of a TIFF or a raster that are shown, as for `semfov search`.
         seed: seed of all draws.
         out: file of scanpaths, `.csv`; of the density of one picture, `.npy`, `.tif` or `.png`; or a folder for
             scanpaths and a heat map of each picture.
@@ -220,6 +228,8 @@ class GazeOptions(Settings):
     device: str | None = None
     people: Annotated[int, Range(1, 1000)] = 15
     seconds: Annotated[float, Range(0.1, 60)] = 3.0
+    white: str | None = None
+    bands: str | None = None
     seed: Seed = 0
     out: Path | None = None
     report: Path | None = None
@@ -252,3 +262,25 @@ def start_of(text: str | None) -> int | tuple[int, int] | None:
     if len(numbers) not in (1, 2) or min(numbers) < 0:
         raise InputError(f"start: expected a cell as column,row (5,5) or as its number (47), got {text!r}")
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
+    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given.
+
+    >>> shown_by(PictureOptions(white="300,3000", bands="4,3,2"))
+    {'white': (300.0, 3000.0), 'bands': (4, 3, 2)}
+    """
+    shown: dict[str, Any] = {}
+    if options.white is not None:
+        try:
+            values = "auto" if options.white == "auto" else tuple(float(each) for each in options.white.split(","))
+        except ValueError:
+            raise InputError(f"white: expected 4095, 300,3000 or auto, got {options.white!r}") from None
+        shown["white"] = values[0] if len(values) == 1 else values
+    if options.bands is not None:
+        try:
+            numbers = tuple(int(each) for each in options.bands.split(","))
+        except ValueError:
+            raise InputError(f"bands: expected 4,3,2 or the number of one band, got {options.bands!r}") from None
+        shown["bands"] = numbers
+    return shown

@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from semfov.agents.picture import PictureLike
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of, result_row
 from semfov.cli.sources import PictureSource
@@ -43,7 +44,12 @@ class PictureOutcome:
 
 
 def picture_outcome(
-    record: GazeRecord, source: PictureSource, options: PictureOptions, seconds: float, settings: Mapping[str, Any]
+    record: GazeRecord,
+    opened: PictureLike,
+    source: PictureSource,
+    options: PictureOptions,
+    seconds: float,
+    settings: Mapping[str, Any],
 ) -> PictureOutcome:
     """Make the text, the row, the part of a page and the figures of a record, as the options say."""
     usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
@@ -55,8 +61,7 @@ def picture_outcome(
     if options.report is not None:
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.
-        whole = source.file if source.scene is None else source.scene.image
-        picture = whole if record.how == "windows" else None
+        picture = opened if record.how == "windows" else None
         episode = record.page_data(picture, name=name, settings=settings, boxes=source.boxes)
     figures = _draw_episode(record, source.boxes, drawings)
     return PictureOutcome(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from glob import glob
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,8 @@ from torch import Tensor
 from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.belief.grid import Grid
-from semfov.data.large import picture_size
+from semfov.cli.options import GazeOptions, PictureOptions, shown_by
+from semfov.data.large import open_large, picture_size
 from semfov.data.sources import Picture, is_video, picture_files
 from semfov.errors import check, printable
 from semfov.head import Flat, Panorama
@@ -21,12 +23,13 @@ from semfov.head import Flat, Panorama
 
 @dataclass(frozen=True)
 class PictureSource:
-    """A picture to look at; `place` is its path in the folder that was named."""
+    """A picture to look at: `place` is its path in the folder that was named, `shown` are arguments of `open_large`."""
 
     name: str
     file: Path | None = None
     scene: Picture | None = None
     place: Path = Path("embedded-scene")
+    shown: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def boxes(self) -> Tensor | None:
@@ -34,8 +37,10 @@ class PictureSource:
         return None if self.scene is None else self.scene.boxes
 
     def opened(self, how: How) -> PictureLike:
-        """The picture, or for a head the scene that it is a picture of."""
-        picture = str(self.file) if self.scene is None else self.scene.image
+        """The picture, with the values and bands that are to be shown, or for a head the scene that it is one of."""
+        picture: Any = str(self.file) if self.scene is None else self.scene.image
+        if self.shown:
+            picture = open_large(picture, **self.shown)
         if how != "head":
             return picture
         width, height = picture_size(picture)
@@ -52,9 +57,10 @@ class PictureSource:
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
 
-def picture_sources(pictures: Sequence[str], *, recursive: bool = False) -> list[PictureSource]:
+def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: list[PictureSource] = []
+    pictures, shown = options.pictures, shown_by(options)
     matched = (sorted(glob(name, recursive=True)) if set(name) & set("*?[") else [] for name in pictures)
     for name in (each for one, some in zip(pictures, matched, strict=True) for each in some or [one]):
         path = Path(name)
@@ -63,12 +69,9 @@ def picture_sources(pictures: Sequence[str], *, recursive: bool = False) -> list
         expected = f"a file or folder (a class is given by --target {name})"
         check(there, "picture", expected, f"{name}, which does not exist")
         check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
-        sources += [
-            PictureSource(
-                printable(str(each)), each, place=each.relative_to(path) if path.is_dir() else Path(each.name)
-            )
-            for each in picture_files(path, recursive=recursive)
-        ]
+        for each in picture_files(path, recursive=options.recursive):
+            place = each.relative_to(path) if path.is_dir() else Path(each.name)
+            sources.append(PictureSource(printable(str(each)), each, place=place, shown=shown))
     return sources
 
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.tone import White, between, black_and_white, check_white
 from semfov.errors import DataError
 from semfov.io.files import check_regular
 
@@ -46,7 +47,7 @@ _INVERSE = {6: 8, 8: 6}
 _SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 
 
-def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
+def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
     """Read an image file as RGB.
 
     The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
@@ -56,6 +57,8 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     Args:
         path: a file in one of `FORMATS`, whatever its name.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
+        white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
+            `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.
 
     Returns:
         `(3, H, W)`, float32 in [0, 1].
@@ -72,6 +75,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     """
     from PIL import Image, UnidentifiedImageError
 
+    check_white(white)
     name = f"image {Path(path)}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
@@ -79,8 +83,8 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             with open_pillow(path) as image:
                 check_proportion(image, path)
                 _check_pixels(image.size, name)
-                wide = image.mode in _SIXTEEN_BITS
-                array = _pixels(image, name, upright=oriented)
+                wide = image.mode in _SIXTEEN_BITS and white is None
+                array = _pixels(image, name, upright=oriented, white=white)
         except DataError:
             raise
         except FileNotFoundError:
@@ -106,7 +110,7 @@ def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
     if 0 < most - least < 65535 / 4:
         warnings.warn(
             f"image {Path(path)}: values from {least:.0f} to {most:.0f} of 16 bits, whose white is 65535, show little; "
-            "scale them to 8 bits, such as (image - low) / (high - low) between two percentiles",
+            f"give the value that is white, white={most:.0f}, or white='auto' for percentiles",
             stacklevel=3,
         )
 
@@ -146,13 +150,13 @@ def check_tile(size: int, stored: int, name: str) -> None:
         raise DataError(f"{name}: expected tiles in proportion, got {size:,} bytes stored in {stored:,}; replace it")
 
 
-def from_pillow(image: Any, name: str) -> Tensor:
+def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about damaged metadata
         try:
             _check_pixels(image.size, name)
-            array = _pixels(image, name, upright=True)
+            array = _pixels(image, name, upright=True, white=white)
         except DataError:
             raise
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
@@ -204,25 +208,32 @@ def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
     return image if orientation == 1 else image.transpose(Transpose[_MOVES[orientation]])
 
 
-def _pixels(image: Any, name: str, *, upright: bool) -> NDArray[np.float32]:
+def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
     stored = orientation(image)
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     inverted = image.mode in _SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
     image.load()
-    pixels = _rgb(turned(image, stored, orientation(image), upright=upright), name)
+    pixels = _rgb(turned(image, stored, orientation(image), upright=upright), name, white)
     return 1 - pixels if inverted else pixels
 
 
-def _rgb(image: Any, name: str) -> NDArray[np.float32]:
+def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1] of a Pillow image of any mode."""
-    if image.mode in _SIXTEEN_BITS or image.mode == "F":
-        grey = np.asarray(image, dtype=np.float32)
-        white = 1.0 if image.mode == "F" else 65535.0
-        if not (grey.min() >= 0 and grey.max() <= white):  # also refuses NaN
-            raise DataError(f"{name}: expected values from 0 to {white:g} in mode {image.mode}; convert it to 8 bits")
-        return np.repeat(grey[..., None] / np.float32(white), 3, axis=-1)
-    return np.asarray(over_white(image).convert("RGB"), dtype=np.float32) / np.float32(255)
+    wide = image.mode in _SIXTEEN_BITS or image.mode == "F"
+    pixels = np.asarray(image if wide else over_white(image).convert("RGB"))
+    if white is not None:
+        pixels = between(pixels, black_and_white(white, pixels))
+    elif not wide:
+        pixels = pixels.astype(np.float32) / np.float32(255)
+    else:
+        most = 1.0 if image.mode == "F" else 65535.0
+        if not (pixels.min() >= 0 and pixels.max() <= most):  # also refuses NaN
+            expected = f"values from 0 to {most:g} in mode {image.mode}"
+            got = f"{pixels.min():g} to {pixels.max():g}; give white=(low, high) or white='auto'"
+            raise DataError(f"{name}: expected {expected}, got {got}")
+        pixels = pixels.astype(np.float32) / np.float32(most)
+    return np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels
 
 
 def over_white(image: Any) -> Any:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import from_pillow, read_image
+from semfov.data.tone import White, between, black_and_white, check_white
 from semfov.errors import InputError, check, check_pixels, lookup
 
 if TYPE_CHECKING:
@@ -31,7 +32,14 @@ STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
-def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb") -> Tensor:
+def as_image(
+    image: ImageLike,
+    *,
+    like: Tensor | None = None,
+    argument: str = "image",
+    color: Color = "rgb",
+    white: White | None = None,
+) -> Tensor:
     """Convert a picture of any common type to RGB in [0, 1].
 
     - A path: a file that Pillow reads (`semfov.read_image`).
@@ -49,6 +57,8 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "i
             to float32, and leaves the picture on its device.
         argument: name of the argument, for the message.
         color: order of the channels of arrays and tensors. Files and Pillow images know their own.
+        white: the value that is white where 0 is black, the values `(black, white)`, or `auto` for percentiles, of
+            numbers of any type (`semfov.read_image`); None as said above.
 
     Returns:
         `(3, H, W)`, RGB.
@@ -61,13 +71,18 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "i
     >>> as_image(np.zeros((48, 64, 3), np.uint8)).shape
     torch.Size([3, 48, 64])
     """
-    images = as_images(image, like=like, argument=argument, color=color)
+    images = as_images(image, like=like, argument=argument, color=color, white=white)
     check(len(images) == 1, argument, "one picture", f"a batch of {len(images)}; give them one by one")
     return images[0]
 
 
 def as_images(
-    images: ImageLike, *, like: Tensor | None = None, argument: str = "image", color: Color = "rgb"
+    images: ImageLike,
+    *,
+    like: Tensor | None = None,
+    argument: str = "image",
+    color: Color = "rgb",
+    white: White | None = None,
 ) -> Tensor:
     """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`.
 
@@ -76,7 +91,8 @@ def as_images(
 
     Shapes: → `(B, 3, H, W)`.
     """
-    pixels = channels_first(pixels_of(images, argument), argument, choose=not isinstance(images, np.ndarray))
+    check_white(white)
+    pixels = channels_first(pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
     pixels = in_rgb(pixels, images, color)
     whole, pixels = not pixels.is_floating_point(), _in_unit(pixels, like, argument)
     if not whole:
@@ -102,8 +118,12 @@ def is_batch(image: object) -> bool:
     return isinstance(image, Tensor | np.ndarray) and image.ndim > 3
 
 
-def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
-    """The pixels of a picture; arrays and tensors keep their layout and dtype. Refuses what is no picture."""
+def pixels_of(image: ImageLike, argument: str = "image", white: White | None = None) -> Tensor:
+    """The pixels of a picture; arrays and tensors keep their layout, without `white` also their dtype."""
+    if white is not None and isinstance(image, Tensor | np.ndarray):
+        values = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
+        check(values.dtype.kind in "buif" and values.size > 0, argument, "numbers", f"{values.dtype} {values.shape}")
+        return torch.from_numpy(between(values, black_and_white(white, values)))
     if isinstance(image, Tensor):
         return image
     if isinstance(image, np.ndarray):
@@ -116,11 +136,11 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
         return torch.from_numpy(np.array(image, dtype=native, order="C"))
     if isinstance(image, str | PathLike):
         check_local(image, argument)
-        return read_image(image)
+        return read_image(image, white=white)
     from PIL.Image import Image
 
     if isinstance(image, Image):
-        return from_pillow(image, argument)
+        return from_pillow(image, argument, white)
     expected = "a path, a Pillow image, a NumPy array or a tensor"
     got = type(image).__name__
     if image is None:
@@ -188,7 +208,7 @@ def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
 
 
 def _integers(array: NDArray[Any]) -> str:
-    return "; convert it to bytes, array.astype('uint8')" if array.dtype.kind == "i" else ""
+    return "; convert it to bytes, array.astype('uint8'), or give white=" if array.dtype.kind == "i" else ""
 
 
 def _in_unit(pixels: Tensor, like: Tensor | None, argument: str) -> Tensor:

@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 
 from semfov.data.images import read_image
-from semfov.data.large import _ArrayPicture, _MemoryPicture, _TiffPicture, open_large
+from semfov.data.large import _ArrayPicture, _MemoryPicture, open_large
+from semfov.data.tiff import TiffPicture
 from semfov.errors import DataError, InputError
 
 
@@ -83,7 +84,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     array[1000:1100, 2000:2100] = 77
     tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
     del array
-    picture = _TiffPicture(tmp_path / "large.tif")
+    picture = TiffPicture(tmp_path / "large.tif")
     tracemalloc.start()
     window = picture.read((1900, 900, 2316, 1316))
     peak = tracemalloc.get_traced_memory()[1]
@@ -169,4 +170,4 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
     monkeypatch.setitem(sys.modules, "tifffile", None)
     assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)
     with pytest.raises(DataError, match="pip install tifffile"):
-        _TiffPicture(tmp_path / "a.tif")
+        TiffPicture(tmp_path / "a.tif")

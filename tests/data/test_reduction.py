@@ -6,8 +6,9 @@ import torch
 from PIL import Image
 from torch.nn import functional
 
-from semfov.data.large import _ArrayPicture, _TiffPicture
+from semfov.data.large import _ArrayPicture
 from semfov.data.reduction import ReducedCopies, resized
+from semfov.data.tiff import TiffPicture
 from tests.data.test_large import pixels
 
 
@@ -99,7 +100,7 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)
-    assert torch.equal(_TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
+    assert torch.equal(TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
 
 
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):

@@ -1,0 +1,90 @@
+"""The values of a picture that are shown as black and as white, for thermal cameras, reflectances and 12 bits."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.errors import check
+from semfov.io.schema import is_number
+
+White = float | tuple[float, float] | Literal["auto"]
+"""The value that is white where 0 is black, the values that are black and white, or `auto` for percentiles."""
+
+_PERCENTILES = 1.0, 99.0  # of the values, which are black and white for `auto`
+_ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which the values of a picture are looked at
+_ROWS = 64  # of a picture that are converted at once: more leave the cache of the processor
+
+
+def check_white(white: White | None) -> None:
+    """Raise `InputError` for what is no white."""
+    if white is None or (isinstance(white, str) and white == "auto"):
+        return
+    pair = white if isinstance(white, tuple | list) else (0.0, white)
+    fits = len(pair) == 2 and all(is_number(each) and np.isfinite(each) for each in pair) and pair[0] < pair[1]
+    check(fits, "white", "a value above 0, (black, white) with black < white, or 'auto'", white)
+
+
+def black_and_white(white: White, values: NDArray[Any], nodata: float | None = None) -> tuple[float, float]:
+    """The values that are shown as black and as white, by percentiles of some values of the picture for `auto`.
+
+    >>> black_and_white(4095, np.zeros(0)), black_and_white((300, 3000), np.zeros(0))
+    ((0.0, 4095.0), (300.0, 3000.0))
+    >>> black_and_white("auto", np.arange(101))
+    (1.0, 99.0)
+    """
+    if white != "auto":
+        pair = white if isinstance(white, tuple | list) else (0.0, white)
+        return float(pair[0]), float(pair[1])
+    there = values[np.isfinite(values) & (values != (np.nan if nodata is None else nodata))]
+    if not there.size:
+        return 0.0, 1.0
+    low, high = (float(each) for each in np.percentile(there, _PERCENTILES))
+    return low, high if high > low else low + 1.0
+
+
+def between(values: NDArray[Any], tone: tuple[float, float]) -> NDArray[np.float32]:
+    """Values from 0, black, to 1, white; NaN is black.
+
+    >>> between(np.array([5, 10, 15, 40]), (10, 30)).tolist()
+    [0.0, 0.0, 0.25, 1.0]
+    """
+    low, high = tone
+    share = (values.astype(np.float64) - low) / (high - low)
+    return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)
+
+
+def bytes_between(values: NDArray[Any], tone: tuple[float, float] | None) -> NDArray[np.uint8]:
+    """Bytes of values `(h, w, ...)`, a few rows at a time; without a tone white is the largest of 8 or 16 bits."""
+    if values.dtype == np.uint8 and tone is None:
+        return values
+    shown = np.empty(values.shape, np.uint8)
+    for top in range(0, len(values), _ROWS):
+        rows = slice(top, top + _ROWS)
+        if tone is None:
+            shown[rows] = (values[rows].astype(np.uint32) * 255 + 32767) // 65535
+        else:
+            shown[rows] = np.rint(between(values[rows], tone) * 255)
+    return shown
+
+
+def sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
+    """Windows all over a picture in which its values are looked at, row by row.
+
+    >>> next(sample_windows((1000, 500)))
+    (100, 50, 164, 114)
+    """
+    width, height = size
+    for row in range(_ACROSS):
+        for column in range(_ACROSS):
+            x, y = (length * (1 + 2 * n) // (2 * _ACROSS) for length, n in zip(size, (column, row), strict=True))
+            yield x, y, min(x + _SIDE, width), min(y + _SIDE, height)
+
+
+def check_bands(bands: int | Sequence[int] | None) -> None:
+    """Raise `InputError` for what are no numbers of one band or of three."""
+    if bands is not None:
+        numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
+        fits = len(numbers) in (1, 3) and all(type(each) is int and each >= 1 for each in numbers)
+        check(fits, "bands", "the number of a band, or three for red, green and blue, from 1", bands)
