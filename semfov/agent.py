@@ -211,11 +211,10 @@ class ActivePerception(nn.Module):
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
         fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
-        eye, cells = (
-            f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes",
-            (self.columns, self.rows),
+        eye = (
+            f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes, {type(self.eye.sensor).__name__}"
         )
-        return f"{type(self).__name__}({eye}, {type(self.eye.sensor).__name__}, cells={cells}, fitted={fitted})"
+        return f"{type(self).__name__}({eye}, cells={(self.columns, self.rows)}, fitted={fitted})"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -241,11 +240,9 @@ class ActivePerception(nn.Module):
         """
         search, explore = self.searching.observer, self.exploring.observer
         if not (isinstance(search, Target) and isinstance(explore, LearnedMap)):
-            raise InputError(
-                f"how: expected an agent with learned evidence and a learned map for a head, got one with "
-                f"{type(search).__name__} and {type(explore).__name__}; use ActivePerception.recommended, or fit them "
-                "to your detector (semfov fit)"
-            )
+            got = f"{type(search).__name__} and {type(explore).__name__}"
+            remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
+            raise InputError(f"how: expected an agent with learned evidence and map for a head, got {got}; {remedy}")
         return HeadAgent(self.eye, search.model, explore.model)
 
     def kind_of_look(
@@ -255,10 +252,9 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: as for `search`, or one that is opened.
-            how: `auto` chooses by the picture; another kind is returned as it is, if it suits the picture.
+            how: `auto` chooses by the picture; another kind is returned, if it suits the picture.
             every: whether all objects are wanted.
-            foveal: whether something is asked for that only a fovea can do in a photograph: a search for any of several
-                classes, a first cell, gaze shifts, or the protocol of the paper.
+            foveal: whether a fovea is asked for: by several classes, a first cell, gaze shifts or true boxes.
 
         Returns:
             `fovea`, `windows` or `head`.
@@ -329,15 +325,11 @@ class ActivePerception(nn.Module):
                 the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
                 0.5 for a belief without thresholds.
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. None takes 2 in
-                a photograph, and as many as there are passes for in a large picture. 0 decides without them, as does
-                an agent without a model of verification.
+            closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 2 in a photograph,
+                and all that there are passes for in a large picture. 0, and no fitted verification, make none.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
-            white: for a thermal picture, reflectances or 12 bits: the value that is white where 0 is black, the values
-                `(black, white)`, or `auto` for the 1st and the 99th percentile. None takes the largest value of 8 or 16
-                bits, and 1 for floats.
-            bands: numbers of the bands of a TIFF or a raster that are red, green and blue, from 1, or of one as grey;
-                None takes those that the file names.
+            white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
+            bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
 
         Returns:
             The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
@@ -352,23 +344,21 @@ class ActivePerception(nn.Module):
         # Class numbers may be those of NumPy or a tensor, which have no length.
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
         foveal = start is not None or boxes is not None or len(targets) > 1
-        opened, kind, limits = self._begin(
-            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, foveal=foveal
-        )
+        opened = open_picture(picture, color, white, bands)
+        kind = self._kind(opened, how, shifts, duration, foveal=foveal)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
-            return self.fovea.search(
-                opened.image(self.eye.sensor.like),
-                target,
-                EpisodeLimits(**limits),
-                shifts=shifts,
-                closer=MOST_CLOSER if closer is None else closer,
-                start=start,
-                seed=seed,
-                boxes=boxes,
-                confirm=confirm,
-                give_up=give_up,
-            )
+            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
+            settings: dict[str, Any] = {
+                "start": start,
+                "seed": seed,
+                "boxes": boxes,
+                "confirm": confirm,
+                "give_up": give_up,
+            }
+            settings |= {"shifts": shifts, "closer": MOST_CLOSER if closer is None else closer}
+            return self.fovea.search(image, target, bounds, **settings)
         check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
               target)  # fmt: skip
         arguments = without_none(confirm=confirm, give_up=give_up, **limits)
@@ -411,10 +401,8 @@ class ActivePerception(nn.Module):
             seconds: longest time in seconds on this machine.
             duration: in a scene, longest time in seconds that the movements of eye and head take.
             on_look: called after each look with the record so far; returning False ends it.
-            worth: least gain for which a look is worth it: of windows the expected number of new objects, where None
-                takes 0.01; of a head the expected number of additional correct cells, where None takes all looks.
-            least: score from which on an object counts, in windows its probability; None takes 0.5 there, and elsewhere
-                what suits the detector (`record.least`).
+            worth: least gain of a look: of windows new objects (None: 0.01), of a head further right cells (None: 0).
+            least: score from which on an object counts; None takes `record.least`, 0.5 in windows.
             batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
@@ -429,9 +417,9 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        opened, kind, limits = self._begin(
-            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, every=True
-        )
+        opened = open_picture(picture, color, white, bands)
+        kind = self._kind(opened, how, shifts, duration, every=True)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
@@ -474,10 +462,9 @@ class ActivePerception(nn.Module):
             seconds: longest time in seconds on this machine.
             duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
             on_look: called after each look with the record so far; returning False ends the exploration.
-            worth: least expected gain of a look. Of a fovea with a learned map it is the increase in the number of
-                correctly classified cells (`semfov.acquisition.ExpectedGain`; None takes 0.1). Of windows it is the
-                number of new objects (None takes 0.01), and of a head that of additional correct cells. 0 makes all
-                looks.
+            worth: least expected gain of a look: of a fovea with a learned map the further cells that are right
+                (`semfov.acquisition.ExpectedGain`; None takes 0.1), of windows the new objects (None takes 0.01), of a
+                head the further cells that are right. 0 makes all looks.
             least: score or probability from which on an object counts, as for `find_all`.
             start: first cell of a fovea or first action of a head, as for `search`.
             seed: seed of the generator that draws the start and breaks ties.
@@ -493,14 +480,13 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        foveal = start is not None
-        opened, kind, limits = self._begin(
-            (picture, color, white, bands), how, passes, seconds, on_look, shifts, duration, foveal=foveal
-        )
+        opened = open_picture(picture, color, white, bands)
+        kind = self._kind(opened, how, shifts, duration, foveal=start is not None)
+        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            record = self.fovea.explore(image, bounds, start=start, shifts=shifts, seed=seed, worth=worth)
-            return _counting(record, least)
+            given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth}
+            return _counting(self.fovea.explore(image, bounds, **given), least)
         arguments = without_none(worth=worth, **limits)
         if kind == "head":
             arguments |= without_none(start=start, duration=duration)
@@ -526,8 +512,8 @@ class ActivePerception(nn.Module):
             InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
             DataError: the file of the picture cannot be read.
         """
-        source = fspath(picture) if isinstance(picture, str | PathLike) else None
         image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
+        source = fspath(picture) if isinstance(picture, str | PathLike) else None
         return GazePrediction.of(self.eye.detector, image, source=source)
 
     def live(
@@ -558,8 +544,8 @@ class ActivePerception(nn.Module):
             confirm: least probability for `found`, as for `search`; None takes that of the model.
             give_up: probability below which a look is not worth a frame; None takes that of the belief alone, which a
                 belief that fades can reach, or with rate 0 that of `search`.
-            closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
-                evidence is forgotten (ln 2 / rate frames); None takes 2 for a fovea, and 100 for windows.
+            closer: largest number of closer looks, 0 to 100, in the time until half of the evidence is forgotten
+                (ln 2 / rate frames); None takes 2 for a fovea, and 100 for windows.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.
 
@@ -569,14 +555,13 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: a class is unknown, or an argument does not fit.
         """
-        numbers = class_numbers(target, self.classes[1:], "target")
-        one = bool(numbers) and not isinstance(target, list | tuple)
+        numbers, one = class_numbers(target, self.classes[1:], "target"), not isinstance(target, list | tuple)
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
         return LivePerception(
             self.fovea,
             self.zoom,
-            numbers[0] if one else None,
+            numbers[0] if numbers and one else None,
             () if one else numbers,
             how=lookup(how, get_args(How), "kind of look"),
             rate=rate,
@@ -589,25 +574,15 @@ class ActivePerception(nn.Module):
             white=white,
         )
 
-    def _begin(
-        self,
-        picture: tuple[PictureLike, Color, White | None, Bands],
-        how: How,
-        passes: int | None,
-        seconds: float | None,
-        on_look: OnLook | None,
-        shifts: int | None,
-        duration: float | None,
-        *,
-        every: bool = False,
-        foveal: bool = False,
-    ) -> tuple[OpenedPicture, KindOfLook, dict[str, Any]]:
-        """Open the picture, choose the kind of look, and check the limits that suit it."""
-        opened = open_picture(*picture)
-        kind = self.kind_of_look(opened, how, every=every, foveal=foveal or shifts is not None)
+    def _kind(
+        self, picture: OpenedPicture, how: How, shifts: int | None, duration: float | None, **wanted: bool
+    ) -> KindOfLook:
+        """Choose the kind of look, and check the limits that suit it; wanted as for `kind_of_look`."""
+        foveal = wanted.pop("foveal", False) or shifts is not None
+        kind = self.kind_of_look(picture, how, foveal=foveal, **wanted)
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)
-        return opened, kind, {"passes": passes, "seconds": seconds, "on_look": on_look}
+        return kind
 
     def _check_parts(self) -> None:
         """Raise `InputError` where a model was fitted for another detector, sensor or grid."""

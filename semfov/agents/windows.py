@@ -22,6 +22,7 @@ from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.closer import candidates, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
@@ -339,12 +340,15 @@ class WindowEpisode(Episode[ZoomPath]):
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]
+        still = self.forgetting is None or self.forgetting.rate == 0
+        if isinstance(glances, LiveGlances) and still and not told and glances.lattice.levels > 1:
+            glances.blank = blank_cells(glances.view.picture, glances.lattice)
         if told:
             self.searches, self._decisions = False, None
             belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
             self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
         elif self.evidence is None or (self._slicing and not self.searches):
-            order = ranked(usual_slices(glances.lattice), sought)
+            order = ranked(not_blank(usual_slices(glances.lattice), glances.blank), sought)
             self._turns = look_by_look(glances, order, None, forgetting=self.forgetting)
         elif self.searches and self.target is not None:
             self._turns = look_for(glances, self.evidence, self.target, confirm=inf, forgetting=self.forgetting)

@@ -55,11 +55,11 @@ class ZoomBelief:
 
     Sums over windows (`WindowSums`) and log odds (`WindowOdds`) are kept, and computed anew where cells have changed.
 
-    Shapes: source `(rows, columns)`, left `(rows, columns)`.
+    Shapes: source, left and blank `(rows, columns)`.
     """
 
-    def __init__(self, lattice: Lattice, evidence: Rates, target: int) -> None:
-        self.lattice, self.target = lattice, target
+    def __init__(self, lattice: Lattice, evidence: Rates, target: int, blank: Tensor | None = None) -> None:
+        self.lattice, self.target, self._blank = lattice, target, blank
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
@@ -73,7 +73,7 @@ class ZoomBelief:
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0
         self.source = torch.full(shape, -1)
-        self.left = torch.ones(shape)
+        self.left = torch.ones(shape) if self._blank is None else 1 - self._blank.float()
         self.gists: list[Gist] = []
         self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds: WindowOdds | None = None

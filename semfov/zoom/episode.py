@@ -140,7 +140,8 @@ def look_for(
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at."""
-    belief, last = ZoomBelief(glances.lattice, evidence, target), glances.lattice.levels - 1
+    belief = ZoomBelief(glances.lattice, evidence, target, glances.blank)
+    last = glances.lattice.levels - 1
     allowed = None if slices is None else set(slices)
 
     def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
@@ -165,7 +166,7 @@ def find_everything(
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough."""
-    belief = ZoomBelief(glances.lattice, evidence, target or 0)
+    belief = ZoomBelief(glances.lattice, evidence, target or 0, glances.blank)
 
     def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)

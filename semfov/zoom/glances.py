@@ -92,6 +92,8 @@ class Glances(ABC):
 
     lattice: Lattice
     frame: int = 0
+    blank: Tensor | None = None
+    """Cells where there is nothing to see, `(rows, columns)`; None for none."""
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
