@@ -59,7 +59,9 @@ class ZoomBelief:
     """
 
     def __init__(self, lattice: Lattice, evidence: Rates, target: int, blank: Tensor | None = None) -> None:
-        self.lattice, self.target, self._blank = lattice, target, blank
+        self.lattice, self.target = lattice, target
+        self._there = torch.ones(lattice.rows, lattice.columns) if blank is None else 1 - blank.float()
+        self._areas: dict[int, Cells] = {}
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
@@ -73,7 +75,7 @@ class ZoomBelief:
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0
         self.source = torch.full(shape, -1)
-        self.left = torch.ones(shape) if self._blank is None else 1 - self._blank.float()
+        self.left = self._there.clone()
         self.gists: list[Gist] = []
         self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds: WindowOdds | None = None
@@ -197,10 +199,19 @@ class ZoomBelief:
         return values + np.float32(foresight) * self._sum(level, 2)
 
     def unseen(self, level: int) -> Cells:
-        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`."""
-        span = self.lattice.span(level)
-        whole = min(span, self.lattice.rows) * min(span, self.lattice.columns)
-        return self._sum(level, 0) / np.float32(whole)
+        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`.
+
+        Of what is not blank in it.
+        """
+        if level not in self._areas:
+            there, ones = self._there.numpy(), np.ones(self.lattice.span(level), np.float32)
+            self._areas[level] = WindowSums(ones, there.shape, there.__getitem__).update().clip(1)
+        return self._sum(level, 0) / self._areas[level]
+
+    @property
+    def left_share(self) -> float:
+        """Share of the picture that is left to see, of what is not blank."""
+        return float(self.left.sum() / self._there.sum().clamp(1))
 
     def _sum(self, level: int, octaves: int) -> Cells:
         """Sums over the windows of a level; → `(down, across)`."""

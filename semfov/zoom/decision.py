@@ -93,7 +93,7 @@ class SearchFacts:
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
         closest, named = max(look.closest for look in looks), max(look.named for look in looks)
         hints = features(torch.tensor([best, second, closest, looks[0].score, named, ahead], dtype=torch.float32))
-        left = [math.log(self._left() + 1e-3) / 4, float(self.belief.left.mean())]
+        left = [math.log(self._left() + 1e-3) / 4, self.belief.left_share]
         counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
         return torch.cat([hints, torch.tensor([*left, *counts])])
 

@@ -21,7 +21,7 @@ def agent():
 
 def picture(*squares):
     """Squares `(x, y, side, colour)` on grey, 1200 × 900 px."""
-    pixels = np.full((900, 1200, 3), 100, np.uint8)
+    pixels = np.random.default_rng(0).integers(95, 105, (900, 1200, 3), np.uint8)  # not blank
     for x, y, side, colour in squares:
         pixels[y : y + side, x : x + side] = {"red": (230, 25, 25), "green": (25, 230, 25)}[colour]
     return pixels
