@@ -21,8 +21,8 @@ from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
 from semfov.data.inputs import Color
-from semfov.data.large import Bands
 from semfov.data.tone import White
+from semfov.data.windowed import ChosenBands
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
@@ -284,7 +284,7 @@ class ActivePerception(nn.Module):
         closer: int | None = None,
         color: Color = "rgb",
         white: White | None = None,
-        bands: Bands = None,
+        bands: ChosenBands = None,
     ) -> GazeRecord:
         """Search a picture for a target class, and decide whether it is there (`record.decision`).
 
@@ -305,7 +305,7 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
-                tensor; a `semfov.data.large.LargePicture`; or a scene: a `semfov.Panorama`, a
+                tensor; a `semfov.data.windowed.LargePicture`; or a scene: a `semfov.Panorama`, a
                 `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
             target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
                 with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
@@ -385,7 +385,7 @@ class ActivePerception(nn.Module):
         batch: int = 1,
         color: Color = "rgb",
         white: White | None = None,
-        bands: Bands = None,
+        bands: ChosenBands = None,
     ) -> GazeRecord:
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
@@ -447,7 +447,7 @@ class ActivePerception(nn.Module):
         seed: int = 0,
         color: Color = "rgb",
         white: White | None = None,
-        bands: Bands = None,
+        bands: ChosenBands = None,
     ) -> GazeRecord:
         """Explore a picture: learn which classes are where, without a target.
 
@@ -495,7 +495,7 @@ class ActivePerception(nn.Module):
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
     def gaze(
-        self, picture: PictureLike, *, color: Color = "rgb", white: White | None = None, bands: Bands = None
+        self, picture: PictureLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> GazePrediction:
         """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
 

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from semfov.data.images import MAX_PIXELS
 from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import BY_WINDOWS, Bands, LargePicture, open_large, picture_size
+from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
+from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
 from semfov.head.world import World
@@ -32,7 +33,7 @@ class OpenedPicture:
     """A photograph, a large picture or a scene; what a kind of look needs of it is read when it is asked for."""
 
     def __init__(
-        self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: Bands = None
+        self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> None:
         self.source, self.color, self.white, self.bands = source, color, white, bands
         self.scene = is_scene(source)
@@ -81,7 +82,7 @@ class OpenedPicture:
 
 
 def open_picture(
-    source: "PictureLike | OpenedPicture", color: Color = "rgb", white: White | None = None, bands: Bands = None
+    source: "PictureLike | OpenedPicture", color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> OpenedPicture:
     """Open a picture of any kind; one that is open stays as it is."""
     return source if isinstance(source, OpenedPicture) else OpenedPicture(source, color, white, bands)

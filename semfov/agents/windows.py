@@ -14,7 +14,8 @@ from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, o
 from semfov.agents.picture import pays
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike
-from semfov.data.large import LargePicture, open_large, picture_size
+from semfov.data.large import open_large, picture_size
+from semfov.data.windowed import LargePicture
 from semfov.decision import Decision, check_thresholds
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector, loader_options

@@ -1,13 +1,9 @@
 """Large pictures that are read window by window: arrays, memory maps, TIFFs, rasters, and files decoded when needed."""
 
-import warnings
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from functools import cached_property
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import torch
@@ -15,86 +11,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import (
-    MAX_PIXELS,
     check_proportion,
     open_pillow,
     orientation,
     over_white,
     read_image,
     turned,
-    warn_of_range,
 )
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
-from semfov.data.reduction import LARGE, OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
-from semfov.data.tone import White, black_and_white, check_bands, check_white, sample_windows
-from semfov.errors import DataError, SemfovError, check, check_pixels, lookup
-from semfov.io.files import check_regular
+from semfov.data.raster import RasterPicture
+from semfov.data.reduction import PixelBox
+from semfov.data.tiff import TiffPicture, is_converted
+from semfov.data.tone import White, check_bands, check_white
+from semfov.data.windowed import BY_WINDOWS, RASTERS, TILED, ChosenBands, LargePicture, opening
+from semfov.errors import DataError, check, check_pixels, lookup
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-RASTERS = (".vrt", ".jp2")
-"""Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
-
-Bands = int | Sequence[int] | None
-"""The number of a band of a TIFF or a raster, or three for red, green and blue, from 1; None for those of the file."""
-
 _ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
-_TILED = (".tif", ".tiff")
-BY_WINDOWS = (*_TILED, *RASTERS)
-"""Ends of the names of files that may be read by windows, and whose bands can be chosen."""
-
 _PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
 _WIDTH, _HEIGHT = 256, 257  # tags of a TIFF
-
-
-class LargePicture(ABC):
-    """Base of 8-bit pictures that are read window by window; size `(width, height)`."""
-
-    size: tuple[int, int]
-    path: Path | None = None
-    nothing: tuple[int, int, int] | None = None  # the colour in which pixels without data are shown, if a file has some
-
-    @abstractmethod
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window; → `(h, w, 3)`."""
-
-    def reduction(self, ratio: float, oversampling: float = OVERSAMPLING) -> int:
-        """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
-        many = self.size[0] * self.size[1] > LARGE
-        reduction = reduction_for(ratio, oversampling) if many else 1
-        return reduction if reduction >= self._first else 1
-
-    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
-        """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
-
-        The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels (25
-        MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture, and
-        at most 134 MB: copies of pictures of more than 537 million pixels begin at a coarser one.
-
-        Shapes: → `(3, h, w)`.
-        """
-        self._inside(box)
-        if reduction < self._first or self.size[0] * self.size[1] <= LARGE:
-            return bytes_of(self.pixels(box))
-        return self._copies.window(box, reduction)
-
-    def _inside(self, box: PixelBox) -> PixelBox:
-        """The box; raises `InputError` where it is empty or not inside the picture."""
-        x1, y1, x2, y2 = box
-        width, height = self.size
-        inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
-        check(inside, "box", f"a window inside {width} × {height} pixels", box)
-        return box
-
-    @cached_property
-    def _first(self) -> int:
-        """Least factor by which windows are read reduced."""
-        return first_for(self.size)
-
-    @cached_property
-    def _copies(self) -> ReducedCopies:
-        return ReducedCopies(self.size, self.pixels)
 
 
 class _ArrayPicture(LargePicture):
@@ -183,7 +120,7 @@ def _rgb(image: "Image") -> NDArray[np.uint8]:
 
 
 def open_large(
-    source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: Bands = None
+    source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
     """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
@@ -211,13 +148,11 @@ def open_large(
     check_local(source, "picture")
     if kind in RASTERS:
         return _raster(source, white, bands)
-    return _tiff(source, white, bands) if kind in _TILED else _PhotographPicture(source, white)
+    return _tiff(source, white, bands) if kind in TILED else _PhotographPicture(source, white)
 
 
-def _raster(path: str | PathLike[str], white: White | None, bands: Bands) -> LargePicture:
+def _raster(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """A raster read by windows; JPEG 2000 by Pillow where rasterio is not there."""
-    from semfov.data.raster import RasterPicture
-
     try:
         return RasterPicture(path, white=white, bands=bands)
     except DataError:
@@ -227,11 +162,8 @@ def _raster(path: str | PathLike[str], white: White | None, bands: Bands) -> Lar
         raise
 
 
-def _tiff(path: str | PathLike[str], white: White | None, bands: Bands) -> LargePicture:
+def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """A TIFF read by windows; by rasterio if it has overviews, or of a kind that `tifffile` leaves; else by Pillow."""
-    from semfov.data.raster import RasterPicture
-    from semfov.data.tiff import TiffPicture, is_converted
-
     if is_converted(path):
         expected = f"None for {path}, which is turned, or of other colours than grey and RGB"
         check(bands is None, "bands", expected, f"{bands}; convert it")
@@ -253,49 +185,6 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: Bands) -> Large
         return RasterPicture(path, white=white, bands=bands)
     except DataError:
         return tiff
-
-
-def chosen_bands(
-    count: int, bands: Bands, usual: tuple[int, ...] | None, path: Path, *, alpha: bool = False
-) -> list[int]:
-    """The bands that are shown, one or three, from 1; `usual` has those that a file with `count` bands names."""
-    if bands is not None:
-        numbers = [*bands] if isinstance(bands, tuple | list) else [cast(int, bands)]
-        check(max(numbers) <= count, "bands", f"numbers from 1 to {count} for {path}", bands)
-        return numbers
-    if usual is not None:
-        return [*usual]
-    colours = count - alpha
-    shown = [1, 2, 3] if colours >= 3 else [1]
-    if colours not in (1, 3):
-        words = "1 is shown as grey" if len(shown) == 1 else "1, 2 and 3 are shown as red, green and blue"
-        warnings.warn(f"image {path}: of {count} bands without names {words}; choose by bands=", stacklevel=2)
-    return shown
-
-
-def tone_of(
-    picture: LargePicture,
-    white: White | None,
-    values: Callable[[PixelBox], NDArray[Any]],
-    *,
-    nodata: float | None,
-    wide: bool,
-) -> tuple[float, float] | None:
-    """The values that are black and white in a file; None by its type, with a warning where few of 16 bits are used."""
-    if white is None and not wide:
-        return None
-    assert picture.path is not None
-    if white is not None and white != "auto":
-        return black_and_white(white, np.zeros(0))
-    seen = []
-    # What cannot be decoded is refused where it is read.
-    with nullcontext() if white else suppress(Exception):
-        seen = [values(box).ravel() for box in sample_windows(picture.size)]
-    if white is not None:
-        return black_and_white(white, np.concatenate(seen), nodata)
-    if seen:
-        warn_of_range(float(min(each.min() for each in seen)), float(max(each.max() for each in seen)), picture.path)
-    return None
 
 
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
@@ -330,23 +219,3 @@ def _upright_size(image: "Image") -> tuple[int, int]:
 def _by_rows(shape: tuple[int, ...]) -> bool:
     """Whether a shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
     return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and shape[0] != 3)
-
-
-@contextmanager
-def opening(path: Path, what: str) -> Iterator[None]:
-    """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
-    check_regular(path, f"image {path}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about damaged metadata and large files
-        try:
-            yield
-        except FileNotFoundError:
-            raise DataError(f"image {path}: no such file; check its path") from None
-        except SemfovError:
-            raise
-        except Exception as error:  # decoders of damaged files raise errors of many kinds
-            if type(error).__name__ == "DecompressionBombError":
-                most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
-                raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None

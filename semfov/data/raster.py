@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.gdal import open_raster, raster_settings
-from semfov.data.large import LargePicture, chosen_bands, opening, tone_of
 from semfov.data.reduction import FIRST, PixelBox, bytes_of
 from semfov.data.tone import White, bytes_between
+from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
 from semfov.errors import DataError
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from semfov.data.gdal import MOST_SIDE
 from semfov.data.images import check_tile, open_pillow
-from semfov.data.large import LargePicture, chosen_bands, opening, tone_of
 from semfov.data.reduction import PixelBox
 from semfov.data.tone import White, bytes_between
+from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
 from semfov.errors import DataError
 
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations

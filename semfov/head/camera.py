@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import open_large
 from semfov.data.reduction import resized
+from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, InputError, check
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds

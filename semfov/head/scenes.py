@@ -9,7 +9,8 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.data.inputs import Color, ImageLike, as_image
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import open_large
+from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.head.sphere import BLANK, Sphere

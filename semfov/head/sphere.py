@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.head.world import FIELDS, World, check_fields

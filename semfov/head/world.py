@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.errors import check
 from semfov.head.speeds import Speeds
 from semfov.io.schema import is_number

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects

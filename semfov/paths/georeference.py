@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.gdal import open_raster, raster_settings
-from semfov.data.large import RASTERS
+from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 

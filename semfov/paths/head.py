@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.detection.objects import Objects
 from semfov.detection.placement import resize
 from semfov.errors import InputError, check

@@ -16,7 +16,7 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
 from semfov.data.inputs import as_image
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check

@@ -9,8 +9,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from semfov.data.large import LargePicture
 from semfov.data.reduction import resized
+from semfov.data.windowed import LargePicture
 from semfov.detection.placement import Placement, resize
 from semfov.errors import check, check_shape
 from semfov.eye import Eye

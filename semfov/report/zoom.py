@@ -9,7 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import open_large
+from semfov.data.windowed import LargePicture
 from semfov.errors import check
 from semfov.paths import Record, RecordedLook
 from semfov.paths.look import LookView, read_region

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.large import LargePicture
+from semfov.data.windowed import LargePicture
 from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 

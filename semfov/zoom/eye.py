@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import open_large
 from semfov.data.reduction import resized
+from semfov.data.windowed import LargePicture
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import select
