@@ -38,8 +38,7 @@ _AGENT = """\
 _LOOKS = """\
   --how KIND           auto (default: windows of any picture), fovea, windows, or head (in a panorama)
   --passes N           most passes of the detector; --shifts N: most gaze shifts of a fovea
-  --seconds S          longest time for a picture; the first limit that is reached ends it
-  --white VALUE        thermal, 12 bits: what is white, as 4095, 300,3000 or auto; --bands 4,3,2: bands of a TIFF"""
+  --seconds S          longest time for a picture; --white auto: thermal or 12 bits; --bands 4,3,2: bands of a TIFF"""
 
 _OUTPUT = """\
   --out FILE           .json, .jsonl, .csv, .geojson, or for COCO .coco.json, written as it runs; - is standard output

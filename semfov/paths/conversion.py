@@ -15,7 +15,8 @@ from torch import Tensor
 
 from semfov.data.classes import canonical_name
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import open_large
+from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import category_ids, coco_results, named_detections
 from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
