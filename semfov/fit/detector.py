@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from dataclasses import asdict, fields, replace
 from os import PathLike
@@ -13,6 +14,8 @@ from typing import Any
 import torch
 
 from semfov.agent import ActivePerception
+from semfov.data.coco import category_names
+from semfov.detection.class_names import UnnamedClasses
 from semfov.errors import DataError, InputError
 from semfov.fit.detector_report import class_counts, detector_report, next_commands
 from semfov.fit.evidence import EvidenceFit
@@ -30,7 +33,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import digest_of, finish
 from semfov.runs.settings import plain
-from semfov.runs.setup import detector_options
+from semfov.runs.setup import check_sources, detector_options, make_detector
 from semfov.runs.workers import available_cores
 
 _log = logging.getLogger(__name__)
@@ -108,8 +111,9 @@ def fit_detector(
 
 def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
-    config = config.named()
+    config = _with_classes(config.named())
     started = time.monotonic()
+    print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
     folder = _FolderFit(config, run)
     config, results = folder.inputs.config, folder.inputs.results
@@ -125,7 +129,15 @@ def fit_folder(config: FitDetectorConfig) -> None:
             some,
         )
     stages = {name: each.tasks for name, each in folder.fits.items()}
-    with WholeBar("fitting", {"looking": {"looking": _seconds_of_looks(run)}, **stages}) as whole:
+    stages = {"looking": {"looking": _seconds_of_looks(run)}, **stages}
+    minutes = math.ceil(sum(sum(tasks.values()) for tasks in stages.values()) / 60)
+    looks = len(run.scenes) * math.prod(config.cells)
+    print(
+        f"{len(run.scenes)} photographs, {len(counts)} classes: {looks:,} looks and {len(folder.fits)} fits, about "
+        f"{minutes} minute{'s' if minutes != 1 else ''}",
+        flush=True,
+    )
+    with WholeBar("fitting", stages) as whole:
         with whole.stage("looking"):
             finish(run, "looking")
         for part in PARTS:
@@ -140,6 +152,21 @@ def fit_folder(config: FitDetectorConfig) -> None:
     models = [fitted.part.file for fitted in results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
     print(f"\nnext:\n{next_commands(config, run)}")
+
+
+def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
+    """The settings, with the categories of the annotations as class names where a model has as many and no names."""
+    try:
+        check_sources(config.data, config.detector)
+        make_detector(config.detector)
+    except UnnamedClasses as error:
+        names = () if config.data.annotations is None else category_names(config.data.annotations)
+        if len(names) != error.count:
+            known = f"; the annotations have {len(names)} categories" if names else ""
+            raise InputError(f"{error}{known}") from None
+        print(f"classes of the annotations, in the order of their ids: {', '.join(names)}")
+        return replace(config, detector=replace(config.detector, classes=names))
+    return config
 
 
 def _seconds_of_looks(run: Looking) -> float:

@@ -135,6 +135,6 @@ def next_commands(config: FitDetectorConfig, run: Looking) -> str:
     return "\n".join(
         [
             f"  semfov search PHOTO.jpg --target {quoted} --models {out}",
-            f"  python -m eval.search --models {out} --data.root PHOTOS --data.annotations instances.json",
+            f"  semfov find PHOTOS --target {quoted} --models {out} --out found.csv",
         ]
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -26,6 +28,8 @@ class WholeBar:
         self._at, self._tasks = 0.0, dict[str, float]()
         form = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}{postfix}"
         self._bar = tqdm(total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
+        self._closed = threading.Event()
+        threading.Thread(target=self._tick, daemon=True).start()
 
     @property
     def done(self) -> float:
@@ -50,6 +54,11 @@ class WholeBar:
         """A task with this title, which moves the bar."""
         return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
 
+    def _tick(self) -> None:
+        """Draw the bar anew each second, so that its clock goes on while a task takes long."""
+        while sys.stderr.isatty() and not self._closed.wait(1.0):
+            self._bar.refresh()
+
     def _move(self, to: float) -> None:
         self._at = max(self._at, to)
         self._bar.update(min(self.done, 1.0) - self._bar.n)
@@ -60,6 +69,7 @@ class WholeBar:
 
     def __exit__(self, *_: object) -> None:
         _whole.reset(self._token)
+        self._closed.set()
         self._bar.close()
 
 

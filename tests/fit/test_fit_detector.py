@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from PIL import Image
@@ -28,7 +29,7 @@ from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.comparison import Difference
-from semfov.fit.detector import _seconds_of_looks
+from semfov.fit.detector import _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import _thin_classes
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
@@ -43,7 +44,7 @@ from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
-from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network
+from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
 
 
 @pytest.fixture(scope="module")
@@ -555,3 +556,21 @@ def test_fitting_uses_targets_of_all_sizes():
     for classes, absent in ((("cat", "cup", "dog"), 2), (COCO_CLASSES, None)):
         run = SimpleNamespace(scenes=EmbeddedScenes(classes, count=2))
         assert PartInputs(config, run).absent == absent
+
+
+def test_class_names_are_the_categories_of_the_annotations_where_their_number_fits(tmp_path, capsys):
+    model = onnx.load(write_network(tmp_path / "mine.onnx"))
+    del model.metadata_props[:]
+    onnx.save(model, tmp_path / "mine.onnx")
+    file = write_photographs(tmp_path, 2)
+    config = FitDetectorConfig(tmp_path / "mine.onnx", DataConfig(tmp_path, file)).named()
+    with pytest.raises(InputError, match=r"3 classes of mine\.onnx .* mine\.json; the annotations have 4 categories"):
+        _with_classes(config)
+    annotations = json.loads(file.read_text())
+    annotations["annotations"].pop()  # that of the sky
+    known = annotations["categories"][:3]
+    file.write_text(json.dumps({**annotations, "categories": known[::-1]}))
+    assert _with_classes(config).detector.classes == CLASSES
+    assert "red, green, blue" in capsys.readouterr().out
+    named = replace(config, detector=replace(config.detector, classes=("a", "b", "c")))
+    assert _with_classes(named) == named
