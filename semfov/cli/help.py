@@ -22,6 +22,7 @@ Commands:
   explore     learn what is where, without a target
   gaze        predict where people look
   live        search or explore a video, a camera or a network stream
+  app         a page in the browser on which to try all this out, and to look yourself
   fit         fit all models to your own detector
   detectors   list detectors, or the classes of one
 
@@ -177,6 +178,25 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
 scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
+""",
+    "app": f"""\
+semfov app: a page in the browser on which to try the agent out
+
+  pip install "semfov[app]"
+  semfov app
+  semfov app yolox-nano --port 8000
+  semfov app --models mymodels
+
+usage: semfov app [DETECTOR] [options]
+
+{_AGENT.partition(chr(10))[2]}
+  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; no password is asked for)
+  --port N             its port (default: the first free one from 7860 on)
+  --seed N             seed of the examples
+
+Give it a picture or take an example, choose a class, and search, find all objects, explore, or predict where people
+look. Or look yourself: click on the picture, and see what the fovea sees there and what the agent then believes.
+Pictures are kept nowhere, and nothing is sent elsewhere. Ctrl-C ends it.
 """,
     "detectors": """\
 semfov detectors: detectors that can be named, or the classes of one

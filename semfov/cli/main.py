@@ -25,6 +25,7 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "live": ("source", "video file, or address"),
     "gaze": _PICTURES,
     "fit": ("model", "the detector: a name or a file, as for semfov.load_detector"),
+    "app": ("detector", "the detector: a name or a file, as for semfov.load_detector"),
     "detectors": ("name", "detector, or folder of models"),
 }
 """The positional argument of each subcommand, and its text."""
@@ -46,6 +47,7 @@ def options_of(name: str) -> type[Any]:
         "explore": options.ExploreOptions,
         "live": options.LiveOptions,
         "gaze": options.GazeOptions,
+        "app": options.AppOptions,
         "detectors": options.DetectorsOptions,
     }
     return by_name[name]
@@ -77,6 +79,10 @@ def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
         from semfov.cli.gaze import predict_gaze
 
         return predict_gaze(options)
+    if name == "app":
+        from semfov.cli.app import serve
+
+        return serve(options)
     if name == "detectors":
         from semfov.cli.detectors import list_detectors
 

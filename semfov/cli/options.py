@@ -237,6 +237,23 @@ class GazeOptions(Settings):
 
 
 @dataclass(frozen=True)
+class AppOptions(AgentOptions):
+    """A page on which to try the agent out, served to the browsers of this machine.
+
+    Args:
+        host: address that the page is served on. Another one than that of this machine lets others use it: anybody who
+            reaches it, as it asks for no password.
+        port: its port (none: the first free one from 7860 on).
+        seed: seed of the examples.
+    """
+
+    unused = ("start",)
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(1, 65_535)] | None = None
+
+
+@dataclass(frozen=True)
 class DetectorsOptions(Settings):
     """Detectors that can be named.
 

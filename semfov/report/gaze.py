@@ -38,6 +38,12 @@ class DrawnGaze(NamedTuple):
 def write_gaze_page(path: str | PathLike[str], title: str, drawn: Sequence[DrawnGaze]) -> Path:
     """Write the page of one or several pictures; the path must end in `.html` or `.htm`."""
     path = page_path(Path(path))
+    write_text(path, gaze_page_html(title, drawn))
+    return path
+
+
+def gaze_page_html(title: str, drawn: Sequence[DrawnGaze]) -> str:
+    """Make the page of one or several pictures."""
     data = {
         "pictures": [_picture(each) for each in drawn],
         "heat": colour_steps(overlay_colours()),
@@ -51,8 +57,7 @@ def write_gaze_page(path: str | PathLike[str], title: str, drawn: Sequence[Drawn
         "facts": "".join(_facts(each.prediction, number) for number, each in enumerate(drawn)),
     }
     template = (_FOLDER / "gaze.html").read_text(encoding="utf-8")
-    write_text(path, re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template))
-    return path
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template)
 
 
 def _picture(drawn: DrawnGaze) -> Data:

@@ -563,8 +563,8 @@ def test_class_names_are_the_categories_of_the_annotations_where_their_number_fi
     del model.metadata_props[:]
     onnx.save(model, tmp_path / "mine.onnx")
     file = write_photographs(tmp_path, 2)
-    config = FitDetectorConfig(tmp_path / "mine.onnx", DataConfig(tmp_path, file)).named()
-    with pytest.raises(InputError, match=r"3 classes of mine\.onnx .* mine\.json; the annotations have 4 categories"):
+    config = FitDetectorConfig(model=tmp_path / "mine.onnx", data=DataConfig(tmp_path, file)).named()
+    with pytest.raises(InputError, match=r"3 classes of mine\.onnx .*mine\.json; the annotations have 4 categories"):
         _with_classes(config)
     annotations = json.loads(file.read_text())
     annotations["annotations"].pop()  # that of the sky

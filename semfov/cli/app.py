@@ -1,0 +1,249 @@
+"""Subcommand app: a page in the browser on which to search a picture, and to look yourself."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from html import escape
+from io import BytesIO
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from semfov.agent import ActivePerception
+from semfov.cli.agent import detector_classes, make_agent
+from semfov.cli.options import AppOptions
+from semfov.cli.own_looks import OwnLooks, grid_of, look_at_cells
+from semfov.data.inputs import as_image
+from semfov.data.scenes import EmbeddedScenes
+from semfov.errors import DataError, InputError, SemfovError
+from semfov.report.gaze import DrawnGaze, gaze_page_html
+from semfov.report.page import page_html
+from semfov.viz.belief import plot_belief
+from semfov.viz.style import FOUND, GAZE, TARGET
+
+_TASKS = ("search", "find all", "explore", "gaze")
+_EVERY = "all classes"
+_EXAMPLES = 16  # embedded scenes
+_VIEWERS = 15  # whose scanpaths the page of a prediction has
+_HEIGHT = 820  # pixels of the screen for the page of a record
+_LONGEST = 1600  # longer side in pixels of the picture that is clicked on
+
+_CLICK = "Choose a class, and click on the picture to look there."
+_STYLE = "footer { display: none !important; } .page iframe { width: 100%; border: 0; border-radius: 8px; }"
+
+
+def serve(options: AppOptions) -> int:
+    """Serve the page until Ctrl-C."""
+    os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # nothing is sent elsewhere
+    try:
+        import gradio  # noqa: F401
+    except ImportError:
+        raise DataError('app: expected Gradio for the page; pip install "semfov[app]"') from None
+    detector_classes(options)
+    agent = make_agent(options)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
+        page = make_page(agent, options.seed)
+        address = launched(page, options.host, options.port)
+        print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
+        page.block_thread()
+    return 0
+
+
+def launched(page: Any, host: str, port: int | None) -> str:
+    """Serve a page, with one look at a time; returns its address."""
+    import gradio
+
+    look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
+    page.queue(default_concurrency_limit=1)
+    _, address, _ = page.launch(
+        server_name=host, server_port=port, prevent_thread_lock=True, share=False, quiet=True, css=_STYLE, theme=look
+    )
+    return str(address)
+
+
+class _Calls:
+    """What the page calls; refusals are shown on it."""
+
+    def __init__(self, agent: ActivePerception, seed: int) -> None:
+        self.agent, self.classes = agent, list(agent.classes[1:])
+        self.scenes: EmbeddedScenes | None = None
+        with suppress(InputError):  # the detector knows none of their classes
+            self.scenes = EmbeddedScenes(self.classes, count=_EXAMPLES, seed=seed)
+        self._numbers = cycle(range(_EXAMPLES))
+
+    def take(self) -> tuple[Image.Image, str]:
+        """The next embedded scene, and a class that it holds."""
+        assert self.scenes is not None
+        index = next(self._numbers)
+        return _pixels(self.scenes[index].image), self.scenes.classes[self.scenes.targets(index)[0] - 1]
+
+    def look(self, picture: Any, target: str, task: str, passes: float) -> tuple[str, str]:
+        """Words about a record of the picture, and its page in a frame."""
+        with _told():
+            return _look(self.agent, _given(picture), target, task, int(passes))
+
+    def click(self, picture: Any, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
+        """The cells with that of the click, and what they show."""
+        with _told():
+            image = as_image(_given(picture), argument="picture")
+            scale = image.shape[-1] / _reduced(image).width
+            point = torch.tensor([[side * scale for side in event.index]])
+            cells = [*cells, int(grid_of(self.agent, image).cell_of(point)[0])]
+            looked = look_at_cells(self.agent, image, _one(target, self.classes), cells)
+            return cells, _clicked(image, looked), _seen(looked), _believed(looked), looked.describe()
+
+    def fresh(self, picture: Any) -> tuple[Any, ...]:
+        """No cells, and the picture to click on."""
+        with _told():
+            shown = None if picture is None else _reduced(as_image(picture, argument="picture"))
+            return [], shown, None, None, _CLICK
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Show an error of the library on the page."""
+    import gradio
+
+    try:
+        yield
+    except SemfovError as error:
+        raise gradio.Error(str(error), print_exception=False) from None
+
+
+def make_page(agent: ActivePerception, seed: int = 0) -> Any:
+    """The page, a `gradio.Blocks`; pictures that it is given are removed within minutes."""
+    import gradio
+
+    calls = _Calls(agent, seed)
+
+    def click(picture: Any, target: str, cells: list[int], event: gradio.SelectData) -> tuple[Any, ...]:
+        return calls.click(picture, target, cells, event)
+
+    click.__annotations__["event"] = gradio.SelectData  # by which Gradio knows it
+    fixed: dict[str, Any] = {"interactive": False, "format": "jpeg", "buttons": ["fullscreen", "download"]}
+    with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=(60, 300), fill_width=True) as page:
+        gradio.Markdown("# semfov\nWhere does it look, what does it see there, and what does it believe?")
+        with gradio.Row():
+            with gradio.Column(scale=1, min_width=300):
+                sources = ["upload", "clipboard"]
+                picture = gradio.Image(label="Picture", type="pil", sources=sources, height=300, buttons=["fullscreen"])
+                example = gradio.Button("Take an example", visible=calls.scenes is not None)
+                target = gradio.Dropdown([_EVERY, *calls.classes], value=_EVERY, label="Class", filterable=True)
+                task = gradio.Radio(list(_TASKS), value=_TASKS[0], label="What to do")
+                passes = gradio.Slider(1, 64, value=16, step=1, label="Passes of the detector at most")
+                go = gradio.Button("Look", variant="primary")
+            with gradio.Column(scale=2, min_width=300), gradio.Tabs():
+                with gradio.Tab("Its looks"):
+                    words = gradio.Markdown("Give it a picture or take an example, and press *Look*.")
+                    shown = gradio.HTML(elem_classes="page")
+                with gradio.Tab("Look yourself"):
+                    about = gradio.Markdown(_CLICK)
+                    again = gradio.Button("Start again")
+                    cells = gradio.State([])
+                    own = gradio.Image(label="Your looks", type="pil", elem_id="own", **fixed)
+                    with gradio.Row():
+                        seen = gradio.Image(label="What the fovea sees there", **fixed)
+                        believed = gradio.Image(label="What is believed", **fixed)
+        outputs = [cells, own, seen, believed, about]
+        example.click(calls.take, [], [picture, target], api_visibility="private")
+        go.click(calls.look, [picture, target, task, passes], [words, shown], api_visibility="private")
+        for changed in (picture.change, again.click, target.change):
+            changed(calls.fresh, [picture], outputs, api_visibility="private")
+        own.select(click, [picture, target, cells], outputs, api_visibility="private")
+    return page
+
+
+def _given(picture: Any) -> Any:
+    """The picture; refused where there is none."""
+    if picture is None:
+        raise DataError("picture: expected one, or an example, got none")
+    return picture
+
+
+def _one(target: str, classes: list[str]) -> str:
+    """The class to search for."""
+    if target not in classes:
+        raise DataError(f"class: expected one to search for, got {target}")
+    return target
+
+
+def _look(agent: ActivePerception, picture: Any, target: str, task: str, passes: int) -> tuple[str, str]:
+    """Words about a record of the picture, and its page in a frame."""
+    if task == "gaze":
+        prediction = agent.gaze(picture)
+        paths = tuple(prediction.scanpaths(_VIEWERS))
+        return prediction.describe(), _framed(gaze_page_html("Where people look", [DrawnGaze(prediction, paths)]))
+    if task == "search":
+        record = agent.search(picture, _one(target, list(agent.classes)), passes=passes)
+    elif task == "find all":
+        record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
+    else:
+        record = agent.explore(picture, passes=passes)
+    data = record.page_data(picture if record.how == "windows" else None, settings=agent.eye.settings())
+    return record.summary(), _framed(page_html(record.describe(), [data]))
+
+
+def _framed(page: str) -> str:
+    """A page in a frame that shares nothing with the page around it."""
+    return f'<iframe title="The looks" sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"></iframe>'
+
+
+def _pixels(image: Tensor) -> Image.Image:
+    """A picture `(3, H, W)` in [0, 1] for Pillow."""
+    return Image.fromarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy())
+
+
+def _reduced(image: Tensor) -> Image.Image:
+    """The picture that is clicked on."""
+    picture = _pixels(image)
+    picture.thumbnail((_LONGEST, _LONGEST))
+    return picture
+
+
+def _clicked(image: Tensor, looked: OwnLooks) -> Image.Image:
+    """The picture with numbered looks, and a ring where the agent would look next."""
+    picture = _reduced(image)
+    draw, scale = ImageDraw.Draw(picture), picture.width / image.shape[-1]
+    radius = max(picture.size) / 50
+    points = [(x * scale, y * scale) for x, y in looked.record.fixations.tolist()]
+    draw.line(points, fill="white", width=5)
+    draw.line(points, fill=GAZE, width=3)
+    for number, (x, y) in enumerate(points, 1):
+        draw.circle((x, y), radius, fill=GAZE, outline="white", width=2)
+        draw.text((x, y), str(number), fill="white", anchor="mm", font_size=1.2 * radius)
+    x, y = (side * scale for side in looked.point)
+    draw.circle((x, y), radius, outline="white", width=6)
+    draw.circle((x, y), radius, outline=TARGET, width=4)
+    return picture
+
+
+def _seen(looked: OwnLooks) -> Image.Image:
+    """The foveated picture of the last look, with its detections of at least 0.1."""
+    record = looked.record
+    view = record.views()[-1]
+    picture = _pixels(view)
+    draw, scale = ImageDraw.Draw(picture), view.shape[-1] / record.size[0]
+    detections = record.looks[-1].detections
+    columns = detections.boxes[0].tolist(), detections.labels[0].tolist(), detections.confidence[0].tolist()
+    for box, label, score in zip(*columns, strict=True):
+        if score >= 0.1:
+            colour = FOUND if label == record.target else GAZE
+            draw.rectangle([side * scale for side in box], outline=colour, width=3)
+            draw.text((box[0] * scale + 4, box[1] * scale + 2), f"{record.classes[label]} {score:.2f}", fill="white",
+                      stroke_width=2, stroke_fill=colour, font_size=max(12, picture.width / 40))  # fmt: skip
+    return picture
+
+
+def _believed(looked: OwnLooks) -> Any:
+    """The probability of the target in each cell after the last look."""
+    file = BytesIO()
+    plot_belief(looked.record, -1).savefig(file, format="png", dpi=110)
+    return np.asarray(Image.open(file).convert("RGB"))

@@ -1,0 +1,85 @@
+"""The page on which to try an agent out: looks at given cells, and the page in Chromium."""
+
+import os
+import shutil
+import sys
+
+import pytest
+import torch
+
+from semfov.cli.main import main
+from semfov.cli.own_looks import look_at_cells
+from semfov.data import read_image
+
+NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
+
+
+def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, photo):
+    image = read_image(photo)
+    own = agent.search(image, "wine glass", how="fovea", start=47, shifts=3, closer=0)
+    assert len(own) == 4
+    cells = own.cells.tolist()
+    for count in (1, 2, 3):
+        looked = look_at_cells(agent, image, "wine glass", cells[:count])
+        assert looked.record.cells.tolist() == cells[:count]
+        torch.testing.assert_close(looked.record.presence, own.presence[:count])
+        values = own.values[count - 1]
+        assert float(values[looked.advice]) == pytest.approx(float(values[cells[count]]))  # ties are drawn
+        assert looked.advice not in cells[:count]
+        assert looked.agent.cells.tolist() == cells[:count]
+    assert "before it" in looked.describe()
+    assert "before it" not in look_at_cells(agent, image, "wine glass", [3]).describe()
+
+
+def test_without_gradio_it_is_said_how_to_install_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "gradio", None)
+    assert main(["app"]) == 1
+    assert capsys.readouterr().err == 'error: app: expected Gradio for the page; pip install "semfov[app]"\n'
+
+
+@pytest.fixture
+def served(agent, tmp_path, monkeypatch):
+    """The page of the agent of squares, opened in Chromium on a telephone; it may print and request nothing."""
+    gradio = pytest.importorskip("gradio", reason='needs Gradio (pip install "semfov[app]")')
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium (apt-get install chromium, or set $CHROMIUM)")
+    from semfov.cli.app import launched, make_page
+
+    assert gradio
+    monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
+    page, told = make_page(agent), []
+    address = launched(page, "127.0.0.1", None)
+    with playwright.sync_playwright() as program:
+        browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        view = browser.new_page(viewport={"width": 390, "height": 900})
+        # Gradio itself warns with this when it closes its stream of answers.
+        view.on("console", lambda each: each.text == "Method not implemented." or told.append(each.text))
+        view.on("pageerror", lambda error: told.append(str(error)))
+        view.on("request", lambda each: each.url.startswith((address, "data:", "blob:")) or told.append(each.url))
+        view.goto(address)
+        yield view
+        assert told == []
+        browser.close()
+    page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # those of Gradio and of what it imports
+def test_a_picture_a_search_and_a_click_on_the_width_of_a_telephone(served, photo):
+    served.set_input_files("input[type=file]", str(photo))
+    served.get_by_label("Class").click()
+    served.get_by_role("option", name="red").click()
+    served.get_by_role("button", name="Look", exact=True).click()
+    served.wait_for_selector(".page iframe", timeout=60_000)
+    frame = served.frame_locator(".page iframe")
+    frame.get_by_role("heading", level=1).wait_for()
+    assert "red" in frame.get_by_role("heading", level=1).inner_text()
+    served.get_by_role("tab", name="Look yourself").click()
+    own = served.locator("#own img")
+    for number in (1, 2):
+        box = own.bounding_box()
+        own.click(position={"x": 0.1 * number * box["width"], "y": 0.1 * box["height"]})
+        served.get_by_text(f"Look {number}", exact=True).wait_for(timeout=60_000)
+    assert served.evaluate("document.documentElement.scrollWidth") <= 390
