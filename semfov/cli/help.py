@@ -182,8 +182,7 @@ scores on photographs that were held out. After an interruption the same command
     "app": f"""\
 semfov app: a page in the browser on which to try the agent out
 
-  pip install "semfov[app]"
-  semfov app
+  semfov app                                           (pip install "semfov[app]")
   semfov app yolox-nano --port 8000
   semfov app --models mymodels
 
