@@ -63,7 +63,7 @@ class ModuleDetector(Detector):
         return keep_classes(candidates, self._places, self._count)
 
 
-def edge_scale(images: Tensor, edges: tuple[int, int]) -> float:
+def edge_scale(images: Tensor, edges: tuple[float, float]) -> float:
     """The scale at which the shorter edge of images has a length, unless the longer one exceeds another."""
     height, width = images.shape[-2:]
     return min(edges[0] / min(width, height), edges[1] / max(width, height))

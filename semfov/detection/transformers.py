@@ -1,6 +1,7 @@
 """Object detection models of transformers (DETR, RT-DETR, D-FINE), with the full score vector of every box."""
 
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,12 +16,15 @@ from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preproce
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import DataError, InputError, check
+from semfov.io.schema import excerpt
 
 _SOFTMAX = ("detr", "table-transformer", "yolos")
 """Kinds of models whose scores are a softmax over the classes and "no object"; the others have a sigmoid each."""
 _IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformable_detr", "dab-detr")
 _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
+_MOST = ("max_height", "max_width")
 _SQUARE = {"height": 640, "width": 640}
+_LARGEST = 65_536  # side of a canvas in pixels
 
 
 class _TransformersDetector(ModuleDetector):
@@ -54,20 +58,26 @@ class _TransformersDetector(ModuleDetector):
         normal = config.model_type in _IMAGENET
         settings: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
         settings |= processor or {}
-        size = settings.get("size") or (_EDGES if normal else _SQUARE)
-        self.edges = (size["shortest_edge"], size["longest_edge"]) if "shortest_edge" in size else None
+        size = _size(settings, _EDGES if normal else _SQUARE)
+        self.resizes = bool(settings.get("do_resize", True))
+        self.limits = None if self.resizes and "height" in size else size
         self.softmax = config.model_type in _SOFTMAX
+        focal = getattr(config, "use_focal_loss", True)
+        check(bool(focal) or self.softmax, "model", "scores trained with focal loss", f"use_focal_loss={focal}")
+        sides = size.get("width") or size.get("max_width"), size.get("height") or size.get("max_height")
+        longest = size.get("longest_edge") or size.get("shortest_edge") or 0
         super().__init__(
             model,
             classes,
             config.model_type if name is None else name,
-            (size["width"], size["height"]) if self.edges is None else (self.edges[1], self.edges[1]),
+            (sides[0] or longest, sides[1] or longest),
             background=("own" if self.softmax else "residual") if background is None else background,
             selection=selection,
-            stretch=self.edges is None,
+            stretch=self.limits is None,
             digest=digest,
         )
-        self.preprocessing = Preprocessing(stretch=self.edges is None)
+        factor = (settings.get("rescale_factor") or 1 / 255) if settings.get("do_rescale", True) else 1.0
+        self.preprocessing = Preprocessing(stretch=self.limits is None, scale=255 * factor)
         if settings["do_normalize"]:
             means = {"mean": settings["image_mean"], "std": settings["image_std"]}
             self.preprocessing = self.preprocessing.merged(means)
@@ -75,9 +85,11 @@ class _TransformersDetector(ModuleDetector):
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's image processor does, without padding."""
         check_images(images)
-        if self.edges is None:
+        if self.limits is None:
             return letterbox(images, self.input_size, stretch=True)
-        scale = edge_scale(images, self.edges)
+        shortest, longest, highest, widest = (self.limits.get(name, math.inf) for name in (*_EDGES, *_MOST))
+        scale = min(edge_scale(images, (shortest, longest)), highest / images.shape[-2], widest / images.shape[-1])
+        scale = scale if self.resizes else 1.0
         return resized_images(images, scale=scale, antialias=scale < 1)
 
     def propose(self, canvas: Tensor) -> Candidates:
@@ -98,7 +110,30 @@ class _TransformersDetector(ModuleDetector):
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on."""
         own = {"softmax": self.softmax, "preprocessing": self.preprocessing.settings()}
-        return super().settings() | own | ({} if self.edges is None else {"edges": list(self.edges)})
+        if self.limits is not None:
+            own["edges"] = [*self.limits.values()] if self.resizes else []
+        return super().settings() | own
+
+
+def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, int]:
+    """The size of an image processor as a mapping, which older settings give as a number or `(height, width)`.
+
+    >>> _size({"size": 800, "max_size": 1333}, {}), _size({"size": [480, 640]}, {})
+    ({'shortest_edge': 800, 'longest_edge': 1333}, {'height': 480, 'width': 640})
+    """
+    given = settings.get("size") or usual
+    if isinstance(given, int):
+        given = {"shortest_edge": given, "longest_edge": settings.get("max_size")}
+    elif isinstance(given, list | tuple) and len(given) == 2:
+        given = {"height": given[0], "width": given[1]}
+    size = {
+        name: value for name, value in dict(given if isinstance(given, Mapping) else {}).items() if value is not None
+    }
+    kinds = [{"height", "width"}, {*_MOST}, {*_EDGES}, *({name} for name in _EDGES)]
+    whole = all(isinstance(value, int) and 0 < value <= _LARGEST for value in size.values())
+    wanted = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"
+    check(whole and set(size) in kinds, "processor size", wanted, excerpt(settings.get("size")))
+    return size
 
 
 def wrap_transformers(

@@ -207,6 +207,54 @@ def test_pictures_are_resized_as_by_the_image_processor():
     )
 
 
+@pytest.mark.parametrize(
+    ("settings", "shape"),
+    [
+        ({"size": {"max_height": 60, "max_width": 90}}, (30, 90)),
+        ({"size": {"shortest_edge": 64, "longest_edge": 120}}, (40, 120)),
+        ({"size": {"shortest_edge": 50}}, (50, 150)),
+        ({"size": {"longest_edge": 60, "shortest_edge": None}}, (20, 60)),
+        ({"size": 64, "max_size": 120}, (40, 120)),
+        ({"size": [64, 96]}, (64, 96)),
+        ({"do_resize": False}, (100, 300)),
+        ({"do_resize": False, "size": {"height": 64, "width": 64}}, (100, 300)),
+    ],
+)
+def test_sizes_of_image_processors_are_understood(settings, shape):
+    detector = load_detector(small("detr"), processor=settings)
+    canvas, placement = detector.fit(torch.rand(1, 3, 100, 300))
+    assert canvas.shape[-2:] == shape
+    json.dumps(detector.settings(), allow_nan=False)
+    corner = torch.tensor([[0.0, 0.0, shape[1], shape[0]]])
+    torch.testing.assert_close(placement.boxes_to_image(corner), torch.tensor([[0.0, 0.0, 300.0, 100.0]]))
+    if set(settings) == {"size"} and isinstance(settings["size"], dict) and len(settings["size"]) == 2:
+        sizes = {key: value for key, value in settings["size"].items() if value is not None}
+        if len(sizes) == 2:
+            theirs = hf.DetrImageProcessor(size=sizes, do_pad=False)(torch.rand(3, 100, 300), do_rescale=False)
+            assert theirs["pixel_values"][0].shape[-2:] == shape
+
+
+@pytest.mark.parametrize(("settings", "factor"), [({"do_rescale": False}, 255), ({"rescale_factor": 1 / 127.5}, 2)])
+def test_pixels_are_scaled_as_by_the_image_processor(settings, factor):
+    settings = {"do_normalize": False, "size": {"height": 64, "width": 64}, **settings}
+    detector = load_detector(small("detr"), processor=settings)
+    picture = torch.randint(0, 256, (3, 64, 64), dtype=torch.uint8)
+    canvas, _ = detector.fit(picture[None] / 255)
+    theirs = hf.DetrImageProcessor(**settings, do_pad=False)(picture, return_tensors="pt")["pixel_values"]
+    torch.testing.assert_close(detector.preprocessing(canvas), theirs.float(), atol=1e-3, rtol=1e-5)
+    torch.testing.assert_close(detector.preprocessing(canvas), canvas * factor)
+
+
+def test_settings_that_would_be_ignored_are_refused():
+    for size in ({"height": 64}, {"width": 0, "height": 64}, "large", {"shortest_edge": 1e9}, [640]):
+        with pytest.raises(InputError, match="processor size: expected height and width, max_height"):
+            load_detector(small("detr"), processor={"size": size})
+    model = small("rt_detr")
+    model.config.use_focal_loss = False
+    with pytest.raises(InputError, match="model: expected scores trained with focal loss, got use_focal_loss=False"):
+        load_detector(model)
+
+
 @pytest.mark.slow
 def test_a_saved_model_is_loaded_with_its_processor(tmp_path):
     model = small("rt_detr")
