@@ -25,6 +25,7 @@ from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
+from semfov.cli.truth import read_truth
 from semfov.data.sources import embedded_picture
 from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.head.world import World
@@ -58,6 +59,10 @@ class PictureJob(ABC):
             again = [place for place, times in places.items() if times > 1]
             expected = f"pictures of different names with --{name}, whose files have their names"
             check(not again or getattr(options, name) is None, name, expected, ", ".join(again[:3]))
+        self.truth = None if options.annotations is None else read_truth(options.annotations)
+        if self.truth is not None:
+            for source in self._sources:
+                self.truth.image_id(source.name)
 
     @property
     def sources(self) -> list[PictureSource]:
@@ -76,6 +81,7 @@ class PictureJob(ABC):
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
             "folder": None if folder is None else sha256(folder / MANIFEST),
+            "annotations": None if self.truth is None else self.truth.digest,
         }
 
     @abstractmethod
@@ -149,7 +155,7 @@ class _PictureFiles:
         kind = kind_of(out)
         file = out if kind is not None else out / "results.json"
         searched = self.job.title.startswith("search")
-        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream)
+        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream, truth=self.job.truth)
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several and out != STDOUT:
             key = digest_of([self.job.depends_on(), package_digest()])[:32]
@@ -193,6 +199,8 @@ class _PictureFiles:
         written = self.written
         if self.results is not None:
             self.results.write()
+            if complete and self.job.truth is not None:
+                print(self.results.precision())
             written = [*([] if self.results.path == STDOUT else [self.results.path]), *written]
         if self.episodes:
             episodes = [self.episodes[number] for number in sorted(self.episodes)]

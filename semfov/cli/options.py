@@ -81,6 +81,8 @@ class PictureOptions(AgentOptions):
             where), `belief_bars` (of a search) and `animation`; `none` draws nothing (not given: all but `belief_bars`,
             if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are
             written into a folder of its name.
+        annotations: annotation file in COCO's format; `--out FILE.coco.json` is then a list of results with its ids of
+            pictures and categories, and their average precision is printed.
         report: HTML page to write, in which to step through the looks.
         crops: folder for what the box of each object shows, as JPEG, with a folder for each class.
         labels: folder for labels in the format of YOLO, a text file for each picture (`semfov.paths.Record.to_yolo`).
@@ -100,6 +102,7 @@ class PictureOptions(AgentOptions):
     bands: str | None = None
     out: Path | None = None
     draw: tuple[Drawing, ...] | None = None
+    annotations: Path | None = None
     report: Path | None = None
     crops: Path | None = None
     labels: Path | None = None

@@ -15,6 +15,7 @@ from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of, result_row
 from semfov.cli.sources import PictureSource
 from semfov.cli.text import looks_text, outcome_text, plain_name
+from semfov.cli.truth import read_truth
 from semfov.paths import GazeRecord, Scanpath
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief_bars, plot_belief_strip
@@ -57,7 +58,8 @@ def picture_outcome(
     text = outcome_text(record, source.name, seconds)
     episode = None
     kind = None if options.out is None else kind_of(options.out)
-    row = result_row(record, source.name, seconds, kind, source.file)
+    truth = None if options.annotations is None else read_truth(options.annotations)
+    row = result_row(record, source.name, seconds, kind, source.file, truth)
     if options.report is not None:
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from semfov.cli.truth import Truth
 from semfov.data.classes import canonical_name
 from semfov.errors import check
 from semfov.io.files import write_text
@@ -45,7 +46,12 @@ def kind_of(path: Path) -> str | None:
 
 
 def result_row(
-    record: GazeRecord, name: str, seconds: float, kind: str | None, file: Path | None = None
+    record: GazeRecord,
+    name: str,
+    seconds: float,
+    kind: str | None,
+    file: Path | None = None,
+    truth: Truth | None = None,
 ) -> dict[str, Any]:
     """Make the entry of a picture in a file of results."""
     picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
@@ -56,6 +62,15 @@ def result_row(
         row["parts"] = [
             {**each, "properties": {"picture": name, **each["properties"]}} for each in collection["features"]
         ]
+    elif truth is not None:
+        sought = picture["targets"] or record.classes[1:]
+        row["image_id"] = truth.image_id(name, (picture["width"], picture["height"]))
+        row["categories"] = truth.categories(sought)
+        ids = {canonical_name(each["name"]): each["id"] for each in row["categories"]}
+        # Objects of other classes cannot be judged; their number is not that of a category.
+        numbers = [ids.get(canonical_name(each), -1) for each in record.classes[1:]]
+        results = record.to_coco(row["image_id"], numbers)
+        row["parts"] = [each for each in results if each["category_id"] != -1]
     elif kind == ".coco.json":
         row["categories"] = _categories(record.classes[1:])
         row["parts"] = [
@@ -71,8 +86,8 @@ class ResultsFile:
     JSON lines are written one by one, to the stream if one is given; the other kinds as a whole, atomically.
     """
 
-    def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO) -> None:
-        self.path, self.kind, self.searched = path, kind, searched
+    def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO, truth: Truth | None = None) -> None:
+        self.path, self.kind, self.searched, self.truth = path, kind, searched, truth
         self._rows: dict[int, dict[str, Any]] = {}
         self._skipped: dict[int, dict[str, str]] = {}
         self._due = 0.0
@@ -103,6 +118,15 @@ class ResultsFile:
         took = time.monotonic() - began
         self._due = began + took / _SHARE
 
+    def precision(self) -> str:
+        """AP and AP50 of the objects against the annotations, in words."""
+        assert self.truth is not None
+        rows = [*self._rows.values()]
+        categories = {each["id"] for row in rows for each in row["categories"]}
+        results, images = [part for row in rows for part in row["parts"]], [row["image_id"] for row in rows]
+        ap, ap50 = self.truth.precision(results, images, [*categories])
+        return f"AP {ap:.3f}, AP50 {ap50:.3f} against {self.truth.path} ({len(rows)} pictures, {len(results)} boxes)"
+
     def _line(self, values: dict[str, Any]) -> None:
         """Write a line now."""
         line = json.dumps(values, ensure_ascii=False) + "\n"
@@ -125,6 +149,8 @@ class ResultsFile:
             unit = "; ".join(sorted({row["coordinates"] for row in rows}))
             features = [each for row in rows for each in row["parts"]]
             whole = {"type": "FeatureCollection", "coordinates": unit, "features": features}
+        elif self.truth is not None:
+            return json.dumps([each for row in rows for each in row["parts"]], indent=1) + "\n"
         elif self.kind == ".coco.json":
             images = [
                 {"id": number, "file_name": each["picture"], "width": each["width"], "height": each["height"]}

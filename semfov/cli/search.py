@@ -191,6 +191,8 @@ def _check(options: PictureOptions) -> Any:
     for folder in (options.crops, options.labels):
         if folder is not None:
             check_writable(folder, folder=True)
+    coco = options.out is not None and kind_of(options.out) == ".coco.json"
+    check(options.annotations is None or coco, "annotations", "--out FILE.coco.json beside it", options.out)
     check(not options.draw or options.out not in (None, STDOUT), "draw", "--out FOLDER beside --draw", "none")
     return start_of(options.start)
 

@@ -27,7 +27,7 @@ from semfov.io.schema import excerpt, is_number, is_plain
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
 
 
-def _read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
+def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     """Read and check a COCO instances file.
 
     Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
@@ -214,7 +214,7 @@ class CocoScenes:
         check(coverage in ("sum", "union"), "coverage", "'sum' or 'union'", repr(coverage))
         check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
         self.classes = tuple(classes)
-        coco, digest = _read_annotations(annotations)
+        coco, digest = read_annotations(annotations)
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import index
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,9 +33,12 @@ def named_detections(
 
 
 def coco_results(
-    image_id: int, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int]
+    image_id: int | str, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int]
 ) -> list[dict[str, Any]]:
     """COCO results of boxes (corners), with the category id of each class 1..K from `ids`."""
+    if not isinstance(image_id, str):
+        check(_is_whole(image_id), "image_id", "the whole number of an image, or text", repr(image_id))
+        image_id = index(image_id)
     size = boxes[:, 2:] - boxes[:, :2]
     placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
     return [
@@ -64,7 +68,8 @@ def category_ids(
     """Find the category id of each class."""
     ids = [category for category in categories if not isinstance(category, Mapping)]
     if len(ids) == len(categories):
-        return ids
+        check(all(map(_is_whole, ids)), "categories", "whole numbers, or categories of an annotation file", ids[:3])
+        return [index(each) for each in ids]
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
     named = [category for category in categories if isinstance(category, Mapping)]
@@ -73,6 +78,11 @@ def category_ids(
     missing = [name for name in names if name not in by_name]
     check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")
     return [by_name[name] for name in names]
+
+
+def _is_whole(value: object) -> bool:
+    """Whether a value is a whole number of any library."""
+    return hasattr(value, "__index__") and not isinstance(value, bool)
 
 
 def _supervision() -> Any:

@@ -10,11 +10,14 @@ import pandas as pd
 import pytest
 import torch
 from PIL import Image
+from pycocotools.coco import COCO
 
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
+from semfov.cli.truth import Truth, read_truth
 from semfov.data import read_image
 from semfov.data.sources import picture_files
+from semfov.errors import DataError
 from tests.colours import write_network
 
 
@@ -146,6 +149,55 @@ def test_all_objects_are_listed_and_written_as_tables(run, photo, large, tmp_pat
     corners = [each["geometry"]["coordinates"][0] for each in places]
     assert [[min(x), min(y), max(x), max(y)] for x, y in (zip(*ring, strict=True) for ring in corners)] == boxes
     assert [each["properties"]["picture"] for each in places] == [str(photo), str(large)]
+
+
+def test_results_have_the_ids_of_annotations_and_are_judged_by_pycocotools(run, photo, tmp_path):
+    """A right box of the one object gives AP 1; a category that was not sought is not judged."""
+    squares = [{"id": 1, "image_id": 77, "category_id": 5, "bbox": [8, 8, 20, 20], "area": 400, "iscrowd": 0}]
+    squares += [{**squares[0], "id": 2, "category_id": 9, "bbox": [80, 60, 9, 9]}]
+    truth = {
+        "images": [{"id": 77, "file_name": photo.name, "width": 160, "height": 120}, {"id": 78, "file_name": "b.png",
+                   "width": 8, "height": 8}],
+        "categories": [{"id": 9, "name": "gull"}, {"id": 5, "name": "Red"}],
+        "annotations": squares,
+    }  # fmt: skip
+    file = tmp_path / "gt.json"
+    file.write_text(json.dumps(truth))
+    out = ("--out", tmp_path / "boxes.coco.json", "--annotations", file)
+    code, printed = run("find", photo, *out)
+    assert code == 0
+    assert re.search(r"AP (1|0\.[89])\S*, AP50 1\.000 against .*gt\.json \(1 pictures, 1 boxes\)", printed.out)
+    (found,) = json.loads((tmp_path / "boxes.coco.json").read_text())
+    assert (found["image_id"], found["category_id"]) == (77, 5)
+    coco = COCO(str(file))
+    assert coco.loadRes(str(tmp_path / "boxes.coco.json")).getAnnIds() == [1]
+    code, printed = run("find", photo, "--out", tmp_path / "boxes.json", "--annotations", file)
+    assert (code, "annotations: expected --out FILE.coco.json beside it" in printed.err) == (1, True)
+    file.write_text(json.dumps({**truth, "images": [{**truth["images"][0], "width": 120, "height": 160}]}))
+    read_truth.cache_clear()
+    code, printed = run("find", photo, *out)
+    assert (code, "to have 120 × 160 px, got 160 × 120" in printed.err) == (1, True)
+    read_truth.cache_clear()
+
+
+def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth):
+    truth = make_truth("a/x.jpg", "b/x.jpg", "y.jpg")
+    assert truth.image_id("/photos/b/x.jpg") == 2
+    assert truth.image_id("../elsewhere/y.jpg") == 3
+    for name in ("c/x.jpg", "x.jpg", "z.jpg"):
+        with pytest.raises(DataError, match="expected one image with the file_name of"):
+            truth.image_id(name)
+
+
+@pytest.fixture
+def make_truth(tmp_path):
+    def make(*names):
+        images = [{"id": n, "file_name": name, "width": 8, "height": 6} for n, name in enumerate(names, 1)]
+        text = json.dumps({"images": images, "annotations": [], "categories": [{"id": 1, "name": "red"}]})
+        (tmp_path / "truth.json").write_text(text)
+        return Truth(tmp_path / "truth.json")
+
+    return make
 
 
 def test_several_classes_or_all_are_found(run, photo):

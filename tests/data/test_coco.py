@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from semfov.data import CocoScenes, read_image
-from semfov.data.coco import _read_annotations
+from semfov.data.coco import read_annotations
 from semfov.errors import DataError, InputError
 
 CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
@@ -27,7 +27,7 @@ ALL = {"min_instances": 0, "max_target_area": None}
 
 def test_index_and_digest(make_coco, capsys):
     path = make_coco(BOXES)
-    index, digest = _read_annotations(path)
+    index, digest = read_annotations(path)
     assert digest == hashlib.sha256(path.read_bytes()).hexdigest()
     assert sorted(index.getImgIds()) == [10, 20, 30]
     assert [a["bbox"] for a in index.loadAnns(index.getAnnIds(imgIds=[10]))] == [
@@ -44,22 +44,22 @@ def test_ids_may_be_strings(make_coco, coco_dict):
         image["id"] = str(image["id"])
     for annotation in data["annotations"]:
         annotation["image_id"] = str(annotation["image_id"])
-    index, _ = _read_annotations(make_coco(data=data))
+    index, _ = read_annotations(make_coco(data=data))
     assert sorted(index.imgs) == ["10", "20", "30"]
 
 
 def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"no\.json: no such file; check data\.annotations"):
-        _read_annotations(tmp_path / "no.json")
+        read_annotations(tmp_path / "no.json")
     with pytest.raises(DataError, match="expected a file, got a folder"):
-        _read_annotations(tmp_path)
+        read_annotations(tmp_path)
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 10_000])
 def test_a_file_that_is_not_json_is_refused(tmp_path, text):
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(DataError, match=r"a\.json: not a JSON file"):
-        _read_annotations(tmp_path / "a.json")
+        read_annotations(tmp_path / "a.json")
 
 
 MISSING = object()
@@ -108,19 +108,19 @@ def test_errors_name_the_entry_and_the_field(make_coco, coco_dict, where, value,
     else:
         entry[where[-1]] = value
     with pytest.raises(DataError, match=rf"instances\.json: .*{message}.*; correct or replace the file"):
-        _read_annotations(make_coco(data=data))
+        read_annotations(make_coco(data=data))
 
 
 def test_a_json_list_is_refused(make_coco):
     with pytest.raises(DataError, match="expected an object with images, annotations and categories, got a list"):
-        _read_annotations(make_coco(data=[]))
+        read_annotations(make_coco(data=[]))
 
 
 def test_long_values_are_shortened_in_the_message(make_coco, coco_dict):
     data = coco_dict(BOXES)
     data["images"][0]["width"] = "x" * 10_000
     with pytest.raises(DataError) as caught:
-        _read_annotations(make_coco(data=data))
+        read_annotations(make_coco(data=data))
     assert len(str(caught.value)) < 300
 
 
@@ -130,7 +130,7 @@ def test_deeply_nested_values_are_refused(make_coco, coco_dict, tmp_path):
     text = json.dumps(data).replace('"HERE"', "[" * 900 + "]" * 900)
     (tmp_path / "deep.json").write_text(text)
     with pytest.raises(DataError, match=r"deep\.json"):
-        _read_annotations(tmp_path / "deep.json")
+        read_annotations(tmp_path / "deep.json")
 
 
 @pytest.fixture

@@ -109,6 +109,17 @@ def test_classes_without_a_category_are_refused(record):
     assert [each["category_id"] for each in own.to_coco(1, [11, 12, 13])] == [13, 11, 12]
 
 
+def test_ids_of_numpy_become_plain_numbers(record):
+    results = record.to_coco(np.int64(7), np.array([11, 12, 13]))
+    assert results == json.loads(json.dumps(record.to_coco(7, [11, 12, 13])))
+    assert record.to_coco("a7")[0]["image_id"] == "a7"
+    for wrong in (7.5, None, True):
+        with pytest.raises(InputError, match="image_id: expected the whole number of an image"):
+            record.to_coco(wrong)
+    with pytest.raises(InputError, match="categories: expected whole numbers"):
+        record.to_coco(7, [1.5, 2, 3])
+
+
 def test_geojson_in_pixels_says_so(record, tmp_path):
     Image.new("RGB", (80, 60)).save(tmp_path / "plain.tif")
     for source in (None, "photo.jpg", str(tmp_path / "plain.tif")):
