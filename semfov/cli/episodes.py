@@ -22,7 +22,7 @@ from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
-from semfov.cli.results import STDOUT, ResultsFile, kind_of
+from semfov.cli.results import STDOUT, ResultsFile, check_places, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.cli.truth import read_truth
@@ -153,6 +153,8 @@ class _PictureFiles:
         if out is None:
             return
         kind = kind_of(out)
+        if kind == ".geojson":
+            check_places([source.file for source in self.job.sources])
         file = out if kind is not None else out / "results.json"
         searched = self.job.title.startswith("search")
         self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream, truth=self.job.truth)

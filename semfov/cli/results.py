@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli.truth import Truth
 from semfov.data.classes import canonical_name
-from semfov.errors import check
+from semfov.errors import DataError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths import GazeRecord
 from semfov.paths.conversion import COLUMNS
+from semfov.paths.georeference import georeference
 
 _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
 """Ends of the names of files of results."""
@@ -43,6 +45,16 @@ def kind_of(path: Path) -> str | None:
     fits = kind is not None or not path.suffix or path.is_dir()
     check(fits, "out", f"a folder, or a file that ends in {', '.join(_RESULT_KINDS)}", path)
     return kind
+
+
+def check_places(files: Sequence[Path | None]) -> None:
+    """Raise `InputError` where only some of the pictures have a place on earth, as one collection has one unit."""
+    kinds: dict[bool, Path | None] = {}
+    for file in files:
+        with suppress(DataError):  # it is skipped when it is opened
+            kinds.setdefault(file is not None and georeference(str(file)) is not None, file)
+    got = f"{kinds.get(True)} with one and {kinds.get(False)} without; look at them apart, or write .json"
+    check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
 
 
 def result_row(
@@ -146,7 +158,7 @@ class ResultsFile:
         if self.kind == ".csv":
             return self._csv(pictures)
         if self.kind == ".geojson":
-            unit = "; ".join(sorted({row["coordinates"] for row in rows}))
+            unit = rows[0]["coordinates"] if rows else ""
             features = [each for row in rows for each in row["parts"]]
             whole = {"type": "FeatureCollection", "coordinates": unit, "features": features}
         elif self.truth is not None:

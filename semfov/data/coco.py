@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import os
+import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from os import PathLike
@@ -25,6 +26,9 @@ from semfov.io.files import check_regular, json_sha256, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
+
+_BEYOND = 0.2
+"""Share of boxes that leave their pictures from which on they may be corners."""
 
 
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
@@ -215,7 +219,7 @@ class CocoScenes:
         check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
         self.classes = tuple(classes)
         coco, digest = read_annotations(annotations)
-        packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
+        packed = _Packed(coco, _match(coco, self.classes, annotations), annotations, drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
             first = ", ".join(f"{what}: {n}" for what, n in self.repairs.most_common(8))
@@ -319,7 +323,7 @@ def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotatio
 class _Packed:
     """The objects of all images of a file, concatenated in a few tensors, which are cheap to send to workers."""
 
-    def __init__(self, coco: Any, labels: dict[int | str, int], *, drop_crowds: bool) -> None:
+    def __init__(self, coco: Any, labels: dict[int | str, int], path: object, *, drop_crowds: bool) -> None:
         self.ids: list[Any] = sorted(coco.imgs)
         self.names: list[str] = [coco.imgs[i]["file_name"] for i in self.ids]
         self.sizes = [(int(coco.imgs[i]["width"]), int(coco.imgs[i]["height"])) for i in self.ids]
@@ -334,6 +338,8 @@ class _Packed:
 
         corner, extent = bboxes.reshape(-1, 4).split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)
+        if seems := _other_form(bboxes.reshape(-1, 4), limits):
+            warnings.warn(f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}", stacklevel=4)
         cut = edges.clamp(min=0).minimum(limits)
         boxes = cut.float()
         solid = (boxes[:, 2:] > boxes[:, :2]).all(-1)
@@ -361,6 +367,19 @@ class _Packed:
         own = slice(self._ends[row - 1] if row else 0, self._ends[row])
         boxes, labels, crowd = self._boxes[own], self._labels[own], self._crowd[own]
         return Annotation(boxes.clone(), labels.clone(), crowd.clone(), self.sizes[row])
+
+
+def _other_form(boxes: torch.Tensor, limits: torch.Tensor) -> str | None:
+    """What boxes `(N, 4)` in pictures of sizes `(N, 4)` look like if they are not [x, y, width, height] in pixels.
+
+    >>> _other_form(torch.tensor([[0.1, 0.2, 0.5, 0.5]]), torch.tensor([[640, 480, 640, 480]]))
+    'fractions of the picture'
+    """
+    if len(boxes) and float(boxes.max()) <= 1 and float(limits.min()) > 2:
+        return "fractions of the picture"
+    corners = bool(((boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)).all())
+    beyond = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1).double().mean()
+    return "corners [x1, y1, x2, y2]" if len(boxes) and corners and float(beyond) >= _BEYOND else None
 
 
 def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[int | str, int]:

@@ -211,7 +211,15 @@ def cache_folder() -> Path:
     """The folder of downloads: `$SEMFOV_CACHE`, else the platform's cache folder for semfov."""
     import pooch
 
-    return Path(os.environ.get("SEMFOV_CACHE") or pooch.os_cache("semfov")).expanduser()
+    given = os.environ.get("SEMFOV_CACHE")
+    try:
+        folder = Path(given or pooch.os_cache("semfov")).expanduser()
+        fits = folder.is_dir() or not folder.exists()
+    except (OSError, RuntimeError, ValueError) as error:  # a name that is too long, or the home of nobody
+        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {given!r} ({error})") from None
+    if not fits:
+        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got the file {folder}")
+    return folder
 
 
 def fetch(name: str) -> Path:

@@ -6,11 +6,17 @@ import os
 import re
 import secrets
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from semfov.errors import DataError
+
+_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
+_OLD = 24 * 3600.0
+"""Seconds after which a part of a file is taken for one whose writer was killed."""
 
 _unfinished: set[Path] = set()
 
@@ -33,6 +39,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(path.parent.resolve())
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
         # Known before it exists: a signal may end the process while the file is created.
         _unfinished.add(temporary)
@@ -49,6 +56,17 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             with suppress(OSError):
                 temporary.unlink()
             _unfinished.discard(temporary)
+
+
+@cache
+def _sweep(folder: Path) -> None:
+    """Remove old parts from a folder, once in each process: a writer that was killed could not."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if _PART.fullmatch(entry.name):
+                with suppress(OSError):
+                    if time.time() - entry.stat(follow_symlinks=False).st_mtime > _OLD:
+                        Path(entry.path).unlink()
 
 
 def inside(folder: str | Path, name: str) -> Path:

@@ -32,14 +32,17 @@ _CLOSER = {
     "place": CHANCE,
     "presence": CHANCE,
 }
+FARTHEST = 2.0**24
+"""Largest coordinate in pixels, up to which float32 holds every whole pixel."""
+
 _DETECTIONS = {
-    "boxes": Field(("M", 4), mixed=True),
+    "boxes": Field(("M", 4), mixed=True, low=-FARTHEST, high=FARTHEST),
     "scores": Field(("M", "C"), mixed=True),
     "mask": Field(("M",), dtype=torch.bool),
 }
 _OPTIONAL = {
-    "box": Field((4,), mixed=True, optional=True),
-    "closer_boxes": Field(("Q", 4), mixed=True, optional=True),
+    "box": Field((4,), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
+    "closer_boxes": Field(("Q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
 }
 _SHARED = {

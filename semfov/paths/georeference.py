@@ -1,6 +1,7 @@
 """The place of a picture on earth, from a GeoTIFF or another raster that GDAL reads."""
 
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,7 +23,7 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None
     try:
-        import rasterio
+        import rasterio.transform
         from rasterio.warp import transform
     except ImportError:
         raise InputError(
@@ -30,11 +31,17 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
             'pip install "semfov[geo]"'
         ) from None
     try:
-        with raster_settings(), open_raster(source) as picture:
+        with warnings.catch_warnings(), raster_settings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            picture = open_raster(source)
+        with picture:
             system, affine = picture.crs, picture.transform
+            points, system_of_points = picture.gcps
+            if affine.is_identity and points:
+                system, affine = system_of_points, rasterio.transform.from_gcps(points)
     except (rasterio.errors.RasterioError, OSError) as error:
         raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
-    if system is None:
+    if system is None or affine.is_identity:  # a system alone does not say where the picture lies
         return None
 
     def place(points: NDArray[np.float64]) -> NDArray[np.float64]:

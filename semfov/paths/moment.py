@@ -17,7 +17,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.io.schema import Field, Number, Object
 from semfov.paths.base import Record
-from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
 from semfov.paths.look import Box, RecordedLook, cell_columns
 from semfov.paths.windows import TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
 from semfov.zoom.glances import Window
@@ -25,7 +25,7 @@ from semfov.zoom.glances import Window
 _FOVEA = Format(
     "moment",
     {
-        "fixation": Field((2,), mixed=True),
+        "fixation": Field((2,), mixed=True, low=-FARTHEST, high=FARTHEST),
         "probability": Field(("cells",), mixed=True, low=0, high=1 + 1e-3),
         "visited": Field(("cells",), dtype=torch.bool),
     },

@@ -22,7 +22,7 @@ from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
 from semfov.paths.base import GazeRecord
-from semfov.paths.files import POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
 
@@ -50,7 +50,7 @@ _FORMAT = Format(
     "scanpath",
     {
         "cells": Field(("n",), dtype=torch.int64, low=0),
-        "fixations": Field(("n", 2), mixed=True),
+        "fixations": Field(("n", 2), mixed=True, low=-FARTHEST, high=FARTHEST),
         "probabilities": Field(("n", "cells", "C"), mixed=True, low=0, high=1 + 1e-3),
         "values": Field(("n", "cells"), mixed=True, finite=False),
         "posterior": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),

@@ -16,7 +16,7 @@ from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Pair
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
-from semfov.paths.files import POSITIVE, WHOLE, Format, pair
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
@@ -41,7 +41,7 @@ TENSORS = {
     "values": Field(("n",), mixed=True, finite=False),
     "cut": Field(("M",), dtype=torch.bool),
     "show": Field(("n", "C-1"), mixed=True),
-    "object_boxes": Field(("P", 4), mixed=True),
+    "object_boxes": Field(("P", 4), mixed=True, low=-FARTHEST, high=FARTHEST),
     "object_scores": Field(("P",), mixed=True),
     "object_labels": Field(("P",), dtype=torch.int64, low=1),
     "object_passes": Field(("P",), dtype=torch.int64, low=0),

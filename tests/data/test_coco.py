@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from semfov.data import CocoScenes, read_image
-from semfov.data.coco import read_annotations
+from semfov.data.coco import _other_form, _Packed, read_annotations
 from semfov.errors import DataError, InputError
 
 CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
@@ -324,3 +324,30 @@ def test_the_program_gives_no_warnings(fresh):
         "runpy.run_module('semfov.data.coco', run_name='__main__')"
     )
     assert "val2017" in fresh(code)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "seems"),
+    [
+        ([[0.1, 0.2, 0.5, 0.4], [0, 0, 1, 1]], "fractions of the picture"),
+        ([[60, 10, 90, 40], [5, 5, 20, 20], [50, 50, 99, 70]], "corners [x1, y1, x2, y2]"),
+        ([[60, 10, 30, 40], [5, 5, 20, 20], [50, 50, 40, 20]], None),
+        ([[60, 10, 90, 40], [5, 5, 2, 2]], None),
+        ([], None),
+    ],
+)
+def test_boxes_in_another_form_are_told(boxes, seems):
+    limits = torch.tensor([100, 80, 100, 80]).expand(len(boxes), 4)
+    assert _other_form(torch.tensor(boxes, dtype=torch.float64).reshape(-1, 4), limits) == seems
+
+
+def test_a_warning_says_that_boxes_are_corners(make_coco):
+    boxes = [[0.5, 0.25, 0.5, 0.5], [0.1, 0.1, 0.2, 0.2]]
+    data = {
+        "images": [{"id": 1, "file_name": "a.png", "width": 100, "height": 80}],
+        "categories": [{"id": 1, "name": "cup"}],
+        "annotations": [{"id": n, "image_id": 1, "category_id": 1, "bbox": box} for n, box in enumerate(boxes)],
+    }
+    index, _ = read_annotations(make_coco(data=data))
+    with pytest.warns(UserWarning, match=r"gt\.json: bbox is .* these look like fractions of the picture"):
+        _Packed(index, {1: 1}, "gt.json", drop_crowds=False)

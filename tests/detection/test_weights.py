@@ -15,6 +15,7 @@ import pytest
 from semfov.detection import weights
 from semfov.detection.weights import _Address, _SourceDistribution, _Weights, cache_folder, fetch
 from semfov.errors import DataError, InputError
+from semfov.io.files import write_text
 
 CONTENT = b"numbers" * 100
 
@@ -203,3 +204,11 @@ def test_an_unreachable_address_is_named_in_the_error(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
         _Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")
+
+
+@pytest.mark.parametrize("folder", ["{file}", "{file}/below", "~nobody-of-this-name/cache", "/" + 300 * "x"])
+def test_an_odd_cache_folder_is_refused_by_name(tmp_path, monkeypatch, folder):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SEMFOV_CACHE", folder.format(file=tmp_path / "file"))
+    with pytest.raises(DataError, match=r"SEMFOV_CACHE|cannot write"):
+        write_text(cache_folder() / "new" / "a.txt", "")

@@ -1,11 +1,13 @@
 """Atomic writes: what is left of a write that does not finish."""
 
+import os
+import time
 from pathlib import Path
 
 import pytest
 
 from semfov.errors import DataError
-from semfov.io.files import discard_unfinished, replacing
+from semfov.io.files import discard_unfinished, replacing, write_bytes
 
 
 def test_a_process_that_ends_while_the_temporary_file_is_created_leaves_nothing(tmp_path, monkeypatch):
@@ -41,3 +43,14 @@ def test_a_path_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"cannot write .*a\.json"), replacing(tmp_path / "file" / "a.json"):
         pass
+
+
+def test_parts_of_writers_that_were_killed_are_removed_when_they_are_old(tmp_path):
+    names = [".a.json.0123abcd.part", ".b.json.00000000.part", "c.part", ".d.0123abcd.part.txt"]
+    for name in names:
+        (tmp_path / name).write_text("")
+    day = 24 * 3600
+    for name in (names[0], names[2], names[3]):
+        os.utime(tmp_path / name, (time.time() - 2 * day,) * 2)
+    write_bytes(tmp_path / "new.json", b"")
+    assert {each.name for each in tmp_path.iterdir()} == {*names[1:], "new.json"}

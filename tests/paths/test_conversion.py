@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import sys
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from pycocotools.cocoeval import COCOeval
 from torchvision.utils import draw_bounding_boxes
 
 from semfov import Detections, Grid, InputError
+from semfov.cli.results import check_places
 from semfov.errors import DataError
 from tests import small
 
@@ -160,6 +162,35 @@ def test_geojson_of_a_geotiff_has_its_coordinates(record, tmp_path):
     # Counterclockwise, as RFC 7946 asks.
     east, north = (ring[1:] - ring[:-1]).T
     assert (east[:-1] * north[1:] - east[1:] * north[:-1] > 0).all()
+
+
+def test_a_system_without_a_place_gives_pixels_and_control_points_a_place(record, tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    from rasterio.control import GroundControlPoint
+    from rasterio.errors import NotGeoreferencedWarning
+
+    options = {"width": 80, "height": 60, "count": 3, "dtype": "uint8", "driver": "GTiff"}
+    names = tmp_path / "system.tif", tmp_path / "points.tif"
+    # A degree is ten pixels, from 10 east, 50 north.
+    places = [(row, column, 10 + column / 10, 50 - row / 10) for row in (0, 60) for column in (0, 80)]
+    for name, points in zip(names, ([], [GroundControlPoint(*place) for place in places]), strict=True):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            file = rasterio.open(name, "w", **options)
+        with file:
+            file.write(np.zeros((3, 60, 80), np.uint8))
+            if points:
+                file.gcps = points, "EPSG:4326"
+            else:
+                file.crs = "EPSG:4326"
+    system, points = (replace(record, source=str(name)).to_geojson() for name in names)
+    assert "pixels" in system["coordinates"]
+    assert "WGS 84" in points["coordinates"]
+    ring = points["features"][1]["geometry"]["coordinates"][0]
+    np.testing.assert_allclose(ring[0], [11.0, 46.0], atol=1e-8)
+    with pytest.raises(InputError, match=r"out: expected pictures that all have .*points\.tif with one"):
+        check_places([*names, None])
+    check_places([names[0], None])
 
 
 def test_a_georeference_needs_rasterio(record, tmp_path, monkeypatch):

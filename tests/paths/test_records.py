@@ -450,6 +450,15 @@ def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path)
         write_file(other, {key: value for key, value in tensors.items() if key != name}, values)
         with pytest.raises(DataError, match=name):
             type(record).load(other)
+    far = {
+        name: tensors[name].clone() for name in ("boxes", "object_boxes", "fixations", "fixation") if name in tensors
+    }
+    for name, tensor in far.items():
+        if tensor.numel():
+            tensor.view(-1)[0] = 1e38
+            write_file(other, {**tensors, name: tensor}, values)
+            with pytest.raises(DataError, match=rf"{name}: expected numbers .* got 9\.99\d+e\+37"):
+                type(record).load(other)
 
 
 def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
