@@ -42,10 +42,9 @@ _LOOKS = """\
   --seconds S          longest time for a picture; --white auto: thermal or 12 bits; --bands 4,3,2: bands of a TIFF"""
 
 _OUTPUT = """\
-  --out FILE           .json, .jsonl, .csv, .geojson, or for COCO .coco.json, written as it runs; - is standard output
+  --out FILE           .json, .jsonl, .csv, .geojson, .coco.json (--annotations FILE: with its ids, and AP); - is stdout
   --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
                        also views,belief, and in a search belief_bars
-  --annotations FILE   for .coco.json: take the ids of COCO's annotations, and print AP against them
   --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: errors alone
   --crops FOLDER       what the box of each object shows, as JPEG; --labels FOLDER: labels in the format of YOLO
   --workers N          processes (--scheduler tcp://HOST:8786: of a Dask cluster); --device cuda; --half: 16 bits
