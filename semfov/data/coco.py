@@ -55,7 +55,7 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
 
 def category_names(path: str | PathLike[str]) -> tuple[str, ...]:
     """Names of the categories of an annotation file, in the order of their ids."""
-    coco, _ = _read_annotations(path)
+    coco, _ = read_annotations(path)
     return tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
 
 
