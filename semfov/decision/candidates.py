@@ -77,6 +77,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """Find the place that is to be looked at closely now."""
 
+    def seen(self, candidate: CandidatePlace) -> bool:
+        """Whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
+        return False
+
     @abstractmethod
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)`."""

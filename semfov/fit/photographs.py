@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
@@ -35,9 +36,9 @@ from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import usual_slices
 
 _FOLDS = 5
-_ABSENT = 6
+_ABSENT = 20
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
-_FALSE_ALARMS = 0.01
+_FALSE_ALARMS = 0.007
 """Maximum share of absent targets that may be reported as found; it determines the threshold."""
 
 _AREA = 0.2
@@ -103,7 +104,7 @@ class WholeSearch(TargetSearch[WindowLook]):
 
     def candidates(self) -> PhotographPlaces:
         """Make the source of places to look at closely."""
-        return PhotographPlaces(self.target)
+        return PhotographPlaces(self.target, self.glances.lattice)
 
     def close_up(self, box: Tensor) -> Detections:
         """Look closely at a box `(4,)`, once."""
@@ -130,16 +131,20 @@ class WholeSearch(TargetSearch[WindowLook]):
         raise NotImplementedError
 
 
-def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: Limits) -> str:
+def fit_photographs(
+    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: Limits, prior: Verification | None = None
+) -> str:
     """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
 
-    Each of the first photographs is searched for up to two classes that it holds and for others that it does not.
-    Returns the report in Markdown.
+    Those with most pixels are searched, each for up to two classes that it holds and for others that it does not. The
+    prior is that of `fit`. Returns the report in Markdown.
     """
     canvas = eye.detector.input_size
     single = [n for n in range(len(pictures)) if Lattice.over(pictures.annotation(n).size, canvas).levels == 1]
     if not single:
         return "None, since no photograph is shown at more than half its size by one look.\n"
+    # Enlarged windows need pixels.
+    single.sort(key=lambda n: -max(pictures.annotation(n).size))
     count, held = len(pictures), torch.zeros(len(pictures), model.classes, dtype=torch.bool)
     for index in range(count):
         held[index, pictures.annotation(index).labels - 1] = True
@@ -165,7 +170,7 @@ def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, co
     certainty = fit_certainty(torch.cat(facts), torch.cat(right))
     evidence.certainty = replace(certainty, strength=1.0)  # looks at all slices leave nothing to expect
     _fit_whole(evidence, [each for each in searches if not each.spare], held, count)
-    text = _fit_closer(evidence, searches, config)
+    text = _fit_closer(evidence, searches, config, prior)
     model.photograph = evidence
     model.metadata["photograph"] = {"photographs": len(single[: config.photographs]), "frequencies": count}
     return text
@@ -188,16 +193,18 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[WholeSearch], he
     evidence.whole.bias.fill_(offset)
 
 
-def _fit_closer(evidence: PhotographEvidence, searches: Sequence[WholeSearch], config: Limits) -> str:
+def _fit_closer(
+    evidence: PhotographEvidence, searches: Sequence[WholeSearch], config: Limits, prior: Verification | None
+) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
     closer = examine(searches, _FOLDS)
     if closer is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
-    chosen = [fit(closer, closer.fold != fold) for fold in range(_FOLDS)]
+    chosen = [fit(closer, closer.fold != fold, prior) for fold in range(_FOLDS)]
     limits = Thresholds(1.0, config.worth, config.worth)
     decisions = list(verify(searches, chosen, limits, None))
     confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
-    fitted = fit(closer, closer.fold >= 0)
+    fitted = fit(closer, closer.fold >= 0, prior)
     fitted.thresholds = Thresholds(confirm, config.worth, config.worth)
     evidence.verification = fitted
     result = VerificationResult(fitted, chosen, closer, decisions)

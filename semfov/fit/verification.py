@@ -231,14 +231,15 @@ def verify(
     """Make all closer looks of searches, with the model that was not fitted to their picture."""
     for search in searches:
         model = folds[search.picture % len(folds)]
-        verifier, count, ends = Verifier(model, search.candidates(), search.close_up, limits), 0, list[int]()
+        places, count, ends = search.candidates(), 0, list[int]()
+        verifier = Verifier(model, places, search.close_up, limits)
         for index in range(len(search)):
             count += 1
             room = search.passes - count
             verifier.see(search.look(index, count), last=search.last(index, room))
-            closer = len(verifier.look_closely(room))
-            ends += range(count + 1, count + closer + 1)
-            count += closer
+            for each in verifier.look_closely(room):
+                count += not places.seen(each)
+                ends.append(count)
             if verifier.outcome() or count >= search.passes:
                 break
         yield _VerifiedSearch(

@@ -82,8 +82,8 @@ class FitZoomConfig(FitConfig):
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because the search gives up.
         place: least probability that the target is at a place, for a closer look there when no other look follows.
-        photographs: number of photographs that are looked at by themselves, to fit the evidence for photographs; 0
-            leaves it out.
+        photographs: number of photographs that are looked at by themselves, those with most pixels first, to fit the
+            evidence for photographs; 0 leaves it out.
         worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
         refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
@@ -122,7 +122,7 @@ class FitZoomConfig(FitConfig):
     lost: Share = 0.02
     place: Share = 0.2
     photographs: Whole = 320
-    worth: Share = 0.1
+    worth: Share = 0.05
     evidence: Path | None = None
     refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800

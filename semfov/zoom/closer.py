@@ -1,5 +1,7 @@
 """Closer looks of a search in a large picture: the boxes they are made at, and the windows that show these."""
 
+import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -7,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
+from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
@@ -20,6 +23,9 @@ _CONTEXT = 3.0
 
 PART, _AROUND = 0.6, 2.0
 """Least side of that window in a photograph, in longer sides of the photograph, and of the box."""
+
+_WHOLE = 0.9
+"""Share of a photograph from which on a window shows no more than the look at the whole."""
 
 _SMALLEST = 1e-4
 
@@ -185,13 +191,16 @@ class PhotographPlaces(CandidateBoxes):
     A look at a place is worth the probability that the target is there, and at none of the places looked at before:
 
     .. math:: v = p \, (1 - \max_i p_i)
+
+    A place whose window is nearly the whole photograph is examined in the look at the whole, without a pass.
     """
 
     least = 0.002
     by_best = True
 
-    def __init__(self, target: int, forgetting: Forgetting | None = None) -> None:
+    def __init__(self, target: int, lattice: Lattice, forgetting: Forgetting | None = None) -> None:
         super().__init__(target, 0.0, forgetting)
+        self._lattice, self._at = lattice, 0
         self._known: list[tuple[int, float]] = []  # with their frames
 
     @property
@@ -205,13 +214,30 @@ class PhotographPlaces(CandidateBoxes):
         place = super().due(0.0, last=True)
         return None if place is None or self._worth(place) < least else place
 
+    def seen(self, candidate: CandidatePlace) -> bool:
+        """Whether the window that shows a place is nearly the whole photograph."""
+        x1, y1, x2, y2 = closer_window(self._lattice, candidate.box).region(self._lattice)
+        return (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
+
+    def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
+        """Look closely at a place, or take the look at the whole."""
+        return super().examine(candidate, (lambda _: self.detections) if self.seen(candidate) else close_up)
+
+    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
+        """Leave out the places of both boxes."""
+        made = self._number
+        super().dismiss(candidate, box)
+        self._at = made
+        if self.seen(candidate):
+            self._number, self._at = made, self._look.number - 1
+
     def _worth(self, place: CandidatePlace) -> float:
         return place.probability * (1 - max((known for _, known in self._known), default=0.0))
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look."""
         self._known.append((self._frame, place))
-        return super().record(box, place, presence)
+        return replace(super().record(box, place, presence), number=self._at)
 
     def wait(self) -> None:
         """Let a frame pass."""

@@ -165,7 +165,7 @@ class WindowDecisions:
             if photograph is None:
                 places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting)
             else:
-                places = PhotographPlaces(self.target, self._forgetting)
+                places = PhotographPlaces(self.target, belief.lattice, self._forgetting)
                 at = at.changed(place=worth)  # all further looks are closer ones
             self.verifier = Verifier(model, places, self._close_up, at, most)
         else:
@@ -193,7 +193,7 @@ class WindowDecisions:
             return
         look = WindowLook(candidates(turn.glance), number, self._presence, facts.best, self._ahead)
         self.verifier.see(look, last=last)
-        self.outcome = self.verifier.outcome()
+        self._settle(self.verifier)
 
     @property
     def candidate(self) -> CandidatePlace | None:
@@ -209,8 +209,14 @@ class WindowDecisions:
         """Look closely at the candidate, and choose the next one."""
         assert self.verifier is not None
         look = self.verifier.look()
-        self.outcome = self.verifier.outcome()
+        self._settle(self.verifier)
         return look
+
+    def _settle(self, verifier: Verifier[WindowLook]) -> None:
+        """Examine the places that need no pass, and decide."""
+        while verifier.candidate is not None and verifier.places.seen(verifier.candidate):
+            verifier.look()
+        self.outcome = verifier.outcome()
 
     def decision(self, *, over: bool | None = None) -> Decision:
         """The decision as it stands."""

@@ -69,7 +69,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     before = (home / "models/windows.safetensors").read_bytes()
     (home / "models/progress/windows.json").unlink()
     with monkeypatch.context() as stored:
-        stored.setattr("semfov.zoom.glances.LiveGlances.see", None)
+        stored.setattr("semfov.data.mosaics.Mosaics.__getitem__", None)
         assert folder_of(home).fit("windows") == fitted
     assert (home / "models/windows.safetensors").read_bytes() == before
     monkeypatch.setattr("semfov.fit.parts.windows.fit_mosaics", None)

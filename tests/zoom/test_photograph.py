@@ -7,7 +7,7 @@ import torch
 
 from semfov.agents import ZoomAgent
 from semfov.belief.target_evidence import Thresholds
-from semfov.belief.verification import Verification
+from semfov.belief.verification import Verification, closer_features
 from semfov.detection.detections import Detections
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import FACTS, Certainty
@@ -107,7 +107,7 @@ def test_slices_are_ranked_by_the_hints_whose_centre_they_show(detector, photogr
 def test_a_closer_look_is_due_when_it_is_worth_a_pass():
     boxes = torch.tensor([[[10.0, 10, 30, 30], [60.0, 60, 80, 80], [120.0, 100, 140, 120]]])
     scores = torch.tensor([[[0, 0.5, 0], [0, 0.02, 0], [0, 0.001, 0]]])
-    places = PhotographPlaces(1)
+    places = PhotographPlaces(1, LATTICE)
     places.see(WindowLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.8, 0.5, 0.0))
 
     def odds(p):
@@ -127,6 +127,29 @@ def test_a_closer_look_is_due_when_it_is_worth_a_pass():
     assert places.due(chances[1] * 0.4 + 1e-4, last=True) is None
     places.dismiss(second, second.box)
     assert places.left < 0
+
+
+def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
+    boxes = torch.tensor([[[10.0, 10, 180, 140], [60.0, 60, 80, 80]]])
+    scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]])
+    places, looked = PhotographPlaces(1, LATTICE), []
+    whole = Detections(boxes, scores, torch.ones(1, 2).bool())
+    places.see(WindowLook(whole, 1, 0.8, 0.5, 0.0))
+
+    def close_up(box):
+        looked.append(box)
+        return whole
+
+    large = places.due(0.1, last=True)
+    assert places.seen(large)
+    features, box = places.examine(large, close_up)
+    expected = closer_features(0.8, large.probability, 0.5, whole, large.box, 1)
+    assert torch.equal(features, expected[0])
+    assert (looked, places.record(box, 0.4, 0.5).number) == ([], 0)
+    small = places.due(0.1, last=True)
+    assert not places.seen(small)
+    _, box = places.examine(small, close_up)
+    assert (len(looked), places.record(box, 0.4, 0.5).number) == (1, 1)
 
 
 def test_the_window_of_a_closer_look_shows_other_places_too():

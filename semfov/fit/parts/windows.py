@@ -14,6 +14,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, mean_percent, section
 from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
 from semfov.fit.windows import (
     FitZoomConfig,
@@ -32,6 +33,7 @@ from semfov.fit.windows_choice import open_all
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
+from semfov.runs.setup import make_scenes
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
@@ -48,6 +50,8 @@ _OF_INPUT = 1.15
 """Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
 _FOR_MOSAICS = 360
 """The number of mosaics grows up to this number of photographs to learn from."""
+_ALONE = 120
+"""Largest number of photographs that are searched by themselves."""
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
@@ -97,6 +101,7 @@ class WindowsFit(PartFit):
             searched=max(8, training // 12),
             sought=3,
             passes=16,
+            photographs=min(photographs, _ALONE),
             tile=self._tile(),
             steps=own.window_steps,
             survey_steps=own.window_steps,
@@ -129,6 +134,7 @@ class WindowsFit(PartFit):
             "fitting decisions": 0.01 * config.judging,
             "looking closely": 4 * config.searched,
             "looking closely at held-out pictures": 4 * config.judged,
+            "looking at photographs": 25 * _LOOK * config.photographs,
             **{f"exploring, {kind}": 2 * count for kind, count in (sets | some_explored(config.searched)).items()},
         }
 
@@ -181,12 +187,15 @@ def fit_mosaics(
     survey_again(config, model, examples)
     lines = [judge_windows(model, examples["judged"])[0]]
     lines += fit_decision(config, model, eye, mosaics, store)
-    files = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-    verifications = [GlimpseEvidence.from_pretrained(file.stem).verification for file in files]
-    lines += fit_closer_looks(
-        config, model, eye, mosaics, store, mean_of([each for each in verifications if each is not None])
-    )
+    shipped = [
+        GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
+    ]
+    larger = [each.verification for each in shipped if each.verification is not None]
+    lines += fit_closer_looks(config, model, eye, mosaics, store, mean_of(larger))
     lines += fit_counts(config, model, eye, mosaics, store)
+    alone = [each.photograph.verification for each in shipped if each.photograph is not None]
+    scenes = make_scenes(config.data, eye.detector.classes)
+    lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config, mean_of(alone))]
     return model, "\n".join(lines)
 
 
