@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
-from eval.decide.plain import plain_rules
+from eval.decide.plain import PLAIN, plain_rules
 from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.runs.scene_run import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
@@ -68,7 +68,9 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     decided.append(sharp_decisions(first, telling.place(SHARP)))
     for name, (right, passes) in plain.items():
         finds = ~right.isnan()
-        shares = [share(int((finds & kind).sum()), int(kind.sum())) for kind in (there, ~there)]
+        shares = ["-", "-"]  # without closer looks nothing is found
+        if PLAIN[name]:
+            shares = [share(int((finds & kind).sum()), int(kind.sum())) for kind in (there, ~there)]
         means = [mean_or_dash(passes[kind].tolist()) for kind in (there, ~there)]
         decided.append([name, *shares, "-", *means, telling.place(name) if bool(finds.any()) else "-", "-", "-"])
     closely = ""
