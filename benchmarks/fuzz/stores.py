@@ -2,6 +2,8 @@
 
 import copy
 import json
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import torch
 
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov.io import storage
-from semfov.runs.scene_run import SceneResults
+from semfov.runs.results import SceneResults
 from semfov.runs.store import cell_store
 
 RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]
@@ -25,21 +27,22 @@ def part_files(draw: Draw, folder: Path) -> Case:
     """`SceneResults.load`: exactly the stored outcomes, or None."""
     results = SceneResults(folder, "1-2", lambda index: "digest")
     results.save(0, RECORDS, SECONDS)
-    path = results.path(0)
     damage = draw.choose(PART_DAMAGES, "damage")
-    part = json.loads(path.read_text())
-    if damage in ("value", "signed value", "missing"):
-        key = draw.choose(part, "key")
-        part[key] = copy.deepcopy(draw.choose(JUNK, "junk"))
-        if damage == "signed value":
-            part["sha256"] = results._sha256(0, part["records"], part["seconds"])
-        if damage == "missing":
-            del part[key]
-        path.write_text(json.dumps(part))
-    elif damage == "deep":
-        path.write_text("[" * 10_000 + "]" * 10_000)
+    if damage in ("value", "signed value", "missing", "deep"):
+        row = {"seconds": json.dumps(SECONDS), "records": json.dumps(RECORDS)}
+        key = draw.choose(row, "key")
+        row[key] = json.dumps(copy.deepcopy(draw.choose(JUNK, "junk")))
+        if damage == "deep":
+            row[key] = "[" * 10_000 + "]" * 10_000
+        signed = results._sha256(0, row["seconds"], row["records"])
+        with closing(sqlite3.connect(results.path)) as database, database:
+            if damage == "missing":
+                database.execute("DELETE FROM scenes")
+            database.execute("UPDATE scenes SET seconds = ?, records = ?", (row["seconds"], row["records"]))
+            if damage in ("signed value", "deep"):
+                database.execute("UPDATE scenes SET sha256 = ?", (signed,))
     else:
-        path.write_bytes(changed(path.read_bytes(), damage, draw.rng))
+        results.path.write_bytes(changed(results.path.read_bytes(), damage, draw.rng))
 
     def check(loaded: Any) -> str | None:
         if loaded is None:

@@ -26,7 +26,7 @@ from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches
 from semfov.runs.setup import if_shipped, make_learned
 

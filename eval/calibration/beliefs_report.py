@@ -17,7 +17,8 @@ from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.scene_run import ResultRecord, gather
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import gather
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
@@ -29,13 +30,14 @@ _HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
 
 def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     """Write the tables, the sums and the figure of a finished run."""
-    records, seconds = gather(run)
+    stored = gather(run)
+    records = [*stored]
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise target_area")
     sums = _add_up(records)
     text = _beliefs_summary(records, sums, run)
     files = {"beliefs.md": text, "beliefs.csv": _beliefs_csv(sums), "beliefs.json": _beliefs_json(sums)}
-    files[MANIFEST] = manifest(run, "eval.calibration", seconds)
+    files[MANIFEST] = manifest(run, "eval.calibration", stored.seconds)
     written = write_texts(run.config.out, files)
     groups = (
         f"distance from the closest fixation, as a fraction of the longer side, after {_judged_after(sums)[-1]} looks"

@@ -11,7 +11,7 @@ from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.setup import if_shipped, make_learned
 
 

@@ -20,7 +20,7 @@ from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 
 _MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""

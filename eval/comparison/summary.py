@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from semfov.io.code import commit
-from semfov.io.files import inside, write_text
+from semfov.io.files import inside, replacing, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
 from semfov.io.tables import csv_text
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord, gather
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import gather
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import percent
 from semfov.version import __version__
@@ -53,10 +54,9 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
 
 def collect_records(run: PolicyLooking) -> tuple[list[ResultRecord], dict[str, float]]:
     """Records of all scenes, sorted by policy, and the seconds that each stage took."""
-    records, seconds = gather(run)
+    stored = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
-    records.sort(key=lambda record: order.get(record["policy"], len(order)))
-    return records, seconds
+    return sorted(stored, key=lambda record: order.get(record["policy"], len(order))), stored.seconds
 
 
 def by_scene(values: Iterable[tuple[Any, _Value]]) -> dict[Any, _Value]:
@@ -78,31 +78,29 @@ def write_texts(folder: Path, files: Mapping[str, str]) -> list[Path]:
     return [folder / name for name in files]
 
 
-def write_summary(out: Path, name: str, text: str, records: list[ResultRecord]) -> list[Path]:
+def write_summary(out: Path, name: str, text: str, records: Iterable[ResultRecord]) -> list[Path]:
     """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
-    return write_texts(out, {f"{name}.md": text, "records.jsonl": _json_lines(records)})
+    return [*write_texts(out, {f"{name}.md": text}), _write_lines(out / "records.jsonl", records)]
 
 
-def _json_lines(records: Iterable[ResultRecord]) -> str:
-    """Records as JSON, one in a line."""
-    return "".join(json.dumps(record) + "\n" for record in records)
+def _write_lines(path: Path, records: Iterable[ResultRecord]) -> Path:
+    """Write records as JSON, one in a line, as they are read; returns the path."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.writelines(json.dumps(record) + "\n" for record in records)
+    return path
 
 
 def write_files(
     run: PolicyLooking,
     program: str,
     tables: dict[str, str],
-    records: list[ResultRecord],
+    records: Iterable[ResultRecord],
     seconds: dict[str, float],
 ) -> list[Path]:
     """Write tables (text by file name), records, settings and manifest; returns the paths."""
-    files = {
-        **tables,
-        "episodes.jsonl": _json_lines(records),
-        "config.yaml": run.config.yaml(),
-        MANIFEST: manifest(run, program, seconds),
-    }
-    return write_texts(run.config.out, files)
+    out = run.config.out
+    files = {"config.yaml": run.config.yaml(), MANIFEST: manifest(run, program, seconds)}
+    return [*write_texts(out, tables), _write_lines(out / "episodes.jsonl", records), *write_texts(out, files)]
 
 
 def announce(summary: str, written: Iterable[Path]) -> None:

@@ -16,7 +16,8 @@ from semfov.eye import Eye, View
 from semfov.runs.config import LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread, tight
-from semfov.runs.scene_run import ResultRecord, finish, store_folder
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import finish, store_folder
 from semfov.runs.settings import Share
 from semfov.runs.store import DetectionStore, cell_store
 

@@ -26,11 +26,12 @@ def search_and_decide(config: DecideConfig) -> None:
     """Run the searches, and write their tables, records and ROC curves."""
     run = DecisionRun(with_models(config))
     finish(run, "deciding")
-    records, seconds = gather(run)
+    stored = gather(run)
+    records = [*stored]
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     text = decision_summary(records, sensing(run))
-    written = write_files(run, "eval.decide", {"decisions.md": text}, records, seconds)
+    written = write_files(run, "eval.decide", {"decisions.md": text}, records, stored.seconds)
     announce(text, [*written, save_figure(plot_roc(*probabilities(records)), config.out / "roc.png")])
 
 

@@ -14,7 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.eye import Eye
 from semfov.fit.windows_certainty import logistic_regression
 from semfov.observation.matching import box_iou
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 
 PLAIN = {
     "one unfoveated pass": 0,

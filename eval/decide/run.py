@@ -33,7 +33,7 @@ from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import if_shipped, make_learned, make_observation

@@ -20,7 +20,7 @@ from eval.explore.run import ExploreRun
 from semfov.errors import DataError
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.exploration import success_rate
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 

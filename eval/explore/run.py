@@ -26,7 +26,7 @@ from semfov.runs.exploration_protocol import (
     run_explorations,
 )
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 
 FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
-from semfov.runs.scene_run import ResultRecord, finish, gather
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import percent, plus_minus, table
 from semfov.viz.style import line_style, save_figure
 
@@ -25,7 +26,7 @@ def head(config: HeadConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = HeadRun(config)
     finish(run, "looking around")
-    records, _ = gather(run)
+    records = [*gather(run)]
     text = _head_summary(records, config)
     announce(text, [*write_summary(config.out, "head", text, records), *_curves(records, config)])
 

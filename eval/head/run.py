@@ -32,7 +32,8 @@ from semfov.head.world import Places, World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
-from semfov.runs.scene_run import ResultRecord, SceneRun, store_folder
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks

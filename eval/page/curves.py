@@ -12,7 +12,7 @@ from eval.comparison.summary import Curve, by_scene, curve_of
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.metrics.exploration import success_rate
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus
 
 OBJECTS = "right_without_background"

@@ -27,7 +27,7 @@ from semfov.io.files import clean, inside
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.paths import Stimulus
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 

@@ -11,7 +11,7 @@ from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 

@@ -14,7 +14,7 @@ from semfov.agents.windows import WindowEpisode
 from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window

@@ -13,7 +13,7 @@ from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.calibration import BinarySums
-from semfov.runs.scene_run import ResultRecord
+from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom.certainty import Certainty

@@ -13,7 +13,8 @@ from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.metrics.bootstrap import Bootstrap
-from semfov.runs.scene_run import ResultRecord, finish, gather
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
@@ -23,7 +24,7 @@ def zoom(config: ZoomConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = ZoomRun(config)
     finish(run, "zooming")
-    records, _ = gather(run)
+    records = [*gather(run)]
     text = zoom_summary(records, run)
     written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:

@@ -22,7 +22,8 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
-from semfov.runs.scene_run import ResultRecord, SceneRun
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.window_looking import (

@@ -36,7 +36,8 @@ from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
 from semfov.report import write_page
 from semfov.runs.config import WHERE
-from semfov.runs.scene_run import SceneResults, digest_of
+from semfov.runs.results import SceneResults
+from semfov.runs.scene_run import digest_of
 from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 
@@ -169,8 +170,8 @@ class _PictureFiles:
         """Outcomes of an interrupted command with the same options and models, by the numbers of the pictures."""
         if self.finished is None:
             return {}
-        stored = ((number, self.finished.load(number)) for number in range(len(self.job.sources)))
-        return {number: PictureOutcome(**each["records"][0]) for number, each in stored if each is not None}
+        stored = ((number, self.finished.load(number)) for number in self.finished.finished(len(self.job.sources)))
+        return {number: PictureOutcome(**each["records"][0]) for number, each in sorted(stored) if each is not None}
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""
@@ -213,8 +214,9 @@ class _PictureFiles:
             print("written:", *(f"  {path}" for path in written), sep="\n")
         if self.finished is None:
             return
+        self.finished.flush()
         if complete:
-            shutil.rmtree(self.finished.folder.parent, ignore_errors=True)
+            shutil.rmtree(self.finished.path.parent, ignore_errors=True)
         else:
             count = f"{len(self.rows)} of {len(self.job.sources)} pictures were looked at"
             print(f"{count}; the same command continues", file=sys.stderr)

@@ -15,7 +15,8 @@ from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import EyeConfig, LookingConfig
-from semfov.runs.scene_run import ResultRecord, SceneRun, store_folder
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store, look_everywhere
 

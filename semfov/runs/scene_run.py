@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 from abc import ABC, abstractmethod
-from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing
 from functools import cached_property
@@ -14,54 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.scene import Scenes
-from semfov.errors import DataError
 from semfov.io.code import class_digest, package_digest
-from semfov.io.files import check_regular, write_text
 from semfov.io.pretrained import Pretrained
-from semfov.io.schema import is_number
 from semfov.runs.config import WHERE
+from semfov.runs.results import ResultRecord, SceneResults, StoredRecords
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import run_tasks
-
-ResultRecord = dict[str, Any]
-"""The stored outcome of an episode, made of JSON values."""
-
-
-class SceneResults:
-    """Outcomes of finished scenes, one file each."""
-
-    def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
-        self.folder = folder / key
-        self.key = key
-        self.digest = digest
-
-    def path(self, index: int) -> Path:
-        """Path of a scene's file."""
-        return self.folder / f"{index:06d}.json"
-
-    def load(self, index: int) -> dict[str, Any] | None:
-        """The outcomes of a scene; None if they are missing or damaged."""
-        path = self.path(index)
-        try:
-            check_regular(path)
-            result = json.loads(path.read_text(encoding="utf-8"))
-            records, seconds = result["records"], result["seconds"]
-            whole = result["key"] == self.key and result["sha256"] == self._sha256(index, records, seconds)
-            formed = isinstance(records, list) and all(isinstance(record, dict) for record in records)
-            formed = formed and isinstance(seconds, dict) and all(map(is_number, seconds.values()))
-        except Exception:  # whatever is wrong with the file, the scene can be run again
-            return None
-        return result if whole and formed else None
-
-    def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
-        """Store the outcomes of a scene."""
-        verified = {"key": self.key, "sha256": self._sha256(index, records, seconds)}
-        write_text(self.path(index), json.dumps({**verified, "records": records, "seconds": seconds}))
-
-    def _sha256(self, index: int, records: object, seconds: object) -> str:
-        return hashlib.sha256(json.dumps([index, self.digest(index), records, seconds]).encode()).hexdigest()
-
 
 _log = logging.getLogger(__name__)
 
@@ -131,9 +89,10 @@ def store_folder(chosen: Path | None) -> Path:
 def finish(run: SceneRun, title: str) -> None:
     """Run the scenes that are not finished yet, and store their outcomes."""
     results = run.results
-    todo = [index for index in range(len(run.scenes)) if results.load(index) is None]
-    others = results.folder.parent.glob(f"{results.key.partition('-')[0]}-*")
-    older = max((len(list(folder.glob("*.json"))) for folder in others if folder != results.folder), default=0)
+    finished = results.finished(len(run.scenes))
+    todo = [index for index in range(len(run.scenes)) if index not in finished]
+    others = results.path.parent.glob(f"{results.key.partition('-')[0]}-*.sqlite")
+    older = max((len(SceneResults(path.parent, path.stem, run.digest)) for path in others), default=0)
     if todo and older:
         _log.warning(
             "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
@@ -150,25 +109,19 @@ def finish(run: SceneRun, title: str) -> None:
         title=title,
         unit="scene",
     )
-    with closing(done):
-        for index, (records, seconds, stored) in done:
-            if stored is not None:
-                run.keep(index, stored)
-            results.save(index, records, seconds)
+    try:
+        with closing(done):
+            for index, (records, seconds, stored) in done:
+                if stored is not None:
+                    run.keep(index, stored)
+                results.save(index, records, seconds)
+    finally:
+        results.flush()
 
 
-def gather(run: SceneRun) -> tuple[list[ResultRecord], dict[str, float]]:
-    """Records of all scenes in their order, and the seconds that each stage took."""
-    records: list[ResultRecord] = []
-    seconds: dict[str, float] = defaultdict(float)
-    for index in range(len(run.scenes)):
-        result = run.results.load(index)
-        if result is None:
-            raise DataError(f"{run.results.path(index)} is missing or damaged; run the same command again")
-        records += result["records"]
-        for stage, value in result["seconds"].items():
-            seconds[stage] += value
-    return records, dict(seconds)
+def gather(run: SceneRun) -> StoredRecords:
+    """Records of all scenes in their order, read as they are asked for, and the seconds that each stage took."""
+    return StoredRecords(run.results, len(run.scenes))
 
 
 def digest_of(what: object) -> str:

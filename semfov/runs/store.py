@@ -30,7 +30,7 @@ _StoredLook = TypeVar("_StoredLook")
 
 
 class SceneStore:
-    """A folder of tensors with one file for each scene.
+    """A folder of tensors with one file for each scene, in folders by the first digits of their names.
 
     Files are written atomically and carry a checksum. A file that is damaged, truncated, of another version or of
     another schema counts as missing, and its tensors are computed again.
@@ -44,7 +44,7 @@ class SceneStore:
 
     def path(self, digest: str) -> Path:
         """Path of the file of the scene whose image has this sha256."""
-        return self.folder / f"{digest[:32]}.safetensors"
+        return self.folder / digest[:2] / f"{digest[:32]}.safetensors"
 
     def read(self, digest: str) -> dict[str, Tensor] | None:
         """Read the tensors of a scene; None if they are missing or damaged."""

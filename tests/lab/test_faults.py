@@ -5,10 +5,12 @@ import json
 import os
 import resource
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -154,23 +156,34 @@ def test_a_killed_run_does_not_disturb_another_run_on_the_same_cache(whole, tmp_
 def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
     """Stored looks and outcomes of scenes are swapped, cut, or changed by one bit; the results stay the same."""
     looks = sorted((whole / "cache" / "looks").rglob("*.safetensors"))
-    parts = sorted((whole / "out" / "parts").rglob("*.json"))
-    assert len(looks) == len(parts) == 2
-    kept = {file: file.read_bytes() for file in (*looks, *parts)}
+    (part,) = (whole / "out" / "parts").rglob("*.sqlite")
+    assert len(looks) == 2
+    kept = {file: file.read_bytes() for file in (*looks, part)}
     expected = result_files(whole / "out")
-    for files in (looks, parts):
-        for damage in ("swapped", "cut", "flipped"):
-            for file, other in zip(files, reversed(files), strict=True):
-                content = bytearray(kept[other if damage == "swapped" else file])
-                content[-100 if files is looks else 90] ^= 4 if damage == "flipped" else 0
-                file.write_bytes(content[: len(content) // 2] if damage == "cut" else content)
-            if files is looks:
-                for part in parts:
-                    part.unlink()
-            damaged = {file: file.read_bytes() for file in files}
-            assert run_here(whole) == 0
-            assert result_files(whole / "out") == expected, damage
-            assert all(file.read_bytes() != damaged[file] for file in files)
+    for damage in ("swapped", "cut", "flipped"):
+        for file, other in zip(looks, reversed(looks), strict=True):
+            file.write_bytes(damaged(kept[other if damage == "swapped" else file], damage, -100))
+        part.unlink()
+        before = {file: file.read_bytes() for file in looks}
+        assert run_here(whole) == 0
+        assert result_files(whole / "out") == expected, damage
+        assert all(file.read_bytes() != before[file] for file in looks)
+    for damage in ("swapped", "cut", "flipped"):
+        place = kept[part].index(b'"cells"') + 1
+        part.write_bytes(damaged(kept[part], damage, place))
+        if damage == "swapped":
+            with closing(sqlite3.connect(part)) as database, database:
+                database.execute("UPDATE scenes SET number = 9 - number")
+                database.execute("UPDATE scenes SET number = number - 8")
+        assert run_here(whole) == 0
+        assert result_files(whole / "out") == expected, damage
+
+
+def damaged(content: bytes, damage: str, place: int) -> bytes:
+    """Content that is cut, or changed by one bit."""
+    changed = bytearray(content)
+    changed[place] ^= 4 if damage == "flipped" else 0
+    return bytes(changed[: len(changed) // 2] if damage == "cut" else changed)
 
 
 def run_here(folder: Path) -> int:

@@ -1,11 +1,12 @@
 """Stored results of other code or other images are not used, and do not depend on threads."""
 
-import json
 import logging
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,13 @@ import torch
 
 from eval.search import main
 from eval.search.run import SearchConfig, SearchRun
-from semfov.errors import InputError
+from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
-from semfov.runs.scene_run import SceneResults, finish, gather
+from semfov.runs.results import SceneResults, StoredRecords
+from semfov.runs.scene_run import finish, gather
 from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
@@ -84,36 +86,60 @@ def test_a_part_of_another_image_is_not_loaded(tmp_path):
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda part: {**part, "seconds": None},
-        lambda part: {**part, "seconds": {"look": None}},
-        lambda part: {**part, "records": None},
-        lambda part: {**part, "records": [None]},
-        lambda part: {**part, "records": 3},
-        lambda part: {key: value for key, value in part.items() if key != "seconds"},
-        lambda part: [part],
-        lambda part: None,
+        {"seconds": "null"},
+        {"seconds": '{"look": null}'},
+        {"records": "null"},
+        {"records": "[1]"},
+        {"records": '[{"policy": "entropy"}]'},
+        {"records": "[" * 10_000},
+        {"records": b"\xff"},
+        {"sha256": "0"},
+        {"number": 1},
     ],
+    ids=str,
 )
-def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
+def test_outcomes_that_are_damaged_count_as_missing(tmp_path, damage):
     results = SceneResults(tmp_path, "1-2", lambda index: "a")
     results.save(0, [{"policy": "random"}], {"look": 0.5})
-    part = damage(json.loads(results.path(0).read_text()))
-    if isinstance(part, dict) and {"records", "seconds"} <= part.keys():
-        part["sha256"] = results._sha256(0, part["records"], part["seconds"])
-    results.path(0).write_text(json.dumps(part))
-    assert results.load(0) is None
+    results.save(2, [{"policy": "kl"}], {"look": 0.25})
+    assert results.finished(3) == {0, 2}
+    assert results.finished(2) == {0}
+    with closing(sqlite3.connect(results.path)) as database, database:
+        ((column, value),) = damage.items()
+        database.execute(f"UPDATE scenes SET {column} = ? WHERE number = 0", (value,))
+    assert results.load(0) is results.load(1) is None
+    assert results.finished(3) == {2}
+    assert results.load(2) == {"records": [{"policy": "kl"}], "seconds": {"look": 0.25}}
+    with pytest.raises(DataError, match="scene 0 is missing or damaged; run the same command again"):
+        [*results.read(3)]
 
 
-def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
+def test_a_file_that_is_no_database_counts_as_missing_and_is_replaced(tmp_path):
     results = SceneResults(tmp_path, "1-2", lambda index: "a")
-    results.folder.mkdir()
-    for content in (b"[" * 100_000, b"\xff\xfe", b"", b'{"key": 1' * 9):
-        results.path(0).write_bytes(content)
+    for content in (b"[" * 100_000, b"\xff\xfe", b"", b"SQLite format 3\0" * 999):
+        results.path.write_bytes(content)
         assert results.load(0) is None
-    os.mkfifo(results.path(1))
-    assert results.load(1) is None
-    results.path(2).mkdir()
-    assert results.load(2) is None
+        assert results.finished(9) == set()
+        results.save(0, [{"policy": "random"}], {"look": 0.5})
+        assert results.load(0)["records"] == [{"policy": "random"}]
+    os.truncate(results.path, results.path.stat().st_size // 2)
+    assert results.finished(1) == set()
+    results.path.unlink()
+    os.mkfifo(results.path)
+    with pytest.raises(DataError, match="expected a file, got a pipe"):
+        results.load(1)
+
+
+def test_records_are_read_one_scene_at_a_time(tmp_path):
+    """They come in the order of the scenes, whatever the order in which they were finished, and again when asked."""
+    results = SceneResults(tmp_path, "1-2", lambda index: "a")
+    for number in (2, 0, 1):
+        results.save(number, [{"scene": number, "turn": turn} for turn in range(2)], {"look": 0.5 * number})
+    stored = StoredRecords(results, 3)
+    expected = [{"scene": scene, "turn": turn} for scene in range(3) for turn in range(2)]
+    assert [*stored] == [*stored] == expected
+    assert stored.seconds == {"look": 1.5}
+    assert next(iter(StoredRecords(results, 4))) == expected[0]
 
 
 @pytest.mark.slow
@@ -164,7 +190,7 @@ def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
 def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
     run = SearchRun(config)
     finish(run, "searching")
-    assert gather(run)[0]
+    assert [*gather(run)]
     monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
     other = SearchRun(config)
     assert other.results.load(0) is None

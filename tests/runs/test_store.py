@@ -130,6 +130,7 @@ def test_damaged_files_count_as_missing(kind, tmp_path):
     assert store.load(DIGEST) == {}
     path.write_bytes(whole)
     other = store.path("b" * 64)
+    other.parent.mkdir()
     path.rename(other)
     assert store.load("b" * 64) == {}, "the file of another scene"
 

@@ -58,7 +58,7 @@ def compare(config: PeopleSearchConfig) -> None:
     if config.pictures:
         run = PeopleSearchRun(config)
         finish(run, "searching")
-        policies = run.searches(gather(run)[0])
+        policies = run.searches([*gather(run)])
     every = {"people": people, **searchers, **floors}
     tables = {f"all {len(pictures)} pictures": _scored(every, people, grid, config)}
     if run is not None:

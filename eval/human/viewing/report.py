@@ -34,7 +34,7 @@ FLOORS = {"alone": "centre bias", "with habits": "nearby"}
 
 def viewing_report(run: ViewingRun, scored: _Table, sequences: Mapping[str, _Array], reported: Half) -> None:
     """Write all output and print the tables."""
-    records, seconds = gather(run)
+    records = gather(run)
     summary = viewing_summary(run, scored, sequences)
     tables = {
         "summary.md": summary,
@@ -43,7 +43,7 @@ def viewing_report(run: ViewingRun, scored: _Table, sequences: Mapping[str, _Arr
         "weights.csv": weights_csv(scored),
         "sequences.csv": sequences_csv(sequences),
     }
-    written = write_files(run, "eval.human", tables, records, seconds)
+    written = write_files(run, "eval.human", tables, records, records.seconds)
     written.append(draw_shifts(run, scored))
     written += draw_viewings(run, scored, reported)
     announce(summary, written)

@@ -34,8 +34,9 @@ from semfov.runs.candidates import Candidate
 from semfov.runs.config import PolicyConfig, RunConfig, SaliencyConfig, SaliencyModel
 from semfov.runs.looks import one_thread
 from semfov.runs.policy_looking import PolicyLooking
+from semfov.runs.results import ResultRecord
 from semfov.runs.saliency_store import SALIENCY_CLASSES
-from semfov.runs.scene_run import ResultRecord, digest_of, store_folder
+from semfov.runs.scene_run import digest_of, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Side, Whole
 from semfov.runs.store import SceneStore, looks_digest
 from semfov.strategy import Strategy

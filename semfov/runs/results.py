@@ -1,0 +1,167 @@
+"""Outcomes of the scenes of a run, in a database to which each scene is appended, and which is read scene by scene."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sqlite3
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from semfov.errors import DataError
+from semfov.io.files import check_regular
+from semfov.io.schema import is_number
+
+ResultRecord = dict[str, Any]
+"""The stored outcome of an episode, made of JSON values."""
+
+_TABLE = """
+CREATE TABLE IF NOT EXISTS scenes (
+    number INTEGER PRIMARY KEY, sha256 TEXT NOT NULL, seconds TEXT NOT NULL, records TEXT NOT NULL
+)
+"""
+_TOGETHER = 1.0
+"""Seconds after which finished scenes are written: each write waits for the disk."""
+
+_WAIT = 60.0
+"""Seconds for which another process may write."""
+
+
+class SceneResults:
+    """Outcomes of finished scenes, one row each, in a SQLite database; `flush` writes the last ones.
+
+    A row that is damaged, or of a scene that has changed since, counts as missing. So does a whole file that is no
+    database.
+    """
+
+    def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
+        self.path = folder / f"{key}.sqlite"
+        self.key = key
+        self.digest = digest
+        self._waiting: list[tuple[int, str, str, str]] = []
+        self._flushed = -math.inf
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        with self._opened() as database:
+            return 0 if database is None else int(database.execute("SELECT COUNT(*) FROM scenes").fetchone()[0])
+
+    def finished(self, scenes: int) -> set[int]:
+        """Numbers of the finished scenes, whose outcomes are verified but not made."""
+        numbers: set[int] = set()
+        with suppress(sqlite3.DatabaseError), self._opened() as database:
+            rows = () if database is None else database.execute("SELECT * FROM scenes")
+            numbers.update(row[0] for row in rows if row[0] < scenes and self._whole(*row))
+        return numbers
+
+    def load(self, index: int) -> dict[str, Any] | None:
+        """The outcomes of a scene; None if they are missing or damaged."""
+        with suppress(sqlite3.DatabaseError), self._opened() as database:
+            query = "SELECT * FROM scenes WHERE number = ?"
+            row = None if database is None else database.execute(query, (index,)).fetchone()
+            return None if row is None else self._read(*row)
+        return None
+
+    def read(self, scenes: int) -> Iterator[dict[str, Any]]:
+        """The outcomes of all scenes in their order, one at a time."""
+        expected = 0
+        with suppress(sqlite3.DatabaseError), self._opened() as database:
+            query = "SELECT * FROM scenes WHERE number < ? ORDER BY number"
+            for row in () if database is None else database.execute(query, (scenes,)):
+                result = self._read(*row)
+                if result is None or row[0] != expected:
+                    break
+                yield result
+                expected += 1
+        if expected < scenes:
+            raise DataError(f"{self.path}: scene {expected} is missing or damaged; run the same command again")
+
+    def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
+        """Append the outcomes of a scene, or replace them; those of a second are written together."""
+        took, made = json.dumps(seconds), json.dumps(records)
+        self._waiting.append((index, self._sha256(index, took, made), took, made))
+        if time.monotonic() >= self._flushed + _TOGETHER:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the outcomes that are not written yet."""
+        if not self._waiting:
+            return
+        try:
+            self._write()
+        except (sqlite3.OperationalError, OSError) as error:
+            raise DataError(f"cannot write {self.path}: {error}") from None
+        except sqlite3.DatabaseError:
+            self.path.unlink()  # it is no database, or damaged: its scenes are run again
+            self._write()
+        self._waiting.clear()
+        self._flushed = time.monotonic()
+
+    def _write(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(sqlite3.connect(self.path, timeout=_WAIT)) as database, database:
+            database.execute(_TABLE)
+            database.executemany("INSERT OR REPLACE INTO scenes VALUES (?, ?, ?, ?)", self._waiting)
+
+    @contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection | None]:
+        """The database for reading; None where there is none."""
+        self.flush()
+        check_regular(self.path)
+        if not self.path.exists():
+            yield None
+            return
+        with closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", timeout=_WAIT, uri=True)) as database:
+            yield database
+
+    def _whole(self, index: int, sha256: str, seconds: str, records: str) -> bool:
+        """Whether a row is as it was written, for the same scene."""
+        try:
+            return sha256 == self._sha256(index, seconds, records)
+        except Exception:  # whatever is wrong with the row, the scene can be run again
+            return False
+
+    def _read(self, index: int, sha256: str, seconds: str, records: str) -> dict[str, Any] | None:
+        if not self._whole(index, sha256, seconds, records):
+            return None
+        try:
+            result = {"records": json.loads(records), "seconds": json.loads(seconds)}
+        except (ValueError, RecursionError):
+            return None
+        formed = isinstance(result["records"], list) and all(isinstance(each, dict) for each in result["records"])
+        formed = formed and isinstance(result["seconds"], dict) and all(map(is_number, result["seconds"].values()))
+        return result if formed else None
+
+    def _sha256(self, index: int, seconds: str, records: str) -> str:
+        head = json.dumps([self.key, index, self.digest(index), seconds])
+        return hashlib.sha256(f"{head}\n{records}".encode()).hexdigest()
+
+
+class StoredRecords:
+    """Records of all scenes in their order, read from the database whenever they are iterated over.
+
+    One scene is held at a time, so that memory does not grow with their number.
+    """
+
+    def __init__(self, results: SceneResults, scenes: int) -> None:
+        self._results, self._scenes = results, scenes
+
+    def __iter__(self) -> Iterator[ResultRecord]:
+        """The records."""
+        for result in self._results.read(self._scenes):
+            yield from result["records"]
+
+    @cached_property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each stage took in all scenes."""
+        seconds: dict[str, float] = defaultdict(float)
+        for result in self._results.read(self._scenes):
+            for stage, value in result["seconds"].items():
+                seconds[stage] += value
+        return dict(seconds)
