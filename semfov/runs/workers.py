@@ -11,6 +11,7 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from contextvars import ContextVar
+from functools import partial
 from itertools import islice
 from logging import getLogger
 from multiprocessing import resource_tracker
@@ -37,8 +38,8 @@ class _ClusterLost(Exception):
 
 
 @contextmanager
-def _open_cluster(address: str, *, again: bool = False) -> Iterator[Executor]:
-    """Connect to a Dask scheduler, and give tasks to its workers.
+def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Executor, int]]:
+    """Connect to a Dask scheduler, and give tasks to its workers; tells how many tasks they can have at once.
 
     Dask gives the tasks of a worker that dies to another one. Slurm, Kubernetes and others start such workers by
     `dask-jobqueue` and `dask-kubernetes`.
@@ -56,11 +57,12 @@ def _open_cluster(address: str, *, again: bool = False) -> Iterator[Executor]:
             f"({type(error).__name__}); start one with `dask scheduler`"
         ) from None
     with client:
-        if not client.scheduler_info()["workers"]:
+        workers = client.scheduler_info()["workers"].values()
+        if not workers:
             _log.warning("the scheduler at %s has no worker yet; start some with `dask worker %s`", address, address)
         executor = client.get_executor(pure=False)
         try:
-            yield executor
+            yield executor, max(1, sum(worker["nthreads"] for worker in workers))
         except (CancelledError, CommClosedError):
             raise _ClusterLost("the connection to the scheduler broke") from None
         except KilledWorker as error:
@@ -80,6 +82,12 @@ of the Dask scheduler with this address, or in an executor."""
 
 _OUTSTANDING = 256
 """Number of tasks that an executor is given at once; the others wait here, so that memory does not grow with them."""
+
+_BATCH = 16
+"""Largest number of tasks that a worker of a cluster is given at once: each exchange takes milliseconds."""
+
+_TURNS = 8
+"""Number of batches that each worker of a cluster has at least, so that the last ones end together."""
 
 _PATIENCE = 5
 """Number of times that a cluster may be lost before its tasks count as failed."""
@@ -123,7 +131,7 @@ def run_tasks(
             return
         job = _Job(function, setup, settings, package_digest())
         if isinstance(processes, Executor):
-            yield from _results(processes, job, tasks, bar)
+            yield from _results(processes, job, tasks, lambda _: bar.update())
         else:
             yield from _on_cluster(processes, job, tasks, title, bar)
 
@@ -179,7 +187,7 @@ def _results(
     executor: Executor,
     function: Callable[[_Task], _Result],
     tasks: Sequence[_Task],
-    bar: Bar,
+    bar: Callable[[_Task], None],
     starting: AbstractContextManager[object] | None = None,
 ) -> Iterator[tuple[_Task, _Result]]:
     """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish."""
@@ -198,8 +206,9 @@ def _results(
             submit(_OUTSTANDING)
         while running:
             done = finished.get()
-            yield running.pop(done), done.result()
-            bar.update()
+            task = running.pop(done)
+            yield task, done.result()
+            bar(task)
             submit(1)
     finally:
         for future in running:
@@ -217,12 +226,12 @@ def _in_processes(
     try:
         if shared is None:
             with _started(min(processes, len(tasks))) as pool:
-                yield from _results(pool, job, tasks, bar, _deaf_children())
+                yield from _results(pool, job, tasks, lambda _: bar.update(), _deaf_children())
         else:
             pools, executors = shared
             if processes not in executors:
                 executors[processes] = pools.enter_context(_started(processes))
-            yield from _results(executors[processes], job, tasks, bar, _deaf_children())
+            yield from _results(executors[processes], job, tasks, lambda _: bar.update(), _deaf_children())
     except BrokenProcessPool:
         raise SemfovError(
             f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
@@ -251,10 +260,13 @@ def _on_cluster(
     left = dict.fromkeys(tasks)
     for attempt in range(_PATIENCE):
         try:
-            with _open_cluster(address, again=attempt > 0) as executor:
-                for task, result in _results(executor, job, [*left], bar):
-                    yield task, result
-                    del left[task]
+            with _open_cluster(address, again=attempt > 0) as (executor, places):
+                every, size = [*left], min(_BATCH, max(1, len(left) // (_TURNS * places)))
+                batches = [tuple(every[start : start + size]) for start in range(0, len(every), size)]
+                for batch, results in _results(executor, partial(_in_turn, job), batches, lambda b: bar.update(len(b))):
+                    for task, result in zip(batch, results, strict=True):
+                        yield task, result
+                        del left[task]
             return
         except _ClusterLost as error:
             _log.warning("%s: %s; waiting for a scheduler at %s, %d tasks are left", title, error, address, len(left))
@@ -262,6 +274,11 @@ def _on_cluster(
         f"{title}: the scheduler at {address} was lost {_PATIENCE} times; run the same command again, and it continues "
         "where this one stopped"
     )
+
+
+def _in_turn(function: Callable[[_Task], _Result], batch: Sequence[_Task]) -> list[_Result]:
+    """The results of several tasks."""
+    return [function(task) for task in batch]
 
 
 @contextmanager
