@@ -49,8 +49,9 @@ class SceneResults:
 
     def __len__(self) -> int:
         """Number of rows."""
-        with self._opened() as database:
+        with suppress(sqlite3.DatabaseError), self._opened() as database:
             return 0 if database is None else int(database.execute("SELECT COUNT(*) FROM scenes").fetchone()[0])
+        return 0
 
     def finished(self, scenes: int) -> set[int]:
         """Numbers of the finished scenes, whose outcomes are verified but not made."""
