@@ -187,7 +187,7 @@ def _results(
     executor: Executor,
     function: Callable[[_Task], _Result],
     tasks: Sequence[_Task],
-    bar: Callable[[_Task], None],
+    tell: Callable[[_Task], object],
     starting: AbstractContextManager[object] | None = None,
 ) -> Iterator[tuple[_Task, _Result]]:
     """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish."""
@@ -208,7 +208,7 @@ def _results(
             done = finished.get()
             task = running.pop(done)
             yield task, done.result()
-            bar(task)
+            tell(task)
             submit(1)
     finally:
         for future in running:
