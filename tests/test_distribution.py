@@ -25,6 +25,7 @@ import sys
 from pathlib import Path
 import torch
 import semfov
+from semfov.cli.main import main
 from semfov.report.page import page_html
 
 home = Path(semfov.__file__).parent
@@ -37,6 +38,8 @@ semfov.MapEvidence.from_pretrained("yolov3-tiny")
 assert "<script" in page_html("a page", [])
 view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
 print(semfov.__version__, view.shape[-1])
+assert main(["detectors"]) == 0
+main(["search", "--help-all"])
 """
 
 
@@ -103,8 +106,9 @@ def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
     run(sys.executable, "-m", "pip", *install, cwd=tmp_path)
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
     (site / "dependencies.pth").write_text("\n".join(sorted(libraries)) + "\n", encoding="utf-8")
-    assert run(python, "-W", "error", "-c", CODE, cwd=tmp_path).split() == [semfov.__version__, "8"]
+    printed = run(python, "-W", "error", "-c", CODE, cwd=tmp_path)
+    assert printed.split()[:2] == [semfov.__version__, "8"]
+    assert "yolov3-tiny" in printed
+    assert "--give_up" in printed
     command = home / "bin" / "semfov"
     assert run(command, "--version", cwd=tmp_path) == f"semfov {semfov.__version__}\n"
-    assert "--give_up" in run(command, "search", "--help-all", cwd=tmp_path)
-    assert "yolov3-tiny" in run(python, "-m", "semfov", "detectors", cwd=tmp_path)

@@ -21,14 +21,14 @@ from semfov.zoom.glances import Glance, on_lattice
 from tests import small
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def hostile() -> str:
     """A name that would run as a script if it were not escaped: in an attribute, a text, the title or a script."""
     attack = "<img src=x onerror=\"alert('taken')\"><script>alert('taken')</script>"
     return f"\"'>{attack}</title></script>{attack}<!--<script>"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def scanpath(hostile: str) -> Scanpath:
     """Three fixations on a 4 × 3 grid, with different beliefs and detections."""
     generator = torch.Generator().manual_seed(0)
@@ -47,44 +47,46 @@ def scanpath(hostile: str) -> Scanpath:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def image() -> torch.Tensor:
     """A picture of the size of the frame of the episode."""
     across, down = torch.linspace(0, 1, 80).expand(60, 80), torch.linspace(0, 1, 60)[:, None].expand(60, 80)
     return torch.stack([across, down, 1 - across])
 
 
-@pytest.fixture
-def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Path, monkeypatch) -> Path:
+@pytest.fixture(scope="session")
+def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path_factory) -> Path:
     """The page of a run in which every name is `hostile`."""
     scene = SimpleNamespace(name=hostile, image=image, boxes=torch.ones(1, 4), labels=torch.tensor([2]))
     run = SimpleNamespace(
         task=hostile,
         policies={hostile: PolicyConfig("random")},
-        config=SearchConfig(data=DataConfig(annotations=Path(hostile)), policies=(hostile,), out=tmp_path / "run"),
+        config=SearchConfig(
+            data=DataConfig(annotations=Path(hostile)), policies=(hostile,), out=tmp_path_factory.mktemp("run")
+        ),
         eye=SimpleNamespace(
             detector=SimpleNamespace(name=hostile),
             settings=lambda: {"detector": {"name": hostile}, "sensor": {"sigma": 100, "reference": 640, "growth": 2}},
         ),
         scenes=type("Scenes", (list,), {"ids": [7]})([scene]),
     )
-    run.config.out.mkdir()
     stimulus = SimpleNamespace(views=lambda fixations: [image] * len(fixations))
-    monkeypatch.setattr(run_report, "Stimulus", SimpleNamespace(of=lambda eye, image: stimulus))
-    monkeypatch.setattr(run_report, "replay", lambda run, index, record: scanpath)
     share = np.array([0.0, 0.5, 1.0])
-    return run_report.write_run_report(
-        run,
-        [{"policy": hostile, "scene": 7, "repetition": 0}],
-        {"average": {hostile: Curve(share, share / 10, share / 10, 1, 1)}},
-        titles={"average": hostile},
-        label=hostile,
-        shifts=(0, 2),
-        others={hostile + "2": share},
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_report, "Stimulus", SimpleNamespace(of=lambda eye, image: stimulus))
+        patch.setattr(run_report, "replay", lambda run, index, record: scanpath)
+        return run_report.write_run_report(
+            run,
+            [{"policy": hostile, "scene": 7, "repetition": 0}],
+            {"average": {hostile: Curve(share, share / 10, share / 10, 1, 1)}},
+            titles={"average": hostile},
+            label=hostile,
+            shifts=(0, 2),
+            others={hostile + "2": share},
+        )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def zoom_path(hostile: str) -> ZoomPath:
     """Three looks at a picture of 400 × 300 px, the whole of it and two windows of 200 px."""
     lattice = Lattice.over((400, 300), (100, 100))
@@ -114,16 +116,16 @@ def zoom_path(hostile: str) -> ZoomPath:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def large_picture() -> torch.Tensor:
     """Colours that tell the place: red grows along x, and green along y."""
     across, down = torch.linspace(0, 1, 400).expand(300, 400), torch.linspace(0, 1, 300)[:, None].expand(300, 400)
     return torch.stack([across, down, torch.full((300, 400), 0.5)])
 
 
-@pytest.fixture
-def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path_factory) -> Path:
     """The page of a large picture whose names are `hostile`."""
     settings = {"detector": {"name": hostile}}
     data = zoom_data(zoom_path, large_picture, name=hostile, settings=settings)
-    return write_page(tmp_path / "large.html", hostile, [data])
+    return write_page(tmp_path_factory.mktemp("large") / "large.html", hostile, [data])

@@ -74,9 +74,9 @@ def test_a_fitted_model_says_what_it_was_fitted_to_and_with_which_settings(finis
     assert metadata["data"]
 
 
-def long(name):
-    """Starting processes costs more than the work: two commands are tried by default."""
-    return name if name in ("eval.search", "train.fit_search") else pytest.param(name, marks=pytest.mark.long)
+def long(name, *more, usual=("eval.search",)):
+    """A run of a command that repeats what that of another shows, unless it is one of the usual ones."""
+    return pytest.param(name, *more, marks=[] if name in usual else pytest.mark.long)
 
 
 @pytest.mark.parametrize("finished", [long(name) for name in RUN if COMMANDS[name].workers], indirect=True)
@@ -86,8 +86,14 @@ def test_the_same_bits_from_two_workers(finished, tmp_path):
     assert contents(name, tmp_path) == contents(name, folder)
 
 
+SHARE = {"no store": ("eval.search", "eval.zoom"), "small batches": ("eval.search", "eval.explore")}
+"""Commands with a store or with batches of their own; the others share them."""
+
+
 @pytest.mark.parametrize(
-    ("finished", "change"), [(name, change) for name in RUN for change in COMMANDS[name].same], indirect=["finished"]
+    ("finished", "change"),
+    [long(name, change, usual=SHARE.get(change, RUN)) for name in RUN for change in COMMANDS[name].same],
+    indirect=["finished"],
 )
 def test_the_same_bits_with_settings_that_change_only_how_it_is_computed(finished, change, tmp_path):
     name, settings, folder = finished
@@ -113,9 +119,7 @@ def test_finished_parts_are_kept_and_a_damaged_one_is_computed_again(finished):
     assert not parts or parts[0].read_bytes() != damaged
 
 
-ALONE = pytest.mark.parametrize(
-    "finished", ["eval.search", pytest.param("train.fit_fom", marks=pytest.mark.long)], indirect=True
-)
+ALONE = pytest.mark.parametrize("finished", [long("eval.search"), long("train.fit_fom")], indirect=True)
 
 
 @ALONE
@@ -156,7 +160,7 @@ def test_an_output_that_cannot_be_written_is_named(material, tmp_path, capsys):
     assert str(tmp_path / "out") in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ["eval.search", "eval.human viewing", "semfov.cli.main fit"])
 def test_unknown_settings_are_refused(name, capsys):
     with pytest.raises(SystemExit) as stopped:
         run(name, *name.split()[1:], "--seeed", "3")
