@@ -30,7 +30,10 @@ _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 _MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
-_Line = tuple[str, Mapping[str, str]]
+Size = tuple[int, int] | Mapping[str, tuple[int, int]]
+"""`(width, height)` of all frames, or of each by the name of its picture."""
+
+Line = tuple[str, Mapping[str, str]]
 """The place of a line in words, and its fields by our names of the columns."""
 
 
@@ -38,7 +41,7 @@ def read_table(
     source: str | PathLike[str] | Any,
     *,
     columns: Mapping[str, str] | None = None,
-    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+    size: Size | None = None,
     units: Units = "pixels",
     origin: Origin = "top left",
 ) -> list[Fixations]:
@@ -84,9 +87,7 @@ def read_table(
     named = dict(columns or {})
     for name in named:
         lookup(name, (*_COLUMNS, *_SIZE, *_MORE), "column")
-    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
-    where = "the table" if frame else str(source)
-    header, rows = _of_frame(source) if frame else _of_file(Path(source))
+    where, header, rows = of_source(source)
     needed = (*_COLUMNS, *(() if size is not None else _SIZE))
     missing = [named.get(name, name) for name in needed if named.get(name, name) not in header]
     if missing:
@@ -96,8 +97,20 @@ def read_table(
             f"{', '.join(map(repr, header))[:300]}; name them by columns={{…}}{sized}"
         )
     lines = [(place, {name: row.get(named.get(name, name), "") for name in (*needed, *_MORE)}) for place, row in rows]
+    return records_of(where, lines, size, units, origin)
+
+
+def records_of(where: str, lines: Sequence[Line], size: Size | None, units: Units, origin: Origin) -> list[Fixations]:
+    """The records of lines, with a warning of what their coordinates look like."""
     records = [_record(where, group, size, units, origin) for group in _scanpaths(where, lines)]
-    return warn_of_frames(where, records, units=units == "pixels")
+    return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
+
+
+def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
+    """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
+    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
+    header, rows = _of_frame(source) if frame else _of_file(Path(source))
+    return "the table" if frame else str(source), header, rows
 
 
 def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
@@ -143,9 +156,9 @@ def _is_decimal(text: str) -> bool:
     return bool(comma) and (whole + rest.replace("e", "").replace("E", "").replace("-", "")).isdecimal()
 
 
-def _scanpaths(where: str, lines: Sequence[_Line]) -> list[list[_Line]]:
+def _scanpaths(where: str, lines: Sequence[Line]) -> list[list[Line]]:
     """The lines of each scanpath."""
-    groups: dict[tuple[str, ...], list[_Line]] = {}
+    groups: dict[tuple[str, ...], list[Line]] = {}
     previous = None
     for place, line in lines:
         who = tuple(line[name] for name in ("picture", "subject", "target", "trial"))
@@ -191,8 +204,8 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
 
 def _record(
     where: str,
-    group: Sequence[_Line],
-    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None,
+    group: Sequence[Line],
+    size: Size | None,
     units: Units,
     origin: Origin,
 ) -> Fixations:
@@ -237,9 +250,7 @@ def _record(
         raise DataError(f"{where}: {place}, {error}") from None
 
 
-def _frame(
-    where: str, place: str, line: Mapping[str, str], size: tuple[int, int] | Mapping[str, tuple[int, int]] | None
-) -> tuple[int, int]:
+def _frame(where: str, place: str, line: Mapping[str, str], size: Size | None) -> tuple[int, int]:
     """Size of the frame of a scanpath."""
     if size is None:
         sides = [_number(where, place, line, name) for name in _SIZE]
