@@ -23,6 +23,7 @@ Commands:
   gaze        predict where people look
   live        search or explore a video, a camera or a network stream
   app         a page in the browser on which to try all this out, and to look yourself
+  check       say what is suspicious in a file of fixations
   fit         fit all models to your own detector
   detectors   list detectors, or the classes of one
 
@@ -110,6 +111,23 @@ usage: semfov explore [PICTURE ...] [options]
                        picture to show this many new objects (default 0.1 and 0.01)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
+""",
+    "check": """\
+semfov check: is a file of fixations what it seems to be?
+
+  semfov check people.csv
+  semfov check tobii.tsv recordings/*.asc
+  semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (Pupil Cloud, whose tables have neither)
+
+usage: semfov check FILE [FILE ...] [options]
+
+  FILE                 a table of fixations, as semfov, Tobii, Pupil Labs, PsychoPy, PyGaze, Gazepoint, pymovements or
+                       EyeLink Data Viewer write it, an ASC file of EyeLink, or JSON of COCO-Search18 or OSIE
+  --size W,H           the frame, where the file has none; --picture NAME and --subject NAME likewise
+  --quiet              errors alone
+
+It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. The exit code
+is 1 if anything is suspicious. --help-all: all options.
 """,
     "gaze": """\
 semfov gaze: where people look in a picture that they view freely

@@ -24,6 +24,7 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "explore": _PICTURES,
     "live": ("source", "video file, or address"),
     "gaze": _PICTURES,
+    "check": ("files", "files of fixations"),
     "fit": ("model", "the detector: a name or a file, as for semfov.load_detector"),
     "app": ("detector", "the detector: a name or a file, as for semfov.load_detector"),
     "detectors": ("name", "detector, or folder of models"),
@@ -48,6 +49,7 @@ def options_of(name: str) -> type[Any]:
         "live": options.LiveOptions,
         "gaze": options.GazeOptions,
         "app": options.AppOptions,
+        "check": options.CheckOptions,
         "detectors": options.DetectorsOptions,
     }
     return by_name[name]
@@ -83,6 +85,10 @@ def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
         from semfov.cli.app import serve
 
         return serve(options)
+    if name == "check":
+        from semfov.cli.fixations import check_fixations
+
+        return check_fixations(options)
     if name == "detectors":
         from semfov.cli.detectors import list_detectors
 

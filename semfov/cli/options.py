@@ -257,6 +257,25 @@ class AppOptions(AgentOptions):
 
 
 @dataclass(frozen=True)
+class CheckOptions(Settings):
+    """Check files of fixations.
+
+    Args:
+        files: tables, ASC files of EyeLink, or JSON files of fixations.
+        size: width and height of the frame, `1920,1080`, where the file has none.
+        picture: name of the picture, where the file has none.
+        subject: name of the person, where the file has none.
+        quiet: print errors alone; the exit code tells whether anything is suspicious.
+    """
+
+    files: tuple[str, ...] = ()
+    size: str | None = None
+    picture: str | None = None
+    subject: str | None = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True)
 class DetectorsOptions(Settings):
     """Detectors that can be named.
 

@@ -584,7 +584,7 @@ class GazeRecord(Record):
         """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
 
         Args:
-            people: their fixations, those of one person, or the path of a table (`semfov.data.fixations.read_table`).
+            people: fixations, those of one person, or the path of a file (`semfov.data.fixations.read_fixations`).
 
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.

@@ -42,7 +42,7 @@ class _Export(NamedTuple):
 
 _TRUE = ("true", "1")
 _PRO_LAB: dict[str, Any] = {
-    "duration": (("gazeeventdurationms", "gazeeventduration", "eyemovementeventdurationms", "eyemovementeventduration"), 1.0),
+    "duration": (("gazeeventdurationms", "gazeeventduration", "eyemovementeventduration"), 1.0),
     "picture": ("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
     "subject": ("participantname",),
     "trial": ("recordingname",),

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, warn_of_frames
+from semfov.data.fixations.record import Fixations
+from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, check
 from semfov.io.files import check_regular
 

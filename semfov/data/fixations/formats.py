@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox, by_picture, warn_of_frames
+from semfov.data.fixations.record import Fixations, ObjectBox, by_picture
+from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check
 from semfov.io.files import check_regular, write_text
 from semfov.io.schema import Anything, Array, Json, Maybe, Number, Object, Text

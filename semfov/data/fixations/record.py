@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,9 +117,6 @@ def _box(corners: _Array) -> tuple[float, float, float, float]:
 FixationValues = NDArray[np.float64]
 ObjectBox = tuple[float, float, float, float]
 
-_FAR = 0.5
-"""Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
-
 
 @dataclass(frozen=True, eq=False)
 class Fixations:
@@ -212,58 +207,6 @@ class Fixations:
     def inside(self) -> NDArray[np.bool_]:
         """Whether each fixation is inside the frame, `(n,)` boolean."""
         return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
-
-
-def warn_of_frames(
-    source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
-) -> list[Fixations]:
-    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records.
-
-    `units` says that they were read as pixels, in which case they may be fractions.
-    """
-    total = sum(map(len, fixations))
-    if total < 3:
-        return warn_outside(source, fixations, stacklevel=stacklevel + 1)
-    points = np.concatenate([each.points for each in fixations])
-    sides = np.concatenate([np.tile(each.size, (len(each), 1)) for each in fixations])
-    inside = ((points >= -0.5) & (points < sides - 0.5)).all(1).mean()
-    swapped = ((points[:, ::-1] >= -0.5) & (points[:, ::-1] < sides - 0.5)).all(1).mean()
-    middle = (np.abs(points) <= sides / 2).all(1).mean()
-    negative = (points < -0.5).mean(0)
-    looks = None
-    fractional = bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
-    if units and fractional and sides.min() > 8:
-        looks = "fractions of the sides (units='fractions')"
-    elif negative.min() >= 0.2 and middle > 0.95:
-        looks = "pixels from the centre (origin='centre', or 'centre, y up')"
-    elif inside < 0.9 and swapped > max(0.98, inside + 0.1):
-        looks = "y before x (swap the two columns)"
-    elif total >= 20 and bool((points.max(0) < 0.5 * sides.min(0)).all()):
-        corner = " × ".join(f"{side:g}" for side in np.ceil(points.max(0) + 1))
-        looks = f"fixations of a frame of {corner} or little more (give its size)"
-    if looks is None:
-        return warn_outside(source, fixations, stacklevel=stacklevel + 1)
-    first = fixations[0]
-    warnings.warn(
-        f"{source}: {total} fixations were read as pixels of frames such as {first.size[0]} × {first.size[1]}, of "
-        f"{first.subject} in {first.picture}, but look like {looks}",
-        stacklevel=stacklevel,
-    )
-    return fixations
-
-
-def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, stacklevel: int = 3) -> list[Fixations]:
-    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share; returns the records."""
-    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > _FAR * max(each.size) for each in fixations]
-    count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
-    if count:
-        first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())
-        warnings.warn(
-            f"{source}: {count} of {total} fixations ({count / total:.0%}) lie far outside their frame, such as those "
-            f"of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check its size and the unit",
-            stacklevel=stacklevel,
-        )
-    return fixations
 
 
 def by_picture(fixations: Iterable[Fixations]) -> dict[str, list[Fixations]]:

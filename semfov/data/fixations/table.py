@@ -12,7 +12,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox, warn_of_frames
+from semfov.data.fixations.record import Fixations, ObjectBox
+from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import check_regular, write_text
 

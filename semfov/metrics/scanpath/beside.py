@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.record import Fixations, FixationValues, warn_outside
-from semfov.data.fixations.table import read_table
+from semfov.data.fixations.reading import read_fixations
+from semfov.data.fixations.record import Fixations, FixationValues
+from semfov.data.fixations.suspicions import warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.conditional import auc, nss
 from semfov.metrics.scanpath.multimatch import multimatch
@@ -57,7 +58,7 @@ class ScanpathComparison(dict[str, BesidePeople]):
 
 
 People = Fixations | Sequence[Fixations] | str | PathLike[str]
-"""Fixations of one person or several, or a table of them (`semfov.data.fixations.read_table`)."""
+"""Fixations of one person or several, or a file of them (`semfov.data.fixations.read_fixations`)."""
 
 
 def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> ScanpathComparison:
@@ -75,7 +76,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> Scanpa
     Args:
         scanpath: a record of an agent, or fixations.
         people: fixations of people (`semfov.data.fixations`) in the same picture, in any size of it, or the path of a
-            table, of which those in the picture are taken.
+            file of them, of which those in the picture are taken.
 
     Returns:
         The measures by name.
@@ -83,7 +84,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> Scanpa
     Raises:
         InputError: there are no people, their records are of several pictures, of another picture or target, or of a
             frame with other proportions, or rapidfuzz is not installed.
-        DataError: the table cannot be read.
+        DataError: the file cannot be read.
 
     >>> path = Fixations("a.jpg", "1", np.array([[10.0, 10], [60, 10], [60, 40]]), (80, 60))
     >>> compare_scanpath(path, [path])["sequence score"].scanpath
@@ -92,7 +93,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> Scanpa
     own = scanpath.picture if isinstance(scanpath, Fixations) else scanpath.source
     name = None if own is None else Path(own).stem
     if isinstance(people, str | PathLike):
-        table = read_table(people)
+        table = read_fixations(people)
         people = [each for each in table if name is None or Path(each.picture).stem == name]
         check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
     people = [people] if isinstance(people, Fixations) else [*people]

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, warn_outside
+from semfov.data.fixations.record import Fixations
+from semfov.data.fixations.suspicions import warn_outside
 from semfov.metrics.scanpath.beside import people_density
 from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity

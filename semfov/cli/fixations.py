@@ -1,0 +1,59 @@
+"""Subcommand check: says what is suspicious in files of fixations."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semfov.cli.options import CheckOptions
+from semfov.data.fixations import Fixations, read_fixations, suspicions
+from semfov.errors import InputError, SemfovError, check, printable
+
+
+def check_fixations(options: CheckOptions) -> int:
+    """Print what is in files of fixations, and what is suspicious; returns the exit code, 1 if anything is."""
+    check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
+    given: dict[str, Any] = {} if options.size is None else {"size": _size(options.size)}
+    given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
+    wrong = False
+    for name in options.files:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of what the lines below say
+                records = read_fixations(Path(name), **given)
+            lines = suspicions(records)
+        except TypeError:
+            raise InputError(f"picture: expected a file whose reader takes {', '.join(given)}, got {name}") from None
+        except SemfovError as error:
+            if len(options.files) == 1:
+                raise
+            print(f"{printable(name)}: cannot be read: {error}")
+            wrong = True
+            continue
+        print(f"{printable(name)}: {_content(records)}")
+        print(*(f"  suspicious: {line}" for line in lines), sep="\n") if lines else print("  nothing is suspicious")
+        wrong = wrong or bool(lines)
+    return 1 if wrong else 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
+    except ValueError:
+        raise InputError(f"size: expected a width and a height, as 1920,1080, got {text!r}") from None
+    return width, height
+
+
+def _content(records: list[Fixations]) -> str:
+    """What is in the records, in a line."""
+    people, pictures = ({getattr(each, name) for each in records} for name in ("subject", "picture"))
+    sizes = sorted({each.size for each in records})
+    frames = ", ".join(f"{width} × {height}" for width, height in sizes[:3]) + (", …" if sizes[3:] else "")
+    counts = ((sum(map(len, records)), "fixation"), (len(records), "scanpath"), (len(people), "person"))
+    words = ", ".join(f"{n} {name if n == 1 else {'person': 'people'}.get(name, f'{name}s')}" for n, name in counts)
+    times = [each.durations for each in records if each.durations is not None]
+    lasting = f"; they take {np.median(np.concatenate(times)):g} ms in the median" if times else "; without durations"
+    return f"{words}, {len(pictures)} picture{'' if len(pictures) == 1 else 's'}, frames of {frames}{lasting}"

@@ -1,0 +1,65 @@
+"""Reading of fixations from a file of any format of this folder, which its content tells."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from semfov.data.fixations.exports import is_export, read_export
+from semfov.data.fixations.eyelink import read_eyelink
+from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
+from semfov.data.fixations.record import Fixations
+from semfov.data.fixations.table import of_source, read_table
+from semfov.errors import DataError
+from semfov.io.files import check_regular
+
+
+def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fixations]:
+    r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
+
+    Files `.asc` are those of EyeLink (`read_eyelink`), files `.json` those of COCO-Search18, OSIE, or Ruarte and
+    others. Other files are tables, as this library writes them (`read_table`) or as the programs of eye trackers export
+    them (`read_export`), which the columns tell.
+
+    Args:
+        source: the file or table.
+        **options: arguments of the reader, such as `size`.
+
+    Returns:
+        One record for each scanpath.
+
+    Raises:
+        InputError: the reader has no such argument.
+        DataError: the content is of no known form.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "people.csv")
+    ...     _ = path.write_text("picture,subject,x,y,width,height\na.jpg,1,40,30,80,60\n")
+    ...     len(read_fixations(path))
+    1
+    """
+    kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
+    if kind == ".asc":
+        return read_eyelink(source, **options)
+    if kind == ".json":
+        return _json_reader(Path(source))(source, **options)
+    _, header, _ = of_source(source)
+    ours = {"picture", "subject", "x", "y"} <= {*header} or "columns" in options
+    return read_export(source, **options) if is_export(header) and not ours else read_table(source, **options)
+
+
+def _json_reader(path: Path) -> Callable[..., list[Fixations]]:
+    """The reader of a file of JSON."""
+    check_regular(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
+    if isinstance(content, list):
+        return read_cocosearch
+    people = isinstance(content, dict) and any(isinstance(each, list) for each in content.values())
+    return read_osie if people else read_ruarte

@@ -1,0 +1,180 @@
+"""What is suspicious in fixations: their frame, unit, origin and axes, a letterbox, repeats, blinks and durations."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.data.fixations.record import Fixations
+
+_Array = NDArray[np.float64]
+
+_FAR = 0.5
+"""Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
+
+_MANY = 20  # fixations from which on shares tell something
+_BAR, _LEVEL = 0.06, 0.03  # shares of a side that is empty where a picture was letterboxed, and where it was not
+_MOST_OUTSIDE, _MOST_REPEATED, _MOST_ALIKE, _MOST_SHORT = 0.1, 0.02, 0.02, 0.1  # shares of the fixations
+_SHORT, _LONG = 50.0, 5000.0  # milliseconds
+
+
+def suspicions(fixations: Sequence[Fixations]) -> list[str]:
+    """What is suspicious in fixations, in plain lines; none where nothing is.
+
+    - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
+      or many outside it.
+    - A letterbox: bars at two opposite sides without fixations, while the others reach the border.
+    - Points that repeat the one before, records that occur twice, and many fixations at one same point, such as what
+      a tracker writes during a blink.
+    - Durations in seconds or microseconds, all alike, or of samples; and fixations of less than 50 ms or of more than
+      5 s.
+
+    Args:
+        fixations: the records.
+
+    Returns:
+        The lines.
+
+    >>> path = Fixations("a.jpg", "1", np.array([[10.0, 10], [60, 10], [60, 40]]), (80, 60), np.array([0.2, 0.3, 0.2]))
+    >>> suspicions([path])
+    ['durations from 0.2 to 0.3 look like seconds (multiply them by 1000)']
+    """
+    records = list(fixations)
+    if not records:
+        return []
+    points, sides = _joined(records)
+    looks = looks_like(records)
+    found = [] if looks is None else [f"points look like {looks}"]
+    outside = _outside(points, sides)
+    if looks is None and outside.mean() > _MOST_OUTSIDE:
+        found.append(f"{outside.mean():.0%} of the fixations lie outside their frame (check its size and the origin)")
+    if looks is None:
+        found += _letterbox(points, sides)
+    return [*found, *_repeats(records, points), *_durations(records)]
+
+
+def looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
+    """What fixations look like that do not look like those of their frame; None if they do."""
+    points, sides = _joined(fixations)
+    if len(points) < 3:
+        return None
+    inside = 1 - _outside(points, sides).mean()
+    swapped = 1 - _outside(points[:, ::-1], sides).mean()
+    middle = (np.abs(points) <= sides / 2).all(1).mean()
+    negative = (points < -0.5).mean(0)
+    fractional = bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
+    if units and fractional and sides.min() > 8:
+        return "fractions of the sides (units='fractions')"
+    if negative.min() >= 0.2 and middle > 0.95:
+        return "pixels from the centre (origin='centre', or 'centre, y up')"
+    if inside < 0.9 and swapped > max(0.98, inside + 0.1):
+        return "y before x (swap the two columns)"
+    if len(points) >= _MANY and bool((points.max(0) < 0.5 * sides.min(0)).all()):
+        corner = " × ".join(f"{side:g}" for side in np.ceil(points.max(0) + 1))
+        return f"fixations of a frame of {corner} or little more (give its size)"
+    return None
+
+
+def _joined(fixations: Sequence[Fixations]) -> tuple[_Array, _Array]:
+    """The points of all records, and the sizes of their frames, `(n, 2)` both."""
+    points = np.concatenate([each.points for each in fixations])
+    return points, np.concatenate([np.tile(np.array(each.size, np.float64), (len(each), 1)) for each in fixations])
+
+
+def _outside(points: _Array, sides: _Array) -> NDArray[np.bool_]:
+    return np.asarray(~((points >= -0.5) & (points < sides - 0.5)).all(1))
+
+
+def _letterbox(points: _Array, sides: _Array) -> list[str]:
+    """Bars without fixations at two opposite sides of one frame, while the other sides have none."""
+    if len(points) < 5 * _MANY or (sides != sides[0]).any():
+        return []
+    share = (points + 0.5) / sides
+    low, high = np.quantile(share, 0.002, axis=0), 1 - np.quantile(share, 0.998, axis=0)
+    for axis, (name, places) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
+        bars, others = (low[axis], high[axis]), (low[1 - axis], high[1 - axis])
+        if min(bars) > _BAR and max(bars) < 0.4 and abs(bars[0] - bars[1]) < _LEVEL and max(others) < _LEVEL:
+            width = f"{min(bars):.0%} of the frame at the {name}"
+            return [f"no {places} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
+    return []
+
+
+def _repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
+    found = []
+    steps = np.concatenate([(each.points[1:] == each.points[:-1]).all(1) for each in records])
+    if len(steps) >= _MANY and steps.mean() > _MOST_REPEATED:
+        found.append(f"{steps.mean():.0%} of the fixations repeat the point before (are these samples of the tracker?)")
+    twice = Counter((each.picture, each.subject, each.target, each.points.tobytes()) for each in records)
+    again = [who for who, count in twice.items() if count > 1 and len(who[3]) > 16]
+    if again:
+        found.append(f"{len(again)} records occur more than once, such as that of {again[0][1]} in {again[0][0]}")
+    places = Counter(map(tuple, points.tolist()))
+    place, count = places.most_common(1)[0]
+    first = Counter(tuple(each.points[0].tolist()) for each in records)[place]
+    if len(points) >= _MANY and count - first > max(5.0, _MOST_ALIKE * len(points)):
+        at = ", ".join(f"{value:g}" for value in place)
+        found.append(f"{count} of {len(points)} fixations lie at ({at}): does the tracker write it during blinks?")
+    alone = sum(len(each) == 1 for each in records)
+    if len(records) >= _MANY and alone > 0.5 * len(records):
+        found.append(f"{alone} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)")
+    return found
+
+
+def _durations(records: Sequence[Fixations]) -> list[str]:
+    times = [each.durations for each in records if each.durations is not None]
+    if not times:
+        return []
+    values = np.concatenate(times)
+    found, middle = [], float(np.median(values))
+    least, most = (f"{value:g}" for value in (values.min(), values.max()))
+    if middle < 2 and values.max() < 20 and (values % 1 != 0).any():
+        return [f"durations from {least} to {most} look like seconds (multiply them by 1000)"]
+    if middle > 20_000:
+        return [f"durations of {middle:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
+    if len(values) >= _MANY and (values == values[0]).all():
+        found.append(f"all durations are {least} ms (are these samples of the tracker?)")
+    elif middle < _SHORT:
+        found.append(f"durations of {middle:g} ms in the median are those of samples, not of fixations")
+    elif (short := (values < _SHORT).mean()) > _MOST_SHORT:
+        found.append(f"{short:.0%} of the fixations take less than {_SHORT:g} ms")
+    if (long := int((values > _LONG).sum())) > 0:
+        found.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
+    return found
+
+
+def warn_of_frames(
+    source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
+) -> list[Fixations]:
+    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records.
+
+    `units` says that they were read as pixels, in which case they may be fractions.
+    """
+    looks = looks_like(fixations, units=units) if fixations else None
+    if looks is None:
+        return warn_outside(source, fixations, stacklevel=stacklevel + 1)
+    first, total = fixations[0], sum(map(len, fixations))
+    warnings.warn(
+        f"{source}: {total} fixations were read as pixels of frames such as {first.size[0]} × {first.size[1]}, of "
+        f"{first.subject} in {first.picture}, but look like {looks}",
+        stacklevel=stacklevel,
+    )
+    return fixations
+
+
+def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, stacklevel: int = 3) -> list[Fixations]:
+    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share; returns the records."""
+    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > _FAR * max(each.size) for each in fixations]
+    count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
+    if count:
+        first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())
+        warnings.warn(
+            f"{source}: {count} of {total} fixations ({count / total:.0%}) lie far outside their frame, such as those "
+            f"of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check its size and the unit",
+            stacklevel=stacklevel,
+        )
+    return fixations

@@ -1,0 +1,145 @@
+"""Tables of eye trackers' programs: small files in their forms, and the fixations that are in them."""
+
+import numpy as np
+import pytest
+
+from semfov.data.fixations import read_export
+from semfov.errors import DataError
+
+SIZE = (1920, 1080)
+TOBII = "\t".join(
+    ["Recording timestamp [ms]", "Participant name", "Recording name", "Recording resolution width",
+     "Recording resolution height", "Eye movement type", "Eye movement type index", "Gaze event duration [ms]",
+     "Fixation point X [DACS px]", "Fixation point Y [DACS px]", "Presented Stimulus name"]
+)  # fmt: skip
+STUDIO = "\t".join(
+    ["ParticipantName", "RecordingName", "MediaName", "MediaWidth", "MediaHeight", "FixationIndex", "GazeEventType",
+     "GazeEventDuration", "FixationPointX (MCSpx)", "FixationPointY (MCSpx)"]
+)  # fmt: skip
+CLOUD = "section id,recording id,fixation id,start timestamp [ns],end timestamp [ns],duration [ms]"
+
+FILES = {
+    "Tobii Pro Lab": (
+        f"{TOBII}\n0\tP1\tR1\t1920\t1080\tFixation\t1\t250\t100\t200\ta.jpg\n"
+        "8\tP1\tR1\t1920\t1080\tFixation\t1\t250\t100\t200\ta.jpg\n16\tP1\tR1\t1920\t1080\tSaccade\t1\t30\t\t\ta.jpg\n"
+        "20\tP1\tR1\t1920\t1080\tFixation\t2\t300\t640\t360,5\ta.jpg\n",
+        {},
+        ("a.jpg", "P1", SIZE, [[100, 200], [640, 360.5]], [250, 300]),
+    ),
+    "Tobii Pro Lab, on the picture": (
+        "Participant name\tEye movement type\tEye movement type index\tGaze event duration\tFixation point X (MCSnorm)"
+        "\tFixation point Y (MCSnorm)\tPresented Media name\tPresented Media width\tPresented Media height\n"
+        "P1\tFixation\t1\t250\t0.5\t0.25\ta.jpg\t800\t600\nP1\tEyesNotFound\t1\t50\t\t\ta.jpg\t800\t600\n",
+        {},
+        ("a.jpg", "P1", (800, 600), [[399.5, 149.5]], [250]),
+    ),
+    "Tobii Studio": (
+        f"{STUDIO}\nP1\tR1\ta.jpg\t800\t600\t1\tFixation\t250\t100\t200\nP1\tR1\ta.jpg\t800\t600\t\tSaccade\t30\t\t\n"
+        "P1\tR1\ta.jpg\t800\t600\t2\tFixation\t300\t110\t210\n",
+        {},
+        ("a.jpg", "P1", (800, 600), [[100, 200], [110, 210]], [250, 300]),
+    ),
+    "Pupil Cloud": (
+        f"{CLOUD},fixation x [px],fixation y [px],azimuth [deg]\ns1,r1,1,10,20,250,800.25,600.5,1.0\n"
+        "s1,r1,2,30,40,300,,,\ns1,r1,3,50,60,310,10,20,1.0\n",
+        {"size": (1600, 1200), "picture": "scene.mp4"},
+        ("scene.mp4", "r1", (1600, 1200), [[800.25, 600.5], [10, 20]], [250, 310]),
+    ),
+    "Pupil Cloud, reference image": (
+        f"{CLOUD},fixation detected in reference image,fixation x [px],fixation y [px]\n"
+        "s1,r1,1,10,20,250,True,300,200\ns1,r1,2,30,40,300,False,,\n",
+        {"size": (800, 600), "picture": "shelf.jpg"},
+        ("shelf.jpg", "r1", (800, 600), [[300, 200]], [250]),
+    ),
+    "Pupil Cloud, surface": (
+        f"{CLOUD},fixation detected on surface,fixation x [normalized],fixation y [normalized]\n"
+        "s1,r1,1,10,20,250,True,0.5,0.25\ns1,r1,2,30,40,300,False,1.5,0.5\n",
+        {"size": (800, 600), "picture": "shelf.jpg"},
+        ("shelf.jpg", "r1", (800, 600), [[399.5, 149.5]], [250]),
+    ),
+    "Pupil Player": (
+        "id,start_timestamp,duration,start_frame_index,end_frame_index,norm_pos_x,norm_pos_y,dispersion,confidence\n"
+        "1,5.1,240.5,3,9,0.5,0.75,1.1,0.99\n2,5.6,120,10,14,0.25,0.25,1.2,0.98\n",
+        {"size": (1280, 720), "picture": "world.mp4"},
+        ("world.mp4", "ann", (1280, 720), [[639.5, 179.5], [319.5, 539.5]], [240.5, 120]),
+    ),
+    "Pupil Player, surface": (
+        "world_timestamp,world_index,fixation_id,start_timestamp,duration,dispersion,norm_pos_x,norm_pos_y,x_scaled,"
+        "y_scaled,on_surf\n1.0,3,7,0.9,240,1.1,0.5,0.75,0.5,0.75,True\n1.1,4,7,0.9,240,1.1,0.5,0.75,0.5,0.75,True\n"
+        "1.2,5,8,1.2,300,1.1,1.5,0.75,1.5,0.75,False\n",
+        {"size": (800, 600), "picture": "shelf.jpg"},
+        ("shelf.jpg", "ann", (800, 600), [[399.5, 149.5]], [240]),
+    ),
+    "PsychoPy": (
+        "experiment_id,session_id,device_id,event_id,type,time,eye,duration,average_gaze_x,average_gaze_y,cond\n"
+        "1,2,0,30,54,11.5,22,0.25,-100.0,50.0,b.png\n1,2,0,31,54,12.0,22,0.125,0.0,0.0,b.png\n",
+        {"size": SIZE, "columns": {"picture": "cond"}},
+        ("b.png", "2", SIZE, [[859.5, 489.5], [959.5, 539.5]], [250, 125]),
+    ),
+    "Gazepoint": (
+        "MEDIA_ID,MEDIA_NAME,CNT,FPOGX,FPOGY,FPOGS,FPOGD,FPOGID,FPOGV\n0,a.jpg,0,0.5,0.5,0,0.01,1,1\n"
+        "0,a.jpg,1,0.5,0.25,0,0.2,1,1\n0,a.jpg,2,0.9,0.9,0,0.1,2,0\n",
+        {"size": SIZE},
+        ("a.jpg", "ann", SIZE, [[959.5, 269.5]], [200]),
+    ),
+    "PyGaze": (
+        "trialnr,starttime,endtime,duration,endx,endy\n1,100,350,250,512.5,384\n1,400,600,200,100,90\n",
+        {"size": (1024, 768), "picture": "a.png", "columns": {"trial": "trialnr"}},
+        ("a.png", "ann", (1024, 768), [[512.5, 384], [100, 90]], [250, 200]),
+    ),
+    "pymovements": (
+        "subject_id,trial,stimulus,name,onset,offset,duration,location_x,location_y\n"
+        "7,1,a.png,fixation_ivt,0,250,250,512.5,384\n7,1,a.png,saccade,250,270,20,,\n7,1,a.png,fixation,270,370,100,10,20\n",
+        {"size": (1024, 768)},
+        ("a.png", "7", (1024, 768), [[512.5, 384], [10, 20]], [250, 100]),
+    ),
+    "pymovements, pairs": (
+        'name,onset,offset,duration,location\nfixation,0,250,250,"[512.5, 384.0]"\n',
+        {"size": (1024, 768), "picture": "a.png"},
+        ("a.png", "ann", (1024, 768), [[512.5, 384]], [250]),
+    ),
+    "EyeLink Data Viewer": (
+        "RECORDING_SESSION_LABEL\tTRIAL_INDEX\timage\tCURRENT_FIX_X\tCURRENT_FIX_Y\tCURRENT_FIX_DURATION\n"
+        "ann\t1\ta.jpg\t512.3\t384.1\t200\nann\t1\ta.jpg\t.\t.\t200\n",
+        {"size": (1024, 768)},
+        ("a.jpg", "ann", (1024, 768), [[512.3, 384.1]], [200]),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", FILES)
+def test_fixations_of_a_program(tmp_path, program):
+    text, arguments, (picture, subject, size, points, durations) = FILES[program]
+    (tmp_path / "ann.csv").write_text(text, encoding="utf-8-sig")
+    (record,) = read_export(tmp_path / "ann.csv", **arguments)
+    assert (record.picture, record.subject, record.size) == (picture, subject, size)
+    assert np.allclose(record.points, points)
+    assert np.allclose(record.durations, durations)
+
+
+def test_viewings_are_told_apart(tmp_path):
+    """By picture, person and trial; a picture that comes again later is another viewing."""
+    rows = ["P1,1,a.jpg", "P1,1,b.jpg", "P1,1,b.jpg", "P1,1,a.jpg", "P2,1,a.jpg", "P2,2,a.jpg"]
+    head = "subject_id,trial,stimulus,name,onset,offset,duration,location_x,location_y"
+    lines = [f"{row},fixation,0,9,9,{place},{place}" for place, row in enumerate(rows)]
+    (tmp_path / "a.csv").write_text("\n".join([head, *lines]))
+    records = read_export(tmp_path / "a.csv", size=(80, 60))
+    assert [len(each) for each in records] == [1, 2, 1, 1, 1]
+
+
+def test_what_is_missing_is_named(tmp_path):
+    text, _, _ = FILES["Pupil Cloud"]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(DataError, match="Pupil Cloud does not give; give picture="):
+        read_export(tmp_path / "a.csv", size=(1600, 1200))
+    with pytest.raises(DataError, match="Pupil Cloud does not give; give size="):
+        read_export(tmp_path / "a.csv", picture="scene.mp4")
+    (tmp_path / "b.csv").write_text("picture,x,y\na.jpg,1,2\n")
+    with pytest.raises(DataError, match="expected the columns of a table of Tobii Pro Lab"):
+        read_export(tmp_path / "b.csv")
+    (tmp_path / "c.csv").write_text(f"{CLOUD},fixation x [px],fixation y [px]\ns1,r1,1,10,20,250,,\n")
+    with pytest.raises(DataError, match="expected fixations of Pupil Cloud, got none"):
+        read_export(tmp_path / "c.csv", size=(1600, 1200), picture="scene.mp4")
+    (tmp_path / "d.csv").write_text(f"{CLOUD},fixation x [px],fixation y [px]\ns1,r1,1,10,20,250,left,3\n")
+    with pytest.raises(DataError, match=r"line 2, x: expected a number, got 'left'"):
+        read_export(tmp_path / "d.csv", size=(1600, 1200), picture="scene.mp4")

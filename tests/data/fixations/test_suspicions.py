@@ -1,0 +1,110 @@
+"""What is suspicious in fixations is said, each kind alone, and nothing is said of fixations of people."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semfov.cli.main import main
+from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
+
+SIZE = (800, 600)
+
+
+def people(count=40, size=SIZE, seed=0):
+    """Scanpaths all over a frame with durations of fixations."""
+    random = np.random.default_rng(seed)
+    return [
+        Fixations(
+            f"{number}.jpg", "ann", random.uniform(0, 1, (8, 2)) * np.array(size) - 0.5, size,
+            random.uniform(120, 500, 8).round(),
+        )
+        for number in range(count)
+    ]  # fmt: skip
+
+
+def moved(change):
+    return [replace(each, points=change(each.points.copy())) for each in people()]
+
+
+def lasting(change):
+    return [replace(each, durations=change(each.durations.copy())) for each in people()]
+
+
+def blinks(points):
+    points[2:4] = -1000, -1000
+    return points
+
+
+def held(points):
+    points[3:6] = points[3]
+    return points
+
+
+KINDS = {
+    "unit": (moved(lambda points: (points + 0.5) / SIZE), "points look like fractions"),
+    "origin": (moved(lambda points: points - np.array(SIZE) / 2), "points look like pixels from the centre"),
+    "axes": (
+        [replace(each, points=each.points[:, ::-1]) for each in people(size=(800, 450))],
+        "points look like y before x",
+    ),
+    "smaller frame": (moved(lambda points: points / 3), "a frame of 26. × 200"),
+    "outside": (moved(lambda points: points + np.array([150, 0])), "lie outside their frame"),
+    "letterbox": (moved(lambda points: points * [0.75, 1] + [100, 0]), "at the left and right: was the picture"),
+    "bars above": (moved(lambda points: points * [1, 0.5] + [0, 150]), "at the top and bottom"),
+    "repeats": (moved(held), "repeat the point before"),
+    "blinks": (moved(blinks), r"lie at \(-1000, -1000\): does the tracker write it during blinks"),
+    "twice": ([*people(), *people(2)], "2 records occur more than once, such as that of ann in 0.jpg"),
+    "interleaved": ([each.first(1) for each in people()], "40 of 40 scanpaths have one fixation"),
+    "seconds": (lasting(lambda times: times / 1000), "look like seconds"),
+    "microseconds": (lasting(lambda times: times * 1000), "look like microseconds"),
+    "samples": (lasting(lambda times: times / 30), "are those of samples"),
+    "alike": (lasting(lambda times: times * 0 + 200), "all durations are 200 ms"),
+    "short": (lasting(lambda times: np.where(times < 200, 20, times)), "take less than 50 ms"),
+    "long": (lasting(lambda times: np.where(times == times.max(), 9000, times)), "take more than 5 s"),
+}  # fmt: skip
+
+
+def test_nothing_is_said_of_plain_fixations():
+    assert suspicions(people()) == []
+    assert suspicions([replace(each, durations=None) for each in people(3)]) == []
+    assert suspicions([]) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_told(kind):
+    records, said = KINDS[kind]
+    found = suspicions(records)
+    assert any(re.search(said, line) for line in found), found
+
+
+def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong(tmp_path, capsys):
+    write_table(tmp_path / "good.csv", people())
+    assert main(["check", str(tmp_path / "good.csv")]) == 0
+    shown = capsys.readouterr().out
+    assert "320 fixations, 40 scanpaths, 1 person, 40 pictures, frames of 800 × 600; they take" in shown
+    assert "nothing is suspicious" in shown
+    write_table(tmp_path / "bad.csv", KINDS["origin"][0])
+    assert main(["check", str(tmp_path / "good.csv"), str(tmp_path / "bad.csv"), str(tmp_path / "none.csv")]) == 1
+    shown = capsys.readouterr().out
+    assert "suspicious: points look like pixels from the centre" in shown
+    assert "none.csv: cannot be read: " in shown
+    (tmp_path / "neon.csv").write_text("fixation id,duration [ms],fixation x [px],fixation y [px]\n1,250,800,600\n")
+    command = ["check", str(tmp_path / "neon.csv"), "--picture", "scene.mp4"]
+    assert main(command) == 1
+    assert "give --size" in capsys.readouterr().err
+    assert main([*command, "--size", "1600,1200"]) == 0
+    assert main([*command, "--size", "wide"]) == 1
+
+
+def test_a_file_tells_its_reader(tmp_path):
+    records = people(3)
+    write_table(tmp_path / "a.csv", records)
+    write_osie(tmp_path / "b.json", records)
+    write_cocosearch(tmp_path / "c.json", [replace(each, size=(1680, 1050)) for each in records])
+    (tmp_path / "d.asc").write_text("MSG 1 DISPLAY_COORDS 0 0 799 599\nMSG 2 TRIALID 1\nEFIX R 10 209 200 5.5 3.5 1\n")
+    for name in ("a.csv", "b.json", "c.json"):
+        read = read_fixations(tmp_path / name)
+        assert all(np.allclose(one.points, other.points) for one, other in zip(read, records, strict=True))
+    assert read_fixations(tmp_path / "d.asc")[0].points.tolist() == [[5.5, 3.5]]
