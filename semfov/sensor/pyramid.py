@@ -32,7 +32,7 @@ class Bands:
         convention: convention of the pyramid, which determines the positions of a band's pixels in the image.
 
     >>> bands = laplacian_pyramid(torch.rand(1, 3, 64, 48), 2)
-    >>> bands.size, len(bands.details)
+    >>> bands.shape, len(bands.details)
     ((64, 48), 2)
     >>> bands.places(1, -1)[:3]
     tensor([0.5000, 2.5000, 4.5000])
@@ -43,7 +43,7 @@ class Bands:
     convention: Convention
 
     @property
-    def size(self) -> tuple[int, int]:
+    def shape(self) -> tuple[int, int]:
         """`(height, width)` of the image."""
         height, width = (self.details[0] if self.details else self.base).shape[-2:]
         return height, width
@@ -59,7 +59,7 @@ class Bands:
             Positions `(n,)` in image pixels.
         """
         band = self.details[k]
-        return as_positions(pixel_positions(band.shape[axis], self.size[axis], k, self.convention), band)
+        return as_positions(pixel_positions(band.shape[axis], self.shape[axis], k, self.convention), band)
 
 
 def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
@@ -101,32 +101,32 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
     return separable(wide, down, across).to(image.dtype)
 
 
-def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
+def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "kornia") -> Tensor:
     """Enlarge an image and blur it, the counterpart of `pyrdown`.
 
-    - `kornia`: bilinear resizing, then a blur with the 5 taps and reflected borders. Where `size` is twice the image's
+    - `kornia`: bilinear resizing, then a blur with the 5 taps and reflected borders. Where `shape` is twice the image's
       size, this is `kornia.geometry.transform.pyrup`.
-    - `opencv`: `cv2.pyrUp` with `dstsize=size`.
+    - `opencv`: `cv2.pyrUp` with `dstsize=shape[::-1]`.
 
     On accelerators Kornia itself computes the sizes that it defines. On a CPU matrix products compute the same numbers
     faster (`benchmarks.pyramid`).
 
     Args:
         image: `(B, C, H, W)`.
-        size: `(height, width)` of the result; with `opencv`, 2n or 2n - 1 for a side of n pixels.
+        shape: `(height, width)` of the result; with `opencv`, 2n or 2n - 1 for a side of n pixels.
         convention: `kornia` or `opencv`.
 
     Returns:
-        The larger image, `(B, C, *size)`.
+        The larger image, `(B, C, *shape)`.
 
     >>> pyrup(torch.rand(1, 3, 24, 32), (48, 65)).shape
     torch.Size([1, 3, 48, 65])
     """
     _check(image, convention)
     if convention == "opencv":
-        for count, length in zip(image.shape[-2:], size, strict=True):
-            check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
-    return expand(image, size, convention)
+        for count, length in zip(image.shape[-2:], shape, strict=True):
+            check(0 <= 2 * count - length <= 1, "shape", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
+    return expand(image, shape, convention)
 
 
 def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:

@@ -148,7 +148,7 @@ def test_pyramid_equals_plain_loops(reference_sensor, convention, size, wider):
 def test_sum_of_expanded_bands_is_the_image(convention, size):
     image = draw(1, 3, *size)
     bands = laplacian_pyramid(image, 5, convention)
-    assert bands.size == size
+    assert bands.shape == size
     result = bands.base
     for band in reversed(bands.details):
         result = band + pyrup(result, tuple(band.shape[-2:]), convention)
@@ -222,7 +222,7 @@ def test_bad_input():
         pyrdown(torch.rand(1, 1, 4, 4), "openvc")
     with pytest.raises(InputError, match="convention"):
         pyrup(torch.rand(1, 1, 4, 4), (8, 8), "openvc")
-    with pytest.raises(InputError, match="size: expected 8 or 7 for 4 pixels, got 9"):
+    with pytest.raises(InputError, match="shape: expected 8 or 7 for 4 pixels, got 9"):
         pyrup(torch.rand(1, 1, 4, 4), (8, 9), "opencv")
     with pytest.raises(InputError, match="levels"):
         laplacian_pyramid(torch.rand(1, 1, 4, 4), -1)
