@@ -42,6 +42,10 @@ def fill(folder: Path) -> dict[str, object]:
         for each, person in enumerate(("someone", "another"))
     ]
     write_table(folder / "fixations.csv", people)
+    (folder / "neon").mkdir(exist_ok=True)
+    (folder / "neon/fixations.csv").write_text(
+        "recording id,fixation id,duration [ms],fixation x [px],fixation y [px]\nr1,1,250,800,600\nr1,2,310,900,500\n"
+    )
     at: list[float] = []
     motors = SimpleNamespace(move=lambda *direction: at.__setitem__(slice(None), direction), position=lambda: tuple(at))
     video = SimpleNamespace(read=lambda: (True, frame))
