@@ -10,6 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -30,6 +31,15 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "detectors": ("name", "detector, or folder of models"),
 }
 """The positional argument of each subcommand, and its text."""
+
+_FUNCTIONS = {
+    "live": ("live", "look_live"),
+    "gaze": ("gaze", "predict_gaze"),
+    "app": ("app", "serve"),
+    "check": ("fixations", "check_fixations"),
+    "detectors": ("detectors", "list_detectors"),
+}
+"""Modules of this folder and their functions for subcommands that take their options alone."""
 
 _LOOKING = "search", "find", "explore", "live"
 
@@ -73,26 +83,10 @@ def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
 
         fit_folder(options)
         return None
-    if name == "live":
-        from semfov.cli.live import look_live
-
-        return look_live(options)
-    if name == "gaze":
-        from semfov.cli.gaze import predict_gaze
-
-        return predict_gaze(options)
-    if name == "app":
-        from semfov.cli.app import serve
-
-        return serve(options)
-    if name == "check":
-        from semfov.cli.fixations import check_fixations
-
-        return check_fixations(options)
-    if name == "detectors":
-        from semfov.cli.detectors import list_detectors
-
-        return list_detectors(options)
+    if name in _FUNCTIONS:
+        module, function = _FUNCTIONS[name]
+        code: int = getattr(import_module(f"semfov.cli.{module}"), function)(options)
+        return code
     from semfov.cli.search import look_at
 
     return look_at(options, stream)
