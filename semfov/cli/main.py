@@ -10,7 +10,6 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -31,15 +30,6 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "detectors": ("name", "detector, or folder of models"),
 }
 """The positional argument of each subcommand, and its text."""
-
-_FUNCTIONS = {
-    "live": ("live", "look_live"),
-    "gaze": ("gaze", "predict_gaze"),
-    "app": ("app", "serve"),
-    "check": ("fixations", "check_fixations"),
-    "detectors": ("detectors", "list_detectors"),
-}
-"""Modules of this folder and their functions for subcommands that take their options alone."""
 
 _LOOKING = "search", "find", "explore", "live"
 
@@ -83,13 +73,32 @@ def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
 
         fit_folder(options)
         return None
-    if name in _FUNCTIONS:
-        module, function = _FUNCTIONS[name]
-        code: int = getattr(import_module(f"semfov.cli.{module}"), function)(options)
-        return code
-    from semfov.cli.search import look_at
+    run: Callable[[Any], int | None]
+    if name == "live":
+        from semfov.cli.live import look_live
 
-    return look_at(options, stream)
+        run = look_live
+    elif name == "gaze":
+        from semfov.cli.gaze import predict_gaze
+
+        run = predict_gaze
+    elif name == "app":
+        from semfov.cli.app import serve
+
+        run = serve
+    elif name == "check":
+        from semfov.cli.fixations import check_fixations
+
+        run = check_fixations
+    elif name == "detectors":
+        from semfov.cli.detectors import list_detectors
+
+        run = list_detectors
+    else:
+        from semfov.cli.search import look_at
+
+        return look_at(options, stream)
+    return run(options)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -83,7 +83,7 @@ def foveate(
             positive = bool((torch.as_tensor(value) > 0).all())
             check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
     widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
-    size = source.size if isinstance(source, Bands) else tuple(source.shape[-2:])
+    size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
     elements = batch * number * like.shape[1] * size[0] * size[1]
     given = (
         (*source.details, like, fixation, widths, growth)
