@@ -22,7 +22,7 @@ SURFACE = {
     "HeadAgent", "InputError", "MapEvidence", "Objects", "Panorama", "Scanpath", "Selection", "SemfovError",
     "TargetEvidence", "ZoomAgent", "WindowEye", "__version__", "acquisition", "as_image", "dirichlet",
     "fit_detector", "foveate", "fusion", "load_detector", "merge_boxes", "observers", "policies", "read_image",
-    "rollout", "saliency",
+    "rollout", "run", "saliency",
 }  # fmt: skip
 
 # A subpackage imports only from itself and from the subpackages before it.
