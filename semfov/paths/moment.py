@@ -7,11 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
+from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.errors import check
@@ -80,6 +83,35 @@ class Moment(Record):
     def next_region(self) -> Box | None:
         """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
         return None
+
+    def draw(self, frame: ImageLike, *, color: Color = "bgr", longest: int = 1280) -> NDArray[np.uint8]:
+        """Draw the look, the belief or the objects, and where the next look goes, into the frame, for a window.
+
+        Matplotlib is not needed.
+
+        Args:
+            frame: the frame of the moment.
+            color: order of the channels of the frame and of the drawing: `bgr`, as OpenCV reads and shows them, or
+                `rgb`.
+            longest: longer side of the drawing in pixels; a larger frame is reduced to it.
+
+        Returns:
+            `(h, w, 3)`, bytes, with even sides.
+
+        Raises:
+            InputError: it is no frame of the size of the moment's.
+
+        Example::
+
+            moment = live.step(frame)
+            cv2.imshow("semfov", moment.draw(frame))
+        """
+        from semfov.viz.live import draw_moment
+
+        image = as_image(frame, argument="frame", color=color)
+        check(tuple(image.shape[:0:-1]) == self.size, "frame", "{} × {} px".format(*self.size), image.shape[:0:-1])
+        drawn = draw_moment(image, self, self.describe(), longest)
+        return np.ascontiguousarray(drawn[..., ::-1]) if color == "bgr" else drawn
 
     def _decided(self) -> str | None:
         """The decision in words; None without one."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.report.episode import Data
-from semfov.report.zoom import LISTED
 from semfov.viz.labels import place_labels
 
 ABOUT = {
@@ -20,26 +19,56 @@ ABOUT = {
 """Entries at the head of an episode, by their keys in its data."""
 
 
+_NAMED = 25
+"""Largest number of objects whose names are shown at first; more would cover the picture."""
+
+
 def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
-    """The picture with its windows and objects, all looks, and a table of the objects."""
-    name, count = escape(data["name"]), data["count"]
-    facts = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
+    """The picture with its objects and windows, the list of the objects, and all looks."""
+    name = escape(data["name"])
+    facts = "".join(
+        f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key])}</dd></div>" for key in ABOUT if data[key] is not None
+    )
     head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'
     looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
-    caption = "Windows, numbered in the order of the looks, and objects that were found"
-    confirmed = " Green objects were confirmed by the decision or a closer look." if data["confirmable"] else ""
+    what = "view" if data["turns"] else "window"
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
+        f'<div class="panes"><figure class="overview"><figcaption>{_legend(data)}{_switches(data)}</figcaption>'
+        f'{_picture(data, place)}</figure><section class="found-objects" aria-labelledby="{place}-objects">'
+        f'<h4 id="{place}-objects">Objects</h4>{_objects(data, place)}</section></div>'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
-        f"Click on the number or the border of a window to choose its look.{confirmed}</p>"
-        f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data)}</figure>'
-        f'{looks}</div><p class="hint">{data["values"]}A look brought the objects that it shows most sharply.</p>'
-        f"<h3>Objects</h3>{_objects(data, count)}</article>"
+        f"Click on the number or the border of a {what} to choose its look, or on a row of the list.</p>"
+        f'<div class="looks">{looks}</div>'
+        f'<p class="hint">{data["values"]}A look brought the objects that it shows most sharply.</p></article>'
     )
 
 
-def _picture(data: Data) -> str:
-    """The picture with numbered windows and objects."""
+def _legend(data: Data) -> str:
+    """What the colours of the picture mean."""
+    what = "view" if data["turns"] else "window"
+    entries = [("objects", "object that was found")]
+    if data["confirmable"]:
+        entries.append(("sure", "confirmed by the decision or a closer look"))
+    entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
+    swatches = [f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in entries]
+    if data["truth"]:
+        swatches.append('<li><i class="of-truth"></i> true box</li>')
+    return f'<ul class="key">{"".join(swatches)}</ul>'
+
+
+def _switches(data: Data) -> str:
+    """Boxes to tick: whether windows and names are drawn."""
+    names = " checked" if data["count"] <= _NAMED else ""
+    what = "Views" if data["turns"] else "Windows"
+    return (
+        f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {what}</label> '
+        f'<label><input type="checkbox" class="names-shown"{names}> Names</label></span>'
+    )
+
+
+def _picture(data: Data, place: str) -> str:
+    """The picture with named objects and numbered windows."""
     width, height = data["size"]
     unit = max(width, height) / 640
     truth = "".join(_rect(box, "truth") for box in data["truth"])
@@ -47,20 +76,26 @@ def _picture(data: Data) -> str:
     sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     tags = place_labels([tuple(look["box"]) for _, look in windows], sizes, (width, height))
     shapes = []
-    for each in data["objects"]:
+    for order, each in enumerate(data["objects"], 1):
         sure = ", confirmed" if each["confirmed"] else ""
         kind = "object confirmed" if sure else "object"
-        title = f"<title>{escape(each['label'])} {each['score']:.2f}{sure}, look {each['look']}</title>"
-        shapes.append(f'<g class="{kind}" data-look="{each["look"]}">{title}{_framed(each["box"])}</g>')
+        words = f"{escape(each['label'])} {each['score']:.2f}"
+        x, y = each["box"][0] + 2 * unit, max(each["box"][1] - 6 * unit, 7 * unit)
+        name = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{words}</text>'
+        title = f"<title>{words}{sure}, look {each['look']}</title>"
+        inside = f"{title}{_framed(each['box'])}{name}"
+        shapes.append(f'<g class="{kind}" data-look="{each["look"]}" data-object="{order}">{inside}</g>')
     for (number, look), tag in zip(windows, tags, strict=True):
         x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
         shapes.append(f'<g class="window" data-look="{number}">{_framed(look["box"])}{_rect(tag, "tag")}{text}</g>')
     several = "s" if data["count"] != 1 else ""
-    label = f"The picture with {len(windows)} numbered windows and {data['count']} object{several}"
+    what = "views" if data["turns"] else "windows"
+    label = f"The picture with {len(windows)} numbered {what} and {data['count']} object{several}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
-        f'{_image(data["image"], (width, height))}{truth}{"".join(shapes)}<g class="chosen"></g></svg>'
+        f"{_image(data['image'], (width, height), f'{place}-picture')}{truth}{''.join(shapes)}"
+        f'<g class="chosen"></g></svg>'
     )
 
 
@@ -83,16 +118,19 @@ def _look(data: Data, number: int, place: str) -> str:
         tags.append(f'<g class="{kind}">{_rect(each["tag"], "tag")}{text}</g>')
         rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(each["place"])])
     value = "none: the first look" if look["value"] is None else f"{look['value']:.2g}"
-    facts = {
+    where = {
         "Window": f"x {x1} to {x2}, y {y1} to {y2} ({x2 - x1} × {y2 - y1} px)",
         "Magnification": f"{look['magnification']:.2g}",
+    }
+    facts = {
+        **(where if look["turned"] is None else {"Head": look["turned"]}),
         "Value when it was chosen": value,
         "Objects that it brought": look["brought"],
     }
     if look["value"] is None and number:
         del facts["Value when it was chosen"]
     if look["seconds"] is not None:
-        facts["End"] = f"after {look['seconds']:.2f} s"
+        facts["End"] = f"after {look['seconds']:.2f} s{', with the warm-up of the detector' if look['warm'] else ''}"
     if look["closer"] is not None:
         facts["Closer look"] = look["closer"]
     facts_html = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
@@ -105,22 +143,52 @@ def _look(data: Data, number: int, place: str) -> str:
         f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
         f'<h4 id="{place}-title">Look {number}{": the whole picture" if look["whole"] else ""}</h4>'
         f'<svg viewBox="0 0 {size[0]} {size[1]}" role="img" aria-label="{label}">'
-        f"{_image(look['view'], size)}{''.join(shapes)}{''.join(tags)}</svg>"
+        f"{_image(look['view'], size, f'{place}-view')}{''.join(shapes)}{''.join(tags)}</svg>"
         f'<dl class="facts">{facts_html}</dl>{table}{_left_out(left, "detection")}</section>'
     )
 
 
-def _objects(data: Data, count: int) -> str:
-    """The table of the objects, most confident first."""
+def _objects(data: Data, place: str) -> str:
+    """The list of the objects with what their boxes show, most confident first."""
+    count = data["count"]
     if not count:
         return "<p>No objects were found.</p>"
-    rows = [["#", "class", "score", "box", "look", *(["confirmed"] if data["confirmable"] else [])]]
-    for order, each in enumerate(data["objects"][:LISTED], 1):
-        sure = ["yes" if each["confirmed"] else "no"] if data["confirmable"] else []
-        place = _corners(each["box"])
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", place, str(each["look"]), *sure])
-    caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the sharpest look"
-    return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
+    heads = ["#", "", "class", "score", *(["pan, tilt"] if data["turns"] else []), "look"]
+    heads += [*(["confirmed"] if data["confirmable"] else []), "box"]
+    rows = []
+    for order, each in enumerate(data["objects"], 1):
+        cells = [escape(each["label"]), f"{each['score']:.2f}"]
+        cells += [f"{each['pan']:.0f}°, {each['tilt']:.0f}°"] if data["turns"] else []
+        cells += [str(each["look"]), *(["yes" if each["confirmed"] else "no"] if data["confirmable"] else [])]
+        cells.append(_corners(each["box"]))
+        rows.append(
+            f'<tr data-object="{order}" data-look="{each["look"]}"><th scope="row">'
+            f'<button type="button" class="pick">{order}</button></th><td>{_crop(data, each, place)}</td>'
+            + "".join(f'<td class="number">{cell}</td>' for cell in cells)
+            + "</tr>"
+        )
+    titles = "".join(
+        f'<th scope="col"><button type="button" class="sort">{head}</button></th>' if head else "<td></td>"
+        for head in heads
+    )
+    label = "Objects with boxes (x1, y1, x2, y2) in picture pixels and the sharpest look"
+    table = f"<thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    return (
+        f'<div class="wide" tabindex="0" role="region" aria-label="{label}">'
+        f'<table class="objects" aria-label="{label}">{table}</table></div>' + _left_out(count - len(rows), "object")
+    )
+
+
+def _crop(data: Data, each: Data, place: str) -> str:
+    """What the box of an object shows, of the look that shows it most sharply; a part of a picture that is there."""
+    x1, y1, x2, y2 = each["box"]
+    look = data["looks"][each["look"]]
+    source, (left, top) = f"{place}-look-{each['look']}-view", look["box"][:2]
+    if data["turns"]:  # views are no parts of the picture
+        source, left, top = f"{place}-picture", 0, 0
+    margin = 0.1 * max(x2 - x1, y2 - y1, 1)
+    view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {x2 - x1 + 2 * margin:.1f} {y2 - y1 + 2 * margin:.1f}"
+    return f'<svg class="crop" viewBox="{view}" aria-hidden="true"><use href="#{source}"/></svg>'
 
 
 def _left_out(count: int, what: str) -> str:
@@ -133,8 +201,8 @@ def _corners(box: Sequence[float]) -> str:
     return ", ".join(f"{n:.0f}" for n in box)
 
 
-def _image(uri: str, size: tuple[int, int]) -> str:
-    return f'<image href="{uri}" width="{size[0]}" height="{size[1]}" preserveAspectRatio="none"/>'
+def _image(uri: str, size: tuple[int, int], name: str) -> str:
+    return f'<image id="{name}" href="{uri}" width="{size[0]}" height="{size[1]}" preserveAspectRatio="none"/>'
 
 
 def _framed(box: Sequence[float]) -> str:

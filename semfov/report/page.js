@@ -4,6 +4,7 @@
   const find = (id) => document.getElementById(id);
   const GAZE = "#0072B2", TARGET = "#B84700", FOUND = "#00795A", OTHER = "#1F4E79", TRUTH = "#E69F00";
   let episode, fixation = 0, chosenClass = 0, wantedClass = null, playing = null;
+  let stepped = false; // The page opens with the result: nothing is yet to come before the reader steps.
 
   // Elements: names and texts are set as text, never as markup.
   function make(namespace, tag, attributes = {}, children = []) {
@@ -191,7 +192,7 @@
     for (const look of article.querySelectorAll(".look")) look.hidden = Number(look.dataset.look) !== fixation;
     for (const drawn of article.querySelectorAll("g[data-look]")) {
       drawn.classList.toggle("now", Number(drawn.dataset.look) === fixation);
-      drawn.classList.toggle("later", Number(drawn.dataset.look) > fixation);
+      drawn.classList.toggle("later", stepped && Number(drawn.dataset.look) > fixation);
     }
     const frames = [box(now.box, { class: "under" }), box(now.box, { class: "over" })];
     article.querySelector(".chosen").replaceChildren(...frames);
@@ -225,7 +226,8 @@
   }
   function go(number) {
     const wanted = Math.min(Math.max(number, 0), steps().length - 1);
-    if (wanted === fixation) return;
+    if (wanted === fixation && stepped) return;
+    stepped = true;
     fixation = wanted;
     show();
   }
@@ -233,6 +235,7 @@
     if (episode?.maps) wantedClass = episode.maps[chosenClass].label;
     episode = report.episodes[number];
     fixation = 0;
+    stepped = false;
     find("fixation").max = steps().length - 1;
     find("episode-views").hidden = Boolean(episode.looks);
     for (const article of document.querySelectorAll(".large")) article.hidden = article.id !== episode.article;
@@ -246,8 +249,8 @@
     find("back").setAttribute("aria-label", `Previous ${word}`);
     find("forward").setAttribute("aria-label", `Next ${word}`);
     for (const told of document.querySelectorAll("[data-about]")) {
-      told.parentElement.hidden = !(told.dataset.about in episode);
-      told.textContent = episode[told.dataset.about] ?? "not recorded";
+      told.parentElement.hidden = !episode[told.dataset.about];
+      told.textContent = episode[told.dataset.about] ?? "";
     }
     show();
   }
@@ -279,7 +282,27 @@
   find("back").addEventListener("click", () => { stop(); go(fixation - 1); });
   find("forward").addEventListener("click", () => { stop(); go(fixation + 1); });
   find("play").addEventListener("click", play);
+  // The list of objects: a row shows its object and the look that brought it, and a head sorts by its column.
+  function pick(row) {
+    const article = find(episode.article), same = `[data-object="${row.dataset.object}"]`;
+    for (const each of article.querySelectorAll(".picked")) each.classList.remove("picked");
+    for (const each of article.querySelectorAll(same)) each.classList.add("picked");
+    stop();
+    go(Number(row.dataset.look));
+  }
+  function sort(head) {
+    const column = head.cellIndex, down = head.getAttribute("aria-sort") === "ascending";
+    const body = head.closest("table").tBodies[0];
+    for (const each of head.parentElement.cells) each.removeAttribute("aria-sort");
+    head.setAttribute("aria-sort", down ? "descending" : "ascending");
+    const text = (row) => row.cells[column].textContent;
+    const order = (a, b) => text(a).localeCompare(text(b), "en", { numeric: true }) * (down ? -1 : 1);
+    body.append(...[...body.rows].sort(order));
+  }
   document.addEventListener("click", (event) => {
+    const head = event.target.closest(".sort")?.parentElement, row = event.target.closest("tr[data-object]");
+    if (head) return sort(head);
+    if (row) return pick(row);
     const chosen = event.target.closest(".window");
     if (!chosen) return;
     stop();

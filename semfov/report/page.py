@@ -113,8 +113,8 @@ def _about_html(episodes: Sequence[Data]) -> str:
     rows = []
     for key, label in ABOUT.items():
         if any(key in episode for episode in episodes):
-            hidden = "" if key in episodes[0] else " hidden"
-            fact = escape(episodes[0].get(key) or "not recorded")
+            hidden = "" if episodes[0].get(key) else " hidden"
+            fact = escape(episodes[0].get(key) or "")
             rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
     return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from itertools import pairwise
+from statistics import median
 from typing import Any
 
 from torch import Tensor
@@ -19,10 +21,7 @@ from semfov.viz.drawing import photograph_of
 from semfov.zoom.hints import DETECTION_SCORE
 
 DRAWN = 500
-"""Largest number of objects that are drawn in the picture."""
-
-LISTED = 100
-"""Largest number of objects in the table."""
+"""Largest number of objects that are drawn in the picture and listed."""
 
 _MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
@@ -85,7 +84,7 @@ def zoom_data(
             "box": [round(row[side], 1) for side in ("x1", "y1", "x2", "y2")],
             "label": row["class"],
             "score": rounded(row["score"]),
-            **{name: row[name] for name in ("look", "confirmed")},
+            **{name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row},
         }
         for row in path.object_rows()
     ]
@@ -109,6 +108,7 @@ def zoom_data(
         "objects": objects[:DRAWN],
         "count": len(objects),
         "confirmable": path.confirmable,
+        "turns": path.how == "head",
     }
 
 
@@ -133,7 +133,11 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
     brought = Counter(each["label"] for each in objects if each["look"] == number)
     closer = next((each for each in path.closer_looks if each.number == number), None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
-    where = ", at the whole picture" if whole else f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}"
+    turned = None
+    if path.how == "head":
+        turned = "pan {pan:.0f}°, tilt {tilt:.0f}°, field of view {field:.0f}°".format(**look.more)
+    where = f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}" if turned is None else f": {turned}"
+    where = ", at the whole picture" if whole else where
     sentences = [f"Look {number} of {len(path) - 1}{where}."]
     if look.value is not None:
         sentences.append(f"Its value was {look.value:.2g}.")
@@ -145,6 +149,8 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "box": [round(side) for side in look.region],
         "size": list(view.size),
         "whole": whole,
+        "turned": turned,
+        "warm": number == 0 and _warm(path),
         "magnification": rounded(magnification),
         "value": None if look.value is None else rounded(look.value),
         "seconds": None if look.seconds is None else rounded(look.seconds),
@@ -154,6 +160,15 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "brought": kinds or "none",
         "status": " ".join(sentences),
     }
+
+
+def _warm(path: Record) -> bool:
+    """Whether the first look took over three times as long as the others usually did; of a head it is no time here."""
+    ends = [look.seconds for look in path]
+    if path.how == "head" or len(ends) < 3 or None in ends:
+        return False
+    first, *later = [end - start for start, end in pairwise([0.0, *map(float, ends)])]  # type: ignore[arg-type]
+    return first > 3 * median(later)
 
 
 def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:

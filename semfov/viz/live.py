@@ -27,7 +27,7 @@ VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 """Suffixes of videos that can be written, and their codecs."""
 
 
-def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
+def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:
     """Draw what is known at a frame, and where the next look goes, into the frame.
 
     Where there is a belief in cells, the opacity of the colour over a cell is proportional to its probability; a circle
@@ -35,14 +35,15 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> _Frame:
     the circle if the look is a closer one.
 
     Of windows, a frame marks the present window, a thin one the next, and boxes the objects: those that are confirmed
-    in their own colour.
+    in their own colour. A frame that is longer than `longest` is reduced.
 
     Shapes: image `(3, H, W)` → `(h, w, 3)`.
     """
     from PIL import Image, ImageDraw, ImageFont
 
     (height, width), look, ahead = image.shape[-2:], moment.looks[-1], moment.next_region
-    scale = min(1.0, (_LONGEST if ahead is None else _LONGEST_OF_WINDOWS) / max(width, height))
+    usual = _LONGEST if ahead is None else _LONGEST_OF_WINDOWS
+    scale = min(1.0, (usual if longest is None else longest) / max(width, height))
     size = max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2)
     pixels = in_bytes(image) if image.is_floating_point() else image
     picture = Image.fromarray(pixels.permute(1, 2, 0).cpu().numpy()).resize(size)

@@ -66,24 +66,41 @@ def styled(plot: Callable[_Arguments, Figure]) -> Callable[_Arguments, Figure]:
             # the caller has given is left for the caller to draw.
             if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
                 figure.draw_without_rendering()
-            _teach_notebook()
+            if all(options.get(name) is None for name in _PLACES):
+                _show_in_notebook(figure)
             return figure
 
     return draw
 
 
-def _teach_notebook() -> None:
-    """Register figures with IPython, so that a notebook shows one that is the last value of a cell."""
+_waiting: list[Figure] = []
+
+
+def _show_in_notebook(figure: Figure) -> None:
+    """Let a notebook show a figure: as the last value of its cell, or else at the end of the cell, as pyplot does."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None:
         return
     from IPython.core.pylabtools import print_figure
+    from IPython.display import display
     from matplotlib.figure import Figure
+
+    def printed(shown: Figure) -> Any:
+        _waiting[:] = [each for each in _waiting if each is not shown]
+        return print_figure(shown)
+
+    def end_cell() -> None:
+        while _waiting:
+            display(_waiting.pop(0))
 
     pictures = shell.display_formatter.formatters["image/png"]
     if Figure not in pictures.type_printers:
-        pictures.for_type(Figure, print_figure)
+        pictures.for_type(Figure, printed)
+        if hasattr(shell, "kernel"):  # a terminal can show no pictures
+            shell.events.register("post_execute", end_cell)
+    if hasattr(shell, "kernel"):
+        _waiting.append(figure)
 
 
 def lay_out(figure: Figure) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import ActivePerception, Detections, Grid
+from semfov import ActivePerception, Detections, Grid, InputError
 from semfov.belief import DirichletBelief, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.cli import live
@@ -224,6 +224,18 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     assert not changed[:, 262:].any()
     large = draw_moment(torch.zeros(3, 1001, 1999), moment(grid=Grid(4, 2, (1999, 1001))), "cup")
     assert large.shape == (320, 640, 3)
+
+
+def test_a_moment_draws_into_a_frame_of_opencv():
+    known = moment(grid=Grid(4, 2, (400, 200)))
+    image = torch.rand(3, 200, 400, generator=torch.Generator().manual_seed(0)).mul(255).round().byte()
+    frame = image.permute(1, 2, 0).numpy()[..., ::-1]
+    drawn = known.draw(frame)
+    assert np.array_equal(drawn[..., ::-1], draw_moment(image, known, known.describe()))
+    assert np.array_equal(known.draw(frame[..., ::-1], color="rgb"), drawn[..., ::-1])
+    assert known.draw(frame, longest=100).shape == (50, 100, 3)
+    with pytest.raises(InputError, match=r"frame: expected 400 × 200 px"):
+        known.draw(frame[:100])
 
 
 def test_videos_are_written_completely_or_not_at_all(tmp_path):

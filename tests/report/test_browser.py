@@ -308,6 +308,32 @@ def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
     page.close()
 
 
+def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromium, zoom_page):
+    page, told = watched(chromium)
+    page.goto(zoom_page.as_uri())
+    assert (page.locator(".object").count(), page.locator(".object.later").count()) == (2, 0)
+    rows = page.locator(".objects tbody tr")
+    first = rows.first.locator(".crop").screenshot()
+    assert len(set(first)) > 50  # it shows something
+    rows.nth(1).click()
+    assert page.locator(".object.picked").get_attribute("data-look") == "2"
+    assert page.locator("#number").inner_text() == "2 of 2"
+    heads = page.locator(".objects th[scope=col]")
+    heads.filter(has_text="score").get_by_role("button").click()
+    scores = page.locator(".objects tbody tr td:nth-child(4)")
+    ascending = scores.all_inner_texts()
+    assert ascending == sorted(ascending)
+    heads.filter(has_text="score").get_by_role("button").click()
+    assert scores.all_inner_texts() == ascending[::-1]
+    assert heads.filter(has_text="score").get_attribute("aria-sort") == "descending"
+    for switch, drawn in (("Windows", ".window"), ("Names", ".object .name")):
+        assert page.locator(drawn).first.is_visible()
+        page.get_by_role("checkbox", name=switch).uncheck()
+        assert not page.locator(drawn).first.is_visible()
+    assert told == []
+    page.close()
+
+
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
     large = zoom_data(zoom_path, large_picture, name="large.jpg")
     small = episode_data(scanpath, image, [image] * 3, name="small.jpg")

@@ -152,7 +152,7 @@ def test_a_page_without_pictures_says_so(scanpath, tmp_path):
     data = episode_data(scanpath, None, None, name="in the dark")
     page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
     assert data_of(page)["pictures"] == []
-    assert "not recorded" in page
+    assert '<div hidden><dt>Detector</dt><dd data-about="detector"></dd></div>' in page
 
 
 def test_the_head_shows_photograph_settings_and_outcome(scanpath, image, hostile, tmp_path):

@@ -14,7 +14,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects
 from semfov.errors import InputError
 from semfov.report import episode_data, page_html, zoom_data
-from semfov.report.zoom import _MOST_DETECTIONS, LISTED
+from semfov.report.zoom import _MOST_DETECTIONS, DRAWN
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -91,10 +91,10 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
 def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_path, large_picture, sought):
     path = zoom_path if sought else replace(zoom_path, decision=None)
     page = page_html("field", [zoom_data(path, large_picture, name="field")])
-    assert ("Green objects were confirmed" in page) == sought
-    assert ('<th scope="col" class="number">confirmed</th>' in page) == sought
-    (row,) = re.findall(r'<tr><th scope="row">1</th>(?:<td class="number">[^<]*</td>){4,5}</tr>', page)[-1:]
-    assert row.endswith(">yes</td></tr>" if sought else ">1</td></tr>")
+    assert ("confirmed by the decision or a closer look" in page) == sought
+    assert ('<button type="button" class="sort">confirmed</button>' in page) == sought
+    ((look, *sure),) = re.findall(r'<tr data-object="1" data-look="(\d)">.*?(?:>(yes|no)</td>.*?)?</tr>', page)
+    assert (look, *sure) == ("1", "yes" if sought else "")
     assert ("confirmed ones green" in path._repr_html_()) == sought
 
 
@@ -118,7 +118,7 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
-    many = LISTED + 7
+    many = DRAWN + 7
     scores = torch.linspace(0.9, 0.3, many)
     place = torch.tensor([[10.0, 10, 20, 20]]).expand(many, 4)
     objects = Objects(place, scores, torch.full((many,), 2), torch.zeros(many).long())
@@ -138,8 +138,8 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
     assert f"<p>{many - _MOST_DETECTIONS} less confident detections are left out.</p>" in page
-    assert page.count("0.90</td>") == 1
-    one = replace(zoom_path, decision=None, candidates=objects[torch.arange(LISTED + 1)])
+    assert page.count("<tr data-object=") == DRAWN
+    one = replace(zoom_path, decision=None, candidates=objects[torch.arange(DRAWN + 1)])
     page = page_html("crowd", [zoom_data(one, large_picture, name="crowd")])
     assert "<p>1 less confident object is left out.</p>" in page
 
@@ -196,9 +196,9 @@ def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpat
         assert len(elements.of("large")) == 1
         (views,) = [attributes for _, attributes in elements.found if attributes.get("id") == "episode-views"]
         assert "hidden" not in views
-        # The head shows the first; the entries that it does not have are hidden.
+        # The head shows the first; the entries that it does not have are hidden, as that of an unknown detector.
         hidden = [tag for tag, attributes in elements.found if tag == "div" and "hidden" in attributes]
-        assert len(hidden) == (2 if episodes[0] is small else 0)
+        assert len(hidden) == (4 if episodes[0] is small else 1)
         # Without JavaScript, a large picture that is not the first has a head of its own.
         assert ("noscript><dl" in page) == (episodes[0] is small)
 

@@ -21,3 +21,24 @@ def test_a_figure_is_displayed_before_pyplot_is_imported(fresh):
     """Plain Matplotlib figures are not: notebooks can display them only after pyplot is imported."""
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
     assert fresh(CODE).split() == ["False", "True", "1"]
+
+
+LOOP = """
+from IPython.core.interactiveshell import InteractiveShell
+from IPython.utils.capture import capture_output
+
+shell = InteractiveShell.instance()
+shell.kernel = object()  # as in a notebook
+shell.run_cell("from semfov.viz import plot_reliability; import torch")
+shell.run_cell("draw = lambda: plot_reliability({'m': (torch.rand(50, 3).softmax(-1), torch.randint(3, (50,)))})")
+for cell in ("for number in range(2): draw()", "kept = draw()", "draw()", "1"):
+    with capture_output() as shown:
+        shell.run_cell(cell)
+    print(sum("image/png" in each.data for each in shown.outputs))
+"""
+
+
+def test_figures_of_a_loop_are_displayed_once(fresh):
+    """The last value of a cell is its result, which is shown in another way."""
+    pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
+    assert fresh(LOOP).split() == ["2", "1", "0", "0"]
