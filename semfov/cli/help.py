@@ -28,7 +28,7 @@ Commands:
   detectors   list detectors, or the classes of one
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
-`eval "$(semfov completion bash)"` lets the shell complete commands and options (also zsh and fish).
+`semfov completion bash >> ~/.bashrc` lets the shell complete commands and options (also zsh and fish).
 Without a picture, search, find, explore and gaze take an embedded scene, so `semfov search --target cup` tries it out.
 """
 
@@ -281,7 +281,7 @@ def completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
     """
     script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
     if script is None:
-        return 'usage: semfov completion bash|zsh|fish, for example: eval "$(semfov completion bash)"\n'
+        return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
     named = {name: [each.replace("_", "-") for each in several] for name, several in options.items()}
     cases = "\n".join(f'    {name}) words="{" ".join(f"--{each}" for each in some)}";;' for name, some in named.items())
     lines = "\n".join(
