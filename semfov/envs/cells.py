@@ -118,6 +118,9 @@ class CellGazes(Gazes):
         unknown, scenery = options.keys() - {"episode", "scene"}, self.scenery
         check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
         if "episode" in options:
+            scene = getattr(options["episode"], "scene", None)
+            fits = isinstance(scene, int) and 0 <= scene < scenery.count
+            check(fits, "episode", f"one of {type(scenery).__name__}.episodes", repr(options["episode"]))
             return options["episode"]
         if "scene" not in options:
             return scenery.draw(random)
@@ -129,7 +132,8 @@ class CellGazes(Gazes):
 
     def action(self, action: Any) -> Tensor:
         """Check the cell of a single episode; returns a batch of one."""
-        check_whole(action, "action", 0, int(self.action_space.n) - 1)
+        expected = f"a whole number from 0 to {int(self.action_space.n) - 1}"
+        check(self.action_space.contains(action), "action", expected, repr(action))
         return torch.tensor([int(action)])
 
     @torch.inference_mode()

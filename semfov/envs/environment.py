@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from semfov.envs.cells import GAZES, CellGazes
@@ -26,8 +27,10 @@ PRICES = {"search": 0.05, "exploration": 0.01}
 _ROW = torch.tensor([0])
 
 
-class EpisodeEnv(gymnasium.Env[Arrays, Any]):
+class EpisodeEnv(gymnasium.Env[Arrays, Any], EzPickle):
     """One episode at a time; base of `GazeEnv` and `ZoomEnv`, which differ in their actions.
+
+    A copy, also by `pickle`, is a new environment of the same settings and scenes, which begins with a reset.
 
     Args:
         gazes: a batch of one episode.
@@ -170,6 +173,8 @@ class GazeEnv(EpisodeEnv):
             pictures=render_mode is not None,
         )
         super().__init__(gazes, render_mode)
+        rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
+        EzPickle.__init__(self, self.scenery, **rewards, render_mode=render_mode)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Mask of the cells that were not fixated, under the name that `sb3_contrib.MaskablePPO` expects.
@@ -273,6 +278,8 @@ class ZoomEnv(EpisodeEnv):
             glimpse=glimpse,
         )
         super().__init__(gazes, render_mode)
+        rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse, "grid": grid}
+        EzPickle.__init__(self, self.scenery, **rewards, render_mode=render_mode)
 
 
 class ZoomSearch(ZoomEnv):

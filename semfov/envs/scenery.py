@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,8 @@ class Scenery:
         print(len(scenery.episodes(0)), scenery.shape, scenery.shifts)
     """
 
+    opened: partial[Any] | None = None
+
     def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
         check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")
         self._looking, self._data, self.count = looking, looking.scenes, len(looking.scenes)
@@ -91,6 +93,11 @@ class Scenery:
             raise DataError(
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
             )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy opens the same scenes again."""
+        check(self.opened is not None, "scenery", "one that open_scenery has opened, to be copied", "another")
+        return self.opened, ()
 
     def _targets_of(self, scene: int) -> list[int]:
         """Classes to search for in a scene, or those of its objects in an exploration."""
@@ -257,6 +264,7 @@ def open_scenery(
         scenery = open_scenery("search", "photographs/", "instances.json", targets=["cat", "cup"])
         envs = [GazeSearch(scenery, belief=True) for _ in range(4)]
     """
+    arguments = {**locals()}
     check(task in ("search", "exploration"), "task", "'search' or 'exploration'", repr(task))
     check_whole(mosaics, "mosaics", 0, 1_000_000)
     if config is None:
@@ -285,4 +293,6 @@ def open_scenery(
     looking = _SceneLooking(config, task, choose)
     classes, names = looking.scenes.classes, looking.eye.detector.classes
     check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
-    return Scenery(looking, targets)
+    scenery = Scenery(looking, targets)
+    scenery.opened = partial(open_scenery, **arguments)
+    return scenery

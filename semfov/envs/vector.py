@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.utils import seeding
+from gymnasium.utils import EzPickle, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
 
 
-class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
+class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle):
     """Many episodes side by side, each in a scene of its own; a step of all is one step of the batched loop.
 
     With seed s, environment i does the same as a `GazeEnv` with seed s + i. With `together`, the default, learned
@@ -67,11 +67,15 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         **options: Any,
     ) -> None:
         check_whole(num_envs, "num_envs", 1, 1_000_000)
-        modes, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
-        mode = AutoresetMode(lookup(str(name), modes, "autoreset_mode"))
+        known, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
+        mode = AutoresetMode(lookup(str(name), known, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
         self.num_envs, self.task = num_envs, task
         self.scenery = scenery_or_open(scenery, open_scenery, options, task)
+        # A copy is a new environment of the same settings and scenes, which begins with a reset.
+        rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
+        modes = {"detections": detections, "together": together, "autoreset_mode": mode}
+        EzPickle.__init__(self, task, num_envs, self.scenery, **rewards, **modes)
         self.gazes = GAZES[task](
             self.scenery,
             num_envs,
@@ -118,12 +122,17 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
                     self._randoms[row] = seeding.np_random(one)[0]
         remaining = dict(options or {})
         mask = remaining.pop("reset_mask", None)
+        if mask is not None:
+            flags = np.asarray(mask)
+            fits = flags.shape == (self.num_envs,) and flags.dtype == np.bool_
+            check(fits, "reset_mask", f"{self.num_envs} booleans, one for each environment", repr(mask))
         rows = self._rows if mask is None else torch.from_numpy(np.flatnonzero(mask))
         episodes = remaining.pop("episodes", None)
         if episodes is None:
             episodes = [self.gazes.choose(self._randoms[row], remaining) for row in rows.tolist()]
         expected = f"{len(rows)} episodes, one for each environment that is reset"
         check(len(episodes) == len(rows), "episodes", expected, len(episodes))
+        episodes = [self.gazes.choose(self._randoms[0], {"episode": each}) for each in episodes]
         self.gazes.begin(rows, episodes)
         self._ended[:, rows] = False
         return self._observed()
@@ -141,10 +150,10 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         Raises:
             InputError: the actions are not `num_envs` cells.
         """
-        chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
         cells = int(self.gazes.action_space.n)
-        inside = chosen.shape == (self.num_envs,) and bool(((chosen >= 0) & (chosen < cells)).all())
-        check(inside, "actions", f"{self.num_envs} cells from 0 to {cells - 1}", actions)
+        inside = self.action_space.contains(np.asarray(actions))
+        check(inside, "actions", f"{self.num_envs} cells from 0 to {cells - 1}", repr(actions))
+        chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
         mode, over = self.metadata["autoreset_mode"], self._ended.any(0)
         reward, last = torch.zeros(self.num_envs, dtype=torch.float64), {}
         going, resting = (~over).nonzero()[:, 0], over.nonzero()[:, 0]

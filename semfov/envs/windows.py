@@ -52,7 +52,7 @@ class WindowGaze(Gazes):
     @property
     def action_space(self) -> spaces.Box:
         """Place and magnification, each from 0 to 1."""
-        return spaces.Box(0, 1, (3,), np.float32)
+        return spaces.Box(0, 1, (3,), np.float64)  # which holds numbers of any other kind
 
     @property
     def looks(self) -> list[Glance]:
@@ -84,10 +84,9 @@ class WindowGaze(Gazes):
 
     def action(self, action: Any) -> Tensor:
         """Check an action; returns a batch of one."""
-        values = np.asarray(action, dtype=np.float64)
-        fits = values.shape == (3,) and bool(((values >= 0) & (values <= 1)).all())
-        check(fits, "action", "(x, y, magnification), each from 0 to 1", action)
-        return torch.from_numpy(values)[None]
+        fits = self.action_space.contains(action if isinstance(action, np.ndarray) else _array(action))
+        check(fits, "action", "(x, y, magnification), each from 0 to 1", repr(action))
+        return torch.from_numpy(np.asarray(action, dtype=np.float64))[None]
 
     def move(self, rows: Tensor, actions: Tensor) -> Score:
         """Look at another window; the looks are stored at the end of an episode."""
@@ -196,3 +195,11 @@ def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)
     return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)
+
+
+def _array(action: Any) -> Any:
+    """An action as an array; as it is where it has no numbers."""
+    try:
+        return np.asarray(action, dtype=np.float64)
+    except (ValueError, TypeError):
+        return np.empty(0)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -46,6 +47,8 @@ class ZoomScenery:
         envs = [ZoomSearch(scenery) for _ in range(4)]
     """
 
+    opened: partial[Any] | None = None
+
     def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
         self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
         self.annotated = not isinstance(self.pictures, Pictures)
@@ -54,6 +57,11 @@ class ZoomScenery:
         # Looks are kept for as long as an environment uses this scenery.
         self.glances = cache(looking.glances)
         self._listed = cache(self._list)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy opens the same pictures again."""
+        check(self.opened is not None, "scenery", "one that open_zoom_scenery has opened, to be copied", "another")
+        return self.opened, ()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -260,6 +268,7 @@ def open_zoom_scenery(
         scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
         env = ZoomSearch(scenery, belief=True)
     """
+    arguments = {**locals()}
     check_whole(passes, "passes", 2, 100_000)
     folder = Path(scenes) if isinstance(scenes, str | Path) else None
     data = DataConfig(
@@ -283,4 +292,6 @@ def open_zoom_scenery(
     looking = _PictureLooking(config, scenes)
     classes, names = looking.scenes.classes, looking.eye.detector.classes
     check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
-    return ZoomScenery(looking, passes, targets)
+    scenery = ZoomScenery(looking, passes, targets)
+    scenery.opened = partial(open_zoom_scenery, **arguments)
+    return scenery

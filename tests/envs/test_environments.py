@@ -1,5 +1,7 @@
 """The environments against Gymnasium's own checker, its own vectorised environments, and the annotations of scenes."""
 
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
@@ -255,6 +257,41 @@ def test_invalid_calls_are_refused(sceneries):
         envs.step(np.array([0, 20]))
     with pytest.raises(InputError, match="unknown action 'pixel'"):
         gymnasium.make(IDS["search"], action="pixel")
+
+
+def test_actions_are_those_of_the_space(sceneries):
+    """Policies of Stable-Baselines3 give arrays without a dimension."""
+    env = GazeSearch(sceneries["search"])
+    for action in (np.array(1), np.int32(1), 1, np.array([1]), np.uint64(1), 1.0, np.float32(1), None, "1", -1):
+        env.reset(seed=0)
+        if env.action_space.contains(action):
+            env.step(action)
+        else:
+            with pytest.raises(InputError, match="action: expected a whole number from 0 to 19"):
+                env.step(action)
+    envs = GazeVectorEnv("search", 2, sceneries["search"])
+    envs.reset()
+    envs.step([0, 1])
+    with pytest.raises(InputError, match="actions: expected 2 cells"):
+        envs.step([0.9, 1.7])
+    for mask in ([True], [True, False, True], ["a", "b"], [0.5, 1]):
+        with pytest.raises(InputError, match="reset_mask: expected 2 booleans"):
+            envs.reset(options={"reset_mask": mask})
+    envs.reset(options={"reset_mask": [True, False]})
+    for options in ({"episode": "x"}, {"episode": None}):
+        with pytest.raises(InputError, match=r"episode: expected one of Scenery\.episodes"):
+            env.reset(options=options)
+    with pytest.raises(InputError, match=r"episode: expected one of Scenery\.episodes"):
+        envs.reset(options={"episodes": ["x", "y"]})
+
+
+def test_copies_of_environments_begin_the_same_episodes(sceneries):
+    for env in (
+        GazeSearch(sceneries["search"], belief=True),
+        GazeVectorEnv("exploration", 2, sceneries["exploration"]),
+    ):
+        twin = pickle.loads(pickle.dumps(env))
+        assert equal(env.reset(seed=3)[0], twin.reset(seed=3)[0])
 
 
 def test_ended_environments_stay_idle_until_they_are_reset(sceneries):

@@ -1,5 +1,7 @@
 """Environments with large pictures: the checker, the choices of the zooming agent, and found objects."""
 
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
@@ -172,3 +174,18 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
     monkeypatch.setattr(again.eye, "glance", refuse)
     kept = again.glances(0).see([overview(again.glances(0).lattice)])[0]
     assert torch.equal(kept.show, env.gazes.looks[0].show)
+
+
+def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_scenery):
+    env = ZoomSearch(zoom_scenery)
+    for action in ([0.5, 0.2, 0], np.float32([0.5, 0.2, 0]), np.array([0.5, 0.2, 0]), np.array([0, 0, 1])):
+        assert env.action_space.contains(np.asarray(action))
+        env.reset(seed=0)
+        env.step(action)
+    for action in ([0.5, 0.2], "x", [2, 0, 0], np.full(3, np.nan), None, np.array(["a", "b", "c"])):
+        assert not env.action_space.contains(np.asarray(action))
+        env.reset(seed=0)
+        with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\), each from 0 to 1"):
+            env.step(action)
+    twin = pickle.loads(pickle.dumps(env))
+    assert env.reset(seed=3)[0]["target"] == twin.reset(seed=3)[0]["target"]
