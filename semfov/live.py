@@ -88,11 +88,13 @@ class LivePerception:
         }
         self._check_start()
 
-    def step(self, frame: ImageLike) -> Moment:
+    def step(self, frame: ImageLike, passed: float = 1.0) -> Moment:
         """Look at the next frame.
 
         Args:
             frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
+            passed: number of frames since the last look, this one included, by which a fovea's evidence fades; above 1
+                where frames were lost, such as the seconds between two time stamps times the frames per second.
 
         Returns:
             What is known at this frame: a `FoveaMoment` or a `WindowMoment`.
@@ -108,7 +110,7 @@ class LivePerception:
         if self.how == "auto":
             self.how = picture.kind("auto", self._canvas, photographs=self._photographs)
             self._check_start()
-        return self._episodes[self.how].step(frame)
+        return self._episodes[self.how].step(frame, passed)
 
     def describe(self) -> str:
         """What is done in a few words."""

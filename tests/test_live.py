@@ -111,6 +111,10 @@ def test_dirichlet_parameters_return_to_the_prior_exponentially():
     for _ in range(5):
         last = live.step(torch.full((3, 120, 160), 0.4)).belief.beta
     torch.testing.assert_close(last - 0.25, math.exp(-1) * (first - 0.25), atol=1e-6, rtol=1e-5)
+    later = live.step(torch.full((3, 120, 160), 0.4), passed=2.5).belief.beta
+    torch.testing.assert_close(later - 0.25, math.exp(-1.5) * (first - 0.25), atol=1e-6, rtol=1e-5)
+    with pytest.raises(InputError, match="passed: expected a number"):
+        live.step(torch.full((3, 120, 160), 0.4), passed=math.nan)
 
 
 def test_learned_evidence_returns_to_that_of_a_look_without_detections():

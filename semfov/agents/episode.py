@@ -95,6 +95,7 @@ class Episode(ABC, Generic[_Record]):
         self.targets = targets if len(targets) > 1 else ()
         self.limits = EpisodeLimits() if limits is None else limits
         self.forgetting = None if rate is None else Forgetting(rate)
+        self.passed = 1.0
         self.passes = 0
         self.ending: Ending | None = None
         self._size: tuple[int, int] | None = None
@@ -133,15 +134,21 @@ class Episode(ABC, Generic[_Record]):
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
     @torch.inference_mode()
-    def step(self, frame: ImageLike) -> Moment:
+    def step(self, frame: ImageLike, passed: float = 1.0) -> Moment:
         """Look at the next frame of a stream (`look`), and tell what is known then.
 
         Args:
             frame: the frame.
+            passed: number of frames since the last look, this one included, by which a fovea's evidence fades.
 
         Returns:
             What is known.
+
+        Raises:
+            InputError: `passed` is below 0 or no number.
         """
+        check_number(passed, "passed", 0, 1e9)
+        self.passed = passed
         self.look(frame)
         return self.moment()
 

@@ -201,7 +201,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._first = first_cell(cell_at(start, agent.cells), seed, columns * rows)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None
-        self._outcome = 0
+        self._outcome, self._faded = 0, 0.0
         self._concluded: Decision | None = None
 
     def open(self, image: Tensor) -> Grid:
@@ -250,6 +250,7 @@ class FoveaEpisode(Episode[Scanpath]):
         """Spend a frame of a stream on a look."""
         image = as_image(frame, like=self.eye.sensor.like, argument="frame", color=self.color)[None]
         self._check_size((image.shape[-1], image.shape[-2]))
+        self._faded += self.passed
         if self._verifier is not None:
             self._verifier.wait()
         if self._candidate is not None:
@@ -260,7 +261,8 @@ class FoveaEpisode(Episode[Scanpath]):
             self.open(image)
         else:
             self._image, self._looks.view = image, self.eye.open(image)
-            self._looks.frames = 1 if self._last is None else self.passes - self._last[1]
+            self._looks.frames = self._faded
+        self._faded = 0.0
         watch.lap("open")
         return self._fixate(watch.seconds)
 

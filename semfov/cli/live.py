@@ -62,7 +62,7 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | No
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add:
         try:
             for picture in stream.frames:
-                moment = live.step(picture.image)
+                moment = live.step(picture.image, picture.passed)
                 count += 1
                 if count >= _WARM_UP:
                     ends.append(perf_counter())
@@ -74,7 +74,8 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | No
         except KeyboardInterrupt:
             print("  stopped")
     mean = _rate(count - _WARM_UP, ends[-1] - began) if ends else ""
-    print(f"{count} frame{'' if count == 1 else 's'}{mean and f', {mean} after the first {_WARM_UP}'}")
+    gaps = "".join(f", {number} {what}" for what, number in stream.gaps.items() if number)
+    print(f"{count} frame{'' if count == 1 else 's'}{gaps}{mean and f', {mean} after the first {_WARM_UP}'}")
     return path
 
 

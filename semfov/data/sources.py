@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -21,17 +24,23 @@ PHOTOGRAPHS = (
     *(".gif", ".jp2", ".j2k", ".jpx", ".ppm", ".pgm", ".pnm"),
 )
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
+_PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Seconds between the attempts to open a stream again that broke off."""
+_MOST_FRAMES = 1e9  # of a file; streams state numbers that mean nothing
+_FASTEST = 1000  # frames per second
+_USUAL_RATE = 25.0  # of a stream that does not give its own
 
 _PLAYLIST = b"#EXTM3U"
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 class Picture(NamedTuple):
-    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`."""
+    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`, and frames of a stream that passed since the last."""
 
     name: str
     image: Tensor
     boxes: Tensor | None = None
+    passed: float = 1.0
 
 
 def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
@@ -81,11 +90,12 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
 
 
 class Stream(NamedTuple):
-    """A video or a camera."""
+    """A video or a camera; `gaps` counts the frames that were `lost` and how often it was `reconnected`."""
 
     name: str
     rate: float | None
     frames: Iterator[Picture]
+    gaps: Mapping[str, int] = MappingProxyType({})
 
 
 def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
@@ -106,12 +116,7 @@ def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
         with suppress(OSError), source.open("rb") as file:
             if file.read(len(_PLAYLIST)) == _PLAYLIST:
                 raise DataError(f"{name}: expected a video, got a playlist, which names other files; give these")
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised below
-    try:
-        recorder = _recorder(cv2, source)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    recorder = _recorder(cv2, source)
     if not recorder.isOpened():
         what = "OpenCV reads videos of this format"
         if isinstance(source, int):
@@ -120,9 +125,10 @@ def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
             what = "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
         raise DataError(f"{name}: cannot be opened; check that {what}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
-    frames = _record(recorder, name, most)
+    gaps: Counter[str] = Counter()
+    frames = _record(cv2, recorder, source, name, most, gaps)
     first = next(frames)
-    return Stream(name, rate if 0 < rate < 1000 else None, chain([first], frames))
+    return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
 
 
 def _name(address: str) -> str:
@@ -137,28 +143,64 @@ def _name(address: str) -> str:
 
 def _recorder(cv2: Any, source: str | Path | int) -> Any:
     """OpenCV's reader of a source. Of a camera or a stream it keeps the newest frame alone, where it can."""
-    if isinstance(source, Path):
-        return cv2.VideoCapture(str(source))
-    if isinstance(source, int):
-        recorder = cv2.VideoCapture(source)
-    else:
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
-        recorder = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
-    recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-    return recorder
-
-
-def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
-    """Frames of a stream, RGB bytes."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised by the caller
     try:
-        for number in count():
-            if number == most:
+        if isinstance(source, Path):
+            return cv2.VideoCapture(str(source))
+        if isinstance(source, int):
+            recorder = cv2.VideoCapture(source)
+        else:
+            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
+            recorder = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+        recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        return recorder
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _record(
+    cv2: Any, recorder: Any, source: str | Path | int, name: str, most: int | None, gaps: Counter[str]
+) -> Iterator[Picture]:
+    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again."""
+    total, rate = (float(recorder.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+    whole_file = 0 < total < _MOST_FRAMES
+    read, missed, passed = 0, 0, 1.0
+    try:
+        while read != most:
+            there, pixels = recorder.read()
+            if there:
+                gaps["lost"] += missed
+                picture = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
+                yield Picture(f"{name}, frame {read + gaps['lost']}", picture, passed=passed + missed)
+                read, missed, passed = read + 1, 0, 1.0
+                continue
+            if whole_file and read + gaps["lost"] + missed < total:
+                missed += 1
+                continue
+            if not read:
+                raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
+            began = time.monotonic()
+            if whole_file or isinstance(source, Path) or not _reopened(cv2, recorder, source):
+                # The number of frames that a file states may be off by one.
+                gaps["lost"] += missed if missed > 1 else 0
                 return
-            whole, pixels = recorder.read()
-            if not whole:
-                if not number:
-                    raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
-                return
-            yield Picture(f"{name}, frame {number}", torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
+            gaps["reconnected"] += 1
+            passed = 1 + (time.monotonic() - began) * (rate if 0 < rate < _FASTEST else _USUAL_RATE)
     finally:
         recorder.release()
+
+
+def _reopened(cv2: Any, recorder: Any, source: str | int) -> bool:
+    """Open a camera or a stream again, after pauses that grow; returns whether it is there."""
+    recorder.release()
+    for pause in _PAUSES:
+        time.sleep(pause)
+        again = _recorder(cv2, source)
+        if again.isOpened():
+            again.release()
+            opened = recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG)
+            if opened:
+                recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+                return True
+    return False

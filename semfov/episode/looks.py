@@ -35,7 +35,7 @@ class Sight:
     look: Look
     detections: Callable[[], Detections]
     seconds: dict[str, float]
-    frames: int = 1
+    frames: float = 1
 
 
 class Looks(ABC):
@@ -93,7 +93,7 @@ class LiveLooks(Looks):
     def __init__(self, eye: Eye, view: View, grid: Grid, target: int | None = None) -> None:
         self.eye, self.view, self.grid, self.target = eye, view, grid, target
         self.like = view.canvas
-        self.frames = 1
+        self.frames: float = 1
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""

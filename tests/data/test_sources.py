@@ -1,6 +1,8 @@
 """Pictures from files, folders, videos and embedded scenes, and the errors for unreadable sources."""
 
+import re
 import sys
+from collections import Counter
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from semfov.data import sources
 from semfov.data.sources import embedded_picture, open_stream, picture_files
 from semfov.errors import DataError, InputError
 
@@ -97,6 +100,64 @@ def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(DataError, match="pip install opencv-python-headless"):
         open_stream(broken)
+
+
+def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
+    """Frames of zeros cannot be decoded; the others keep their numbers, and say how much time has passed."""
+    content = bytearray(video.read_bytes())
+    starts = [each.start() for each in re.finditer(rb"00dc....\xff\xd8", content, re.DOTALL)]
+    assert len(starts) == 8
+    for number in (2, 3, 5):
+        length = int.from_bytes(content[starts[number] + 4 : starts[number] + 8], "little")
+        content[starts[number] + 8 : starts[number] + 8 + length] = bytes(length)
+    (tmp_path / "damaged.avi").write_bytes(content)
+    stream = open_stream(tmp_path / "damaged.avi")
+    taken = list(stream.frames)
+    assert [picture.name for picture in taken] == [f"damaged.avi, frame {number}" for number in (0, 1, 4, 6, 7)]
+    assert [picture.passed for picture in taken] == [1, 1, 3, 2, 1]
+    assert stream.gaps == {"lost": 3}
+    (tmp_path / "cut.avi").write_bytes(video.read_bytes()[: starts[3]])
+    stream = open_stream(tmp_path / "cut.avi")
+    assert len(list(stream.frames)) == 3
+    assert stream.gaps["lost"] == 5
+
+
+class Recorder:
+    """OpenCV's reader of a stream that breaks off, and is there again when it is opened for the second time."""
+
+    def __init__(self, parts):
+        self.parts, self.left = parts, list(parts.pop(0))
+
+    def get(self, key):
+        return -1.0
+
+    def set(self, key, value):
+        pass
+
+    def release(self):
+        pass
+
+    def isOpened(self):
+        return bool(self.parts)
+
+    def open(self, *source):
+        self.left = list(self.parts.pop(0))
+        return bool(self.left)
+
+    def read(self):
+        return (True, np.full((6, 8, 3), self.left.pop(0), np.uint8)) if self.left else (False, None)
+
+
+def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    recorder, gaps = Recorder([[1, 2], [], [3, 4]]), Counter()
+    monkeypatch.setattr(sources, "_PAUSES", (0.0, 0.0))
+    monkeypatch.setattr(sources, "_recorder", lambda *_: recorder)
+    taken = list(sources._record(cv2, recorder, "rtsp://camera", "camera", None, gaps))
+    assert [int(picture.image[0, 0, 0]) for picture in taken] == [1, 2, 3, 4]
+    assert gaps == {"reconnected": 1, "lost": 0}
+    assert [picture.passed for picture in taken[:2]] == [1, 1]
+    assert taken[2].passed > 1
 
 
 def test_an_embedded_scene_contains_the_target():
