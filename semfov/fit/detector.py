@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from semfov.agent import ActivePerception
 from semfov.data.coco import category_names
@@ -35,6 +36,9 @@ from semfov.runs.scene_run import digest_of, finish
 from semfov.runs.settings import plain
 from semfov.runs.setup import check_sources, detector_options, make_detector
 from semfov.runs.workers import available_cores
+
+_MOST_FAULTS = 5
+"""Largest number of photographs that a message names."""
 
 _log = logging.getLogger(__name__)
 
@@ -115,6 +119,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     started = time.monotonic()
     print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
+    check_photographs(run)
     folder = _FolderFit(config, run)
     config, results = folder.inputs.config, folder.inputs.results
     counts = class_counts(run, range(len(run.scenes)))
@@ -169,10 +174,28 @@ def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
     return config
 
 
+def _unseen(run: Looking) -> list[int]:
+    """The photographs without stored looks from all cells."""
+    cells = len(run.grid(0))
+    return [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
+
+
+def check_photographs(run: Looking) -> None:
+    """Decode all photographs that will be looked at; raises `DataError` with all that cannot be decoded."""
+    faults = []
+    for index in tqdm(_unseen(run), "decoding photographs", unit="photograph", leave=False, dynamic_ncols=True):
+        try:
+            run.scenes[index]
+        except DataError as error:
+            faults.append(str(error))
+    if faults:
+        more = f", and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
+        raise DataError(f"photographs: {len(faults)} cannot be read: {'; '.join(faults[:_MOST_FAULTS])}{more}")
+
+
 def _seconds_of_looks(run: Looking) -> float:
     """Estimate the seconds that the remaining looks will take, from the time of one look."""
-    cells = len(run.grid(0))
-    left = [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
+    left = _unseen(run)
     if not left:
         return 1.0
     image = run.scenes[left[0]].image[None]

@@ -425,6 +425,17 @@ def test_a_known_network_is_recognised_by_its_checksum(home, monkeypatch):
     assert semfov.load_detector(network).name == "yolox-nano"
 
 
+def test_photographs_that_cannot_be_read_are_named_before_the_first_look(tmp_path, capsys):
+    paths = sorted((write_home(tmp_path) / "photographs").glob("*.png"))[2:4]
+    for path in paths:
+        path.write_bytes(path.read_bytes()[:-40])
+    assert command(arguments(tmp_path)) == 1
+    error = capsys.readouterr().err
+    assert "photographs: 2 cannot be read" in error
+    assert all(path.name in error for path in paths)
+    assert not list((tmp_path / "cache").rglob("*.safetensors"))
+
+
 def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_path, capsys):
     record = json.loads((home / "photographs/instances.json").read_text())
     for category in record["categories"]:
