@@ -29,7 +29,7 @@ from eval.page.curves import OBJECTS
 from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
 from eval.page.findings import findings
-from eval.page.origin import missing, origin
+from eval.page.origin import END, PLACE, missing, origin
 from eval.page.tables import (
     Runs,
     agreement,
@@ -52,10 +52,6 @@ from semfov.runs.command import command
 from semfov.runs.presets import label
 from semfov.runs.workers import shared_processes
 
-_END = "<!-- end -->"
-_PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{_END}", re.DOTALL)
-"""A table of a page, between the comment that names it and the one that ends it."""
-
 
 def results(config: ResultsConfig) -> None:
     """Run the experiments and write the pages."""
@@ -73,7 +69,7 @@ def results(config: ResultsConfig) -> None:
         write_text(page, filled)
         stale += others
     drawn = draw_figures(config.pictures, runs)
-    renewed = [match["name"] for text in texts for match in _PLACE.finditer(text) if match["name"] not in stale]
+    renewed = [match["name"] for text in texts for match in PLACE.finditer(text) if match["name"] not in stale]
     stale += [
         f"{name}.png" for name in (*PAGE_FIGURES, THRESHOLD_FIGURE) if config.pictures / f"{name}.png" not in drawn
     ]
@@ -109,9 +105,9 @@ def _fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
             stale.append(match["name"])
             return match[0]
         source = origin(runs[name].out for name in made.made_of)
-        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), _END))
+        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), END))
 
-    return _PLACE.sub(fill, text), stale
+    return PLACE.sub(fill, text), stale
 
 
 def _page_table(line: str, runs: Runs) -> _PageTable:

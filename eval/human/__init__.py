@@ -4,14 +4,10 @@ Visual search: models from files of scanpaths, random baselines, and semfov's po
 
     python -m eval.human search --people human_scanpaths --files "[elm.json, nnIBS.json]" --pictures "[val2017]"
 
-Free viewing: exploration policies, saliency, centre bias and random gaze, compared with people fixation by fixation:
+Free viewing: densities of fixations from saliency, from the feature maps of detectors and from other people, with and
+without a centre bias and oculomotor biases, on folds of the pictures that they were fitted without:
 
-    python -m eval.human viewing --people fixations.json --data.root images --detector.name yolox-nano
-
-Habits: a noisy choice by a policy's value, a centre bias, saccade length and return, fitted one after another to half
-of the people in half of the pictures, and evaluated on the others; the folder `out` gets the model and a report:
-
-    python -m eval.human habits --root images --fixations fixations.json --out runs/habits
+    python -m eval.human viewing --fixations "[osie/fixations.json]" --pictures "[osie/images]"
 
 To continue a stopped run, give the same command again.
 """
@@ -20,30 +16,14 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from eval.human.habits.fit import HabitsConfig, fit_habits
 from eval.human.search.compare import compare
 from eval.human.search.run import PeopleSearchConfig
-from eval.human.viewing.report import viewing_report
-from eval.human.viewing.rows import halves, score_all
-from eval.human.viewing.run import ViewingConfig, ViewingRun
-from eval.human.viewing.sequences import score_sequences
+from eval.human.viewing import ViewingConfig, viewing
 from semfov.runs.command import run_command
-from semfov.runs.scene_run import finish
-
-
-def viewing(config: ViewingConfig) -> None:
-    """Compare policies with people who view pictures freely."""
-    run = ViewingRun(config)
-    finish(run, "following people")
-    fitted, reported = halves(run)
-    scored = score_all(run, fitted, reported)
-    viewing_report(run, scored, score_sequences(scored, reported), reported)
-
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
     "search": (compare, PeopleSearchConfig),
     "viewing": (viewing, ViewingConfig),
-    "habits": (fit_habits, HabitsConfig),
 }
 
 

@@ -1,11 +1,16 @@
 """Which experiments have run, and of which commit, day and photographs a table is."""
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from eval.comparison.summary import MANIFEST
 from eval.page.tables import Runs
+
+END = "<!-- end -->"
+PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{END}", re.DOTALL)
+"""A table of a page, between the comment that names it and the one that ends it."""
 
 
 def missing(names: Iterable[str], runs: Runs) -> list[str]:

@@ -16,10 +16,10 @@ from eval.page.curves import behind, corrected_signs
 from eval.page.experiments import AT_THRESHOLDS, SCORE_THRESHOLDS, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, draw_figures
 from eval.page.findings import _BASELINES, _FINDINGS, COUNTED, TESTED, VERDICTS, Finding, _Advantage, _Overtaken
-from eval.page.origin import missing, origin
+from eval.page.origin import PLACE, missing, origin
 from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
-from eval.results import _PLACE, _WHOLE, _fill_page, _page_table, results
+from eval.results import _WHOLE, _fill_page, _page_table, results
 from eval.search.run import SearchConfig
 from semfov.errors import DataError, InputError
 from semfov.runs.presets import label
@@ -177,8 +177,8 @@ def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
 @pytest.mark.parametrize("page", ["results", "tables"])
 def test_every_table_of_the_pages_can_be_filled(page, runs):
     text = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
-    assert text.count("<!--") == 2 * len(_PLACE.findall(text))
-    for found in _PLACE.finditer(text):
+    assert text.count("<!--") == 2 * len(PLACE.findall(text))
+    for found in PLACE.finditer(text):
         assert set(_page_table(found["name"], runs).made_of) <= runs.keys()
         assert re.fullmatch(r"[0-9a-f]{7}.*, 2\d{3}-\d\d-\d\d.*, \d+ photographs( and \d+.*)?", found["origin"]), found[
             "name"
@@ -191,7 +191,7 @@ def test_every_table_of_the_pages_can_be_filled(page, runs):
 
 def test_no_table_is_on_both_pages():
     names = [
-        name for page in ("results", "tables") for name, _ in _PLACE.findall((ROOT / f"docs/{page}.md").read_text())
+        name for page in ("results", "tables") for name, _ in PLACE.findall((ROOT / f"docs/{page}.md").read_text())
     ]
     assert len(set(names)) == len(names) > 30
 

@@ -13,19 +13,9 @@ from torch.nn import functional as F
 from semfov import Detector, saliency
 from semfov.data.fixations import Fixations, write_osie
 from semfov.detection import Candidates
-from semfov.fit.gaze import (
-    describe_viewing,
-    events_of,
-    fit_map,
-    fit_oculomotor,
-    folds,
-    log_centre,
-    maps_of,
-    people_score,
-    score,
-    summary_of,
-    viewed,
-)
+from semfov.fit.gaze import GazeFit, describe_viewing, fit_map, fit_oculomotor, maps_of, score, summary_of
+from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
+from semfov.fit.viewing import events_of, features_of, folds, grouped, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 from train.fit_gaze import main
@@ -62,31 +52,34 @@ def people(seed, place, count=6):
     return [Fixations(f"{seed}.png", str(number), each, (80, 60), times) for number, each in enumerate(points)]
 
 
+def viewed(shown):
+    """Pictures `(image, people)` as the fit has them."""
+    source = features_of(Colours("colours", ("none",), (80, 60), stride=4).eval())
+    (made,) = grouped((source.maps(image[None]), some) for image, some in shown)
+    return made
+
+
 @pytest.fixture(scope="module")
 def group():
-    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
-    shown = [(seed, *picture(seed)) for seed in range(24)]
-    (made,) = viewed(detector, [(image, people(seed, place)) for seed, image, place in shown], None)
-    return made
+    return viewed([(image, people(seed, place)) for seed in range(24) for image, place in [picture(seed)]])
 
 
 def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     torch.manual_seed(0)
     fitted, held = folds(len(group), 4, 0)
-    counts = group.counts()
-    model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([counts[torch.as_tensor(fitted)]]))
+    model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     losses = []
-    done = lambda epoch, loss: losses.append(loss)  # noqa: E731
-    fit_map(model, [group], [counts], [fitted], epochs=60, rate=0.02, dropout=0.0, done=done)
+    fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
+    fit_map(model, [group], [fitted], fit, done=lambda epoch, loss: losses.append(loss))
     assert losses[-1] < losses[0] - 1
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)
-    baseline = score(base, group, torch.zeros_like(maps), held, conditional=False)
-    scores = summary_of(score(model, group, maps, held, conditional=False), baseline)
+    (baseline,) = score(base, group, [torch.zeros_like(each) for each in maps], held, conditional=False)
+    scores = summary_of(score(model, group, maps, held, conditional=False)[0], baseline)
     assert scores["gain"] > 1.5
     assert scores["NSS"] > 3
-    fit_oculomotor(model, [group], [maps_of(model, group, fitted)], [fitted], epochs=15, rate=0.1)
-    after = summary_of(score(model, group, maps, held, conditional=True), baseline)
+    fit_oculomotor(model, [group], [maps_of(model, group, fitted)], [fitted], fit, rate=0.1)
+    after = summary_of(score(model, group, maps, held, conditional=True)[0], baseline)
     assert after["gain"] > scores["gain"] - 0.05
     describe_viewing(model, [group])
     assert float(model.duration[0, 0]) == pytest.approx(math.log(200), abs=1e-5)
@@ -97,9 +90,9 @@ def test_scores_equal_the_measures_of_scanpaths(group):
     """Of a picture whose cells are the bins, so that nothing is summed."""
     torch.manual_seed(1)
     model = saliency.FixationDensity({"backbone8": 3}, centre=torch.randn(39, 52)).requires_grad_(False)
-    maps = torch.randn(1, *cells_of(SIZE))
-    scored = score(model, group, maps, [2], conditional=False, raster=(52, 39))[0]
-    log = (maps[0] + model.centre_bias(SIZE)).double()
+    maps = torch.randn(1, 1, *cells_of(SIZE))
+    scored = score(model, group, maps, [2], conditional=False, raster=(52, 39))[0][0]
+    log = (maps[0, 0] + model.centre_bias(SIZE)).double()
     log = log - log.logsumexp((0, 1))
     cell = events_of(group.paths[2], SIZE, cells_of(SIZE)).cell.numpy()
     x, y = cell % 52, cell // 52
@@ -107,25 +100,46 @@ def test_scores_equal_the_measures_of_scanpaths(group):
     np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-4)
 
 
-def test_people_are_scored_by_the_others(group):
-    """Twin: the density of the others of one person by `scipy.ndimage.gaussian_filter`, far from the border."""
-    scored = people_score(group, [5], torch.zeros(39, 52), share=0.05)[0]
-    bits = []
-    for person, path in enumerate(group.paths[5]):
-        counts = np.zeros((30, 40))
+def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
+    """Twin: `scipy.ndimage.gaussian_filter`, far from the border."""
+    density = others_of(group, 5, torch.zeros(39, 52), blur=1.3, share=0.05).exp()
+    for person in range(len(group.paths[5])):
+        counts = np.zeros((39, 52))
         for other, theirs in enumerate(group.paths[5]):
             if other != person:
-                np.add.at(counts, tuple(((theirs[1:].numpy()[:, ::-1] + 0.5) / 2).astype(int).T), 1)
-        density = gaussian_filter(counts, 1.0, mode="constant", truncate=6)
-        density = 0.95 * density / density.sum() + 0.05 / 1200
-        bits += [math.log2(1200 * density[int((y + 0.5) / 2), int((x + 0.5) / 2)]) for x, y in path[1:].tolist()]
-    assert float(scored[2]) == pytest.approx(np.mean(bits), abs=0.05)
+                np.add.at(counts, tuple(((theirs[1:].numpy()[:, ::-1] + 0.5) * 52 / 80).astype(int).T), 1)
+        expected = gaussian_filter(counts, 1.3, mode="constant", truncate=6)
+        expected = 0.95 * expected / expected.sum() + 0.05 / 2028
+        np.testing.assert_allclose(density[person], expected, atol=1e-4)
+
+
+def test_people_are_predicted_by_the_others(group):
+    """A density of other people predicts better than a centre bias, and is not that of a person's own fixations."""
+    fit = GazeFit(saccade_epochs=1)
+    fold = Fold([group], 0, 4)
+    scored = fold.scores(fold.fit(fit, "other people"), fit, "other people")
+    assert summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
+    alone = group.by({"0"})
+    assert float(others_of(alone, 5, torch.zeros(39, 52)).std()) < 1e-6
+
+
+def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monkeypatch):
+    half, others = group.by({"0", "1", "2"}), group.by({"3", "4", "5"})
+    assert {each.subject for some in others.people for each in some} == {"3", "4", "5"}
+    fit = GazeFit(epochs=2, units=4, saccade_epochs=0)
+    store = FoldStore(tmp_path, {"data": "drawn"})
+    fold = Fold([half], 1, 4)
+    first = store.scores("halves", fold, fit, judges=[others])
+    assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
+    monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
+    monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
+    again = store.scores("halves", fold, fit, judges=[others])
+    assert all(torch.equal(first[key], again[key]) for key in first)
 
 
 def test_oculomotor_biases_recover_a_known_saccade_length():
     """People whose saccades are all of one length, in any direction: the fitted bias peaks there."""
     rng = np.random.default_rng(0)
-    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
     shown = []
     for seed in range(12):
         some = []
@@ -138,10 +152,10 @@ def test_oculomotor_biases_recover_a_known_saccade_length():
                     path.append(new)
             some.append(Fixations(f"{seed}", str(n), np.array(path), (80, 60)))
         shown.append((torch.full((3, *SIZE), 0.5), some))
-    (group,) = viewed(detector, shown, None)
+    group = viewed(shown)
     model = saliency.FixationDensity({"backbone8": 3})
-    pictures = [list(range(12))]
-    fit_oculomotor(model, [group], [torch.zeros(12, *cells_of(SIZE))], pictures, epochs=30, rate=0.2)
+    flat = torch.zeros(12, 1, *cells_of(SIZE))
+    fit_oculomotor(model, [group], [flat], [list(range(12))], GazeFit(saccade_epochs=30), rate=0.2)
     path = torch.tensor([[[0.5, 0.4]]])
     places = torch.tensor([[0.5, 0.4]]) + torch.tensor([0.05, 0.15, 0.25, 0.36, 0.5])[:, None] * torch.tensor(
         [0.6, -0.8]
@@ -169,16 +183,30 @@ def test_a_run_writes_a_model_and_a_report(tmp_path, monkeypatch, capsys):
         everyone += [each.resized((160, 120)) for each in people(seed, place, 2)]
     write_osie(tmp_path / "fixations.json", everyone)
     detector = Colours("colours", ("none",), (160, 120), stride=4).eval()
-    monkeypatch.setattr("train.gaze.load_detector", lambda name, **options: detector)
+    monkeypatch.setattr("train.fit_gaze.load_detector", lambda name, **options: detector)
     run = ["--fixations", f"[{tmp_path / 'fixations.json'}]", "--pictures", f"[{tmp_path / 'pictures'}]"]
-    run += ["--sizes", "['160,120']", "--folds", "2", "--epochs", "2", "--units", "4", "--out", str(tmp_path / "out")]
+    run += [
+        "--sizes",
+        "['160,120']",
+        "--folds",
+        "2",
+        "--epochs",
+        "2",
+        "--saccade_epochs",
+        "1",
+        "--units",
+        "4",
+        "--cache",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(run) == 0, capsys.readouterr().err
     model = saliency.FixationDensity.from_pretrained(tmp_path / "out/colours.safetensors")
     assert model.layers == {"backbone8": 3}
     assert model.metadata["training"]["pictures"] == 6
     model.check_compatible(detector)
-    rows = json.loads((tmp_path / "out/folds.json").read_text())
+    rows = json.loads((tmp_path / "out/folds.json").read_text())["1"]
     report = (tmp_path / "out/report.md").read_text()
-    mean = sum(row["map"]["NSS"] * row["pictures"] for row in rows) / 6
-    assert f"{mean:.3f}" in report
-    assert sum(row["pictures"] for row in rows) == 6
+    assert f"{rows['map']['NSS']:.3f}" in report
+    assert rows["all terms"]["pictures"] == 6

@@ -29,7 +29,8 @@ _COCOSEARCH = Array(
         required=("name", "X", "Y"),
     )
 )
-_OSIE = Object(others=Array(Object({"x": _PIXELS, "y": _PIXELS, "duration_ms": _MILLISECONDS}, required=("x", "y"))))
+_SOME = Array(Number(low=-1e6, high=1e6))
+_OSIE = Object(others=Array(Object({"x": _SOME, "y": _SOME, "duration_ms": _MILLISECONDS}, required=("x", "y"))))
 _RUARTE = Object(
     others=Object(
         {
@@ -139,8 +140,8 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
     """Read free-viewing fixations of OSIE from a JSON file.
 
     The file is an object with a list under each picture's name. An item of the list has the `x`, `y` and `duration_ms`
-    of one person. People are numbered from 1 in the order of the list. (The data set itself is a MATLAB file with the
-    same content.)
+    of one person. People are numbered from 1 in the order of the list; one without a fixation is left out. (The data
+    set itself is a MATLAB file with the same content.)
 
     Args:
         path: the file.
@@ -165,7 +166,8 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
     for picture, people in _read(path, _OSIE).items():
         for number, person in enumerate(people):
             who = {"picture": picture, "subject": str(number + 1), "size": size}
-            scanpaths.append(_record(path, f"{picture}[{number}]", person, ("x", "y", "duration_ms"), **who))
+            if person["x"] or person["y"]:
+                scanpaths.append(_record(path, f"{picture}[{number}]", person, ("x", "y", "duration_ms"), **who))
     return warn_of_frames(path, scanpaths)
 
 

@@ -244,7 +244,7 @@ class FixationDensity(Pretrained):
             each = maps[name].to(weight)
             check_shape(each, f"features[{name!r}]", None, channels, None, None)
             shape = (int(each.shape[-2]), int(each.shape[-1]))
-            value = torch.matmul(weight, each.flatten(2)).unflatten(-1, shape)
+            value = F.conv2d(each, weight[..., None, None])
             joined[shape] = joined[shape] + value if shape in joined else value
         hidden = self.shift[:, None, None]
         for shape, value in joined.items():

@@ -82,13 +82,17 @@ class OculomotorBias(nn.Module):
         bias = bias + known * (_interpolated(self.turn, lengths, length) * turns).sum(-2)
         earlier = path[:, :-1].flip(1)[:, :_MEMORY]
         seen = ~earlier[..., 0].isnan()
-        distance = _norm(places[:, None] - torch.where(seen[..., None], earlier, 0.0)[:, None])
+        distance = torch.cdist(
+            torch.where(seen[..., None], earlier, 0.0),
+            places.expand(len(earlier), -1, -1),
+            compute_mode="donot_use_mm_for_euclid_dist",
+        )
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
         tables = torch.cat([self.back, self.back.new_zeros(_AGES, 1)], 1)[ages]
         low, share = _position(near, distance)
-        row = torch.arange(len(tables), device=tables.device)
+        row = torch.arange(len(tables), device=tables.device)[:, None]
         below = tables[row, low]
-        return bias + ((below + (tables[row, low + 1] - below) * share) * seen[:, None]).sum(-1)
+        return bias + ((below + (tables[row, low + 1] - below) * share) * seen[..., None]).sum(1)
 
     def gains(self, number: Tensor) -> Tensor:
         """Gains of the map and of the centre bias.

@@ -5,6 +5,7 @@ Definitions differ between groups, and each function names the group whose defin
 sequences need `pip install semfov[human]`.
 """
 
+from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_borji, auc_judd, auc_shuffled, correlation, kullback_leibler, similarity
@@ -17,6 +18,7 @@ from semfov.metrics.scanpath.performance import (
     scanpath_ratio,
     tfp_auc,
 )
+from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import (
     cell_labels,
     cluster_labels,
@@ -37,10 +39,13 @@ __all__ = [
     "cluster_labels",
     "compare_scanpath",
     "correlation",
+    "direction_distance",
+    "dynamic_time_warping",
     "edit_distance",
     "found_at",
     "information_gain",
     "kullback_leibler",
+    "length_distance",
     "log_density",
     "log_likelihood",
     "mean_performance",
@@ -49,8 +54,11 @@ __all__ = [
     "nss",
     "performance_area",
     "probability_mismatch",
+    "saccades",
+    "scanmatch",
     "scanpath_ratio",
     "sequence_score",
     "similarity",
     "tfp_auc",
+    "time_delay_embedding",
 ]

@@ -85,7 +85,7 @@ def multimatch(
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
-    i, j = _aligned(np.linalg.norm(u[:, None] - v[None], axis=-1))
+    i, j = aligned(np.linalg.norm(u[:, None] - v[None], axis=-1))
     u, v = u[i], v[j]
     diagonal = float(np.hypot(*size))
     turn = np.abs(np.arctan2(u[:, 1], u[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))
@@ -108,7 +108,7 @@ def multimatch(
     )
 
 
-def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of the cheapest path through a matrix, from its end to its start."""
     rows, columns = cost.shape
     total = np.full((rows + 1, columns + 1), np.inf)

@@ -1,1 +1,0 @@
-"""Fits models of how people choose their next fixation."""

@@ -1,0 +1,251 @@
+"""Free viewing: how well models predict where people look, on folds of pictures and people they were fitted without."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from eval.page.origin import END, PLACE
+from semfov.detection.load import load_detector
+from semfov.errors import check
+from semfov.fit.gaze import GazeFit, maps_of
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
+from semfov.fit.viewing import MapSource, Viewed, ViewingData, covering, features_of, look, saliency_of
+from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.io.files import write_text
+from semfov.metrics.averages import standard_error
+from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
+from semfov.runs.config import DetectorConfig, SaliencyModel
+from semfov.runs.settings import Count, Whole
+from semfov.runs.setup import detector_options, prepare_worker
+from semfov.runs.tables import plus_minus, table
+
+_Array = NDArray[np.float64]
+
+PEOPLE = "inter-observer"
+_BANDWIDTH = 0.08
+"""Bandwidth of the clusters of fixations that make up the letters of a sequence, in longer sides of the picture."""
+
+
+@dataclass(frozen=True)
+class ViewingConfig(ViewingData, GazeFit):
+    """Comparison of models with people who view the same pictures without a task.
+
+    Args:
+        detectors: detectors whose feature maps are read, each by name or by settings.
+        saliency: saliency models.
+        studied: number of the detector that is also fitted to half of the people, and to the first data set alone.
+        folds: number of folds; every picture is held out once.
+        sequences: number of held-out pictures of the first data set for which scanpaths are drawn.
+        page: page with places for the tables (`<!-- table viewing -->` to `<!-- end -->`); none: it is left alone.
+        out: folder for the tables, and for the models and scores of the folds.
+    """
+
+    detectors: tuple[str | DetectorConfig, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
+    saliency: tuple[SaliencyModel, ...] = ("itti-koch", "vocus2")
+    studied: Whole = 1
+    folds: Count = 5
+    sequences: Whole = 50
+    page: Path | None = None
+    out: Path = Path("runs/human_viewing")
+
+
+def viewing(config: ViewingConfig) -> None:
+    """Fit all models to the folds of the pictures, and write the tables."""
+    check(len(config.fixations) > 0, "fixations", "at least one file", "none")
+    check(config.studied < len(config.detectors), "studied", "the number of a detector", config.studied)
+    prepare_worker()
+    made: dict[str, Callable[[], MapSource]] = {name: lambda name=name: saliency_of(name) for name in config.saliency}
+    for each in config.detectors:
+        chosen = DetectorConfig(name=each) if isinstance(each, str) else each
+        made[chosen.name] = lambda chosen=chosen: features_of(load_detector(chosen.name, **detector_options(chosen)))
+    data, fit, numbers = config.fingerprint, config.fit, range(config.folds)
+    rows: dict[str, Scores] = {}
+    splits: dict[str, Scores] = {}
+    drawn: dict[str, list[dict[str, float]]] = {}
+    for name, source in made.items():
+        opened = source()
+        groups, store = look(config, opened), FoldStore(config.out, {**opened.what, "data": data})
+        folds = [Fold(groups, number, config.folds) for number in numbers]
+        rows[name] = joined([store.scores(name, fold, fit) for fold in _bar(folds, name)])
+        if name == list(made)[len(config.saliency) + config.studied]:
+            splits[f"{name}: all data sets, all people"] = rows[name]
+            splits[f"{name}: half of the people, scored by the others"] = _by_people(
+                store, name, groups, fit, config.folds
+            )
+            if len(config.fixations) > 1:
+                lone = [Fold(groups, number, config.folds, only=0) for number in numbers]
+                alone = GazeFit(**{**vars(fit), "saccade_epochs": 0})
+                scores = [store.scores(f"{name} first data set", fold, alone) for fold in _bar(lone, "first data set")]
+                splits[f"{name}: the first data set alone"] = joined(scores)
+            if config.sequences:
+                drawn |= _sequences(name, groups, [store.model(name, fold, fit) for fold in folds], config)
+    plain = [_without_maps(group) for group in groups]
+    store = FoldStore(config.out, {"data": data})
+    known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
+    for name, maps in known.items():
+        folds = [Fold(plain, number, config.folds) for number in numbers]
+        rows[name] = joined([store.scores(name, fold, fit, maps) for fold in _bar(folds, name)])
+    tables = {
+        "viewing": viewing_table(rows),
+        "viewing terms": terms_table(rows),
+        "viewing splits": splits_table(splits),
+        "viewing sequences": sequences_table(drawn),
+    }
+    text = "\n".join(["\n".join([f"## {name}", "", *lines, ""]) for name, lines in tables.items()])
+    print(text)
+    written = [config.out / "summary.md"]
+    write_text(written[0], text)
+    if config.page is not None:
+        write_text(config.page, filled(config.page.read_text(encoding="utf-8"), tables))
+        written.append(config.page)
+    print("written:", *(f"  {path}" for path in written), sep="\n")
+
+
+def _bar(folds: Sequence[Fold], name: str) -> Sequence[Fold]:
+    return tqdm(folds, desc=name, unit="fold")  # type: ignore[no-any-return]
+
+
+def _without_maps(group: Viewed) -> Viewed:
+    """The same viewing with a map of zeros alone."""
+    width, height = group.size[1], group.size[0]
+    zeros = torch.zeros(len(group), 1, *cells_of(group.size), dtype=torch.half)
+    return Viewed(covering({"none": zeros}, (height, width)), group.people, group.seconds, group.source)
+
+
+def _by_people(store: FoldStore, name: str, groups: Sequence[Viewed], fit: GazeFit, count: int) -> Scores:
+    """Scores by half of the people on held-out pictures, of models that were fitted to the other half."""
+    scored = []
+    for number in range(count):
+        halves = []
+        for part in (0, 1):
+            order = [sorted({p.subject for some in group.people for p in some}, key=_in_order) for group in groups]
+            halves.append([g.by(every[(number + part) % 2 :: 2]) for g, every in zip(groups, order, strict=True)])
+        scored.append(store.scores(f"{name} half of the people", Fold(halves[0], number, count), fit, judges=halves[1]))
+    return joined(scored)
+
+
+def _in_order(subject: str) -> tuple[int, str]:
+    return (int(subject), "") if subject.isdecimal() else (0, subject)
+
+
+def viewing_table(rows: Mapping[str, Scores]) -> list[str]:
+    """Each map with the centre bias, and with oculomotor biases too, by data set."""
+    sources = sorted({source for _, source in rows[CENTRE]})
+    head = ["", *(f"{figure}, {source + 1}" for source in sources for figure in ("NSS", "AUC", "gain"))]
+    body = [[CENTRE, *(cell for source in sources for cell in _figures(rows[PEOPLE], CENTRE, source))]]
+    for row, words in (("map and centre bias", "{}"), ("all terms", "{}, with oculomotor biases")):
+        for name, scores in rows.items():
+            if (row, sources[0]) in scores and (name, row) != (CENTRE, "map and centre bias"):
+                cells = [cell for source in sources for cell in _figures(scores, row, source)]
+                body.append([words.format(name), *cells])
+    return table([head, *body])
+
+
+def terms_table(rows: Mapping[str, Scores]) -> list[str]:
+    """NSS and gain on the first data set with and without each term."""
+    terms = (*ROWS[False], *ROWS[True])
+    head = ["", *(f"{term}: {figure}" for term in terms for figure in ("NSS", "gain"))]
+    body = []
+    for name, scores in rows.items():
+        if name not in (CENTRE, PEOPLE):
+            figures = [_figures(scores, term, 0) if (term, 0) in scores else ["", "", ""] for term in terms]
+            body.append([name, *(cell for nss, _, gain in figures for cell in (nss, gain))])
+    return table([head, *body])
+
+
+def splits_table(splits: Mapping[str, Scores]) -> list[str]:
+    """The studied detector, by what its model was fitted to."""
+    sources = sorted({source for scores in splits.values() for _, source in scores})
+    head = ["fitted to", *(f"{figure}, {source + 1}" for source in sources for figure in ("NSS", "AUC", "gain"))]
+    body = [
+        [name, *(cell for source in sources for cell in _figures(scores, "map and centre bias", source))]
+        for name, scores in splits.items()
+    ]
+    return table([head, *body])
+
+
+def _figures(scores: Scores, row: str, source: int) -> list[str]:
+    """NSS, AUC and information gain over the centre bias of the data set, with standard errors over pictures."""
+    own, base = scores[row, source].double().numpy(), scores[CENTRE, source].double().numpy()
+    columns = own[:, 0], own[:, 1], own[:, 2] - base[:, 2]
+    return [plus_minus(float(each.mean()), float(standard_error(each)), 3) for each in columns]
+
+
+def filled(page: str, tables: Mapping[str, Sequence[str]]) -> str:
+    """A page with its tables of these names replaced."""
+
+    def fill(match: re.Match[str]) -> str:
+        lines = tables.get(match["name"])
+        return match[0] if lines is None else "\n\n".join((f"<!-- table {match['name']} -->", "\n".join(lines), END))
+
+    return PLACE.sub(fill, page)
+
+
+SEQUENCES = ("sequence score", "MultiMatch", "ScanMatch", "time delay embedding")
+
+
+def _sequences(
+    name: str, groups: Sequence[Viewed], models: Sequence[FixationDensity], config: ViewingConfig
+) -> dict[str, list[dict[str, float]]]:
+    """Measures of drawn scanpaths and of people against the other people, on held-out pictures of the first data set.
+
+    A drawn scanpath has the first fixation and the length of a person's, and is compared with all others' but theirs.
+    """
+    group = groups[0]
+    step = max(1, len(group) // config.sequences)
+    rows: dict[str, list[dict[str, float]]] = {name: [], PEOPLE: []}
+    for picture in tqdm(range(0, len(group), step), desc="sequences", unit="picture"):
+        model = models[picture % config.folds]  # the fold that holds it out
+        terms = {"map": maps_of(model, group, [picture])[0], CENTRE: model.centre_bias(group.size)[None]}
+        paths = group.paths[picture]
+        generator = torch.Generator().manual_seed(picture)
+        start = torch.stack([path[0] for path in paths])
+        made = model.sample(terms, group.size, start, max(map(len, paths)), generator)
+        people = [path.double().numpy() for path in paths]
+        drawn = [one[: len(path)].double().numpy() for one, path in zip(made, paths, strict=True)]
+        rows[name].append(beside_others(drawn, people, group.size))
+        rows[PEOPLE].append(beside_others(people, people, group.size))
+    return rows
+
+
+def beside_others(ours: Sequence[_Array], people: Sequence[_Array], size: tuple[int, int]) -> dict[str, float]:
+    """Means of the measures over pairs of a scanpath and that of another person than its own."""
+    every, width = np.concatenate(people), (size[1], size[0])
+    ends = np.cumsum([0, *map(len, ours), *map(len, people)])
+    labels = cluster_labels(np.concatenate([*ours, every]), every, _BANDWIDTH * max(size)).tolist()
+    words = [labels[start:end] for start, end in pairwise(ends)]
+    pairs = [(i, j) for i in range(len(ours)) for j in range(len(people)) if i != j]
+    values = np.array(
+        [
+            (
+                sequence_score(words[i], words[len(ours) + j]),
+                multimatch(ours[i], people[j], width).mean,
+                scanmatch(_within(ours[i], width), _within(people[j], width), width),
+                time_delay_embedding(ours[i], people[j]) / max(size),
+            )
+            for i, j in pairs
+        ]
+    )
+    return dict(zip(SEQUENCES, np.nanmean(values, 0).tolist(), strict=True))
+
+
+def _within(path: _Array, size: tuple[int, int]) -> _Array:
+    return path.clip(0, np.array(size) - 1)
+
+
+def sequences_table(drawn: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
+    """Means over pictures of the measures of scanpaths against those of other people."""
+    body = []
+    for name, pictures in drawn.items():
+        columns = [np.array([each[measure] for each in pictures]) for measure in SEQUENCES]
+        body.append([name, *(plus_minus(float(c.mean()), float(standard_error(c)), 3) for c in columns)])
+    return table([["", *SEQUENCES], *body])

@@ -1,0 +1,135 @@
+"""Scores of models of where people look, on folds of the pictures that they were fitted without."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from semfov.errors import SemfovError
+from semfov.fit.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
+from semfov.fit.viewing import Viewed, folds, log_centre, others_of
+from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.io.code import modules_digest
+from semfov.io.storage import read_tensors, write_tensors
+from semfov.runs.scene_run import digest_of
+
+Maps = Literal["features", "none", "other people"]
+"""What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
+
+Scores = dict[tuple[str, int], Tensor]
+"""By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
+
+CENTRE = "centre bias"
+ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
+"""Rows by the terms of their models, without and with the scanpath."""
+
+
+class Fold:
+    """The pictures of one of `count` folds, which are held out, and the others, to which models are fitted.
+
+    With `only`, models are fitted to one data set, and scored on all.
+    """
+
+    def __init__(self, groups: Sequence[Viewed], number: int, count: int, only: int | None = None) -> None:
+        self.groups, self.number, self.count, self.only = groups, number, count, only
+        split = [folds(len(group), count, number) for group in groups]
+        self.held = [held for _, held in split]
+        self.fitted = self._of(only, [fitted for fitted, _ in split])
+        self.centres = {
+            source: log_centre(groups, self._of(source, [fitted for fitted, _ in split]))
+            for source in {group.source for group in groups}
+        }
+        """Log density of the centre bias of each data set."""
+
+    def _of(self, source: int | None, pictures: Sequence[list[int]]) -> list[list[int]]:
+        pairs = zip(self.groups, pictures, strict=True)
+        return [some if source in (None, group.source) else [] for group, some in pairs]
+
+    def fit(self, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
+        """The model that is fitted to the other pictures; that of given maps has oculomotor biases alone."""
+        if maps == "features":
+            return fitted_density(fit, self.groups, self.fitted, f"fold {self.number + 1} of {self.count}")
+        # The density of other people holds the centre bias already.
+        centre = log_centre(self.groups, self.fitted) if maps == "none" else torch.zeros(1, 1)
+        model = FixationDensity({"none": 1}, centre=centre)
+        known = [self.given(maps, *each) for each in zip(self.groups, self.fitted, strict=True)]
+        fit_oculomotor(model, self.groups, known, self.fitted, fit)
+        return model.requires_grad_(False)
+
+    def given(self, maps: Maps, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
+        """Maps that are not fitted: flat ones, or the densities of other people."""
+        if maps == "other people":
+            return [others_of(group, each, self.centres[group.source]) for each in pictures]
+        return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
+
+    def scores(
+        self, model: FixationDensity, fit: GazeFit, maps: Maps = "features", judges: Sequence[Viewed] | None = None
+    ) -> Scores:
+        """Scores on the held-out pictures with and without each term, and of the centre bias of each data set.
+
+        `judges` are the same pictures viewed by other people, whose fixations are predicted.
+        """
+        scores: dict[tuple[str, int], list[Tensor]] = {}
+        for group, seen, some in zip(self.groups, judges or self.groups, self.held, strict=True):
+            known = maps_of(model, group, some) if maps == "features" else self.given(maps, group, some)
+            bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
+            found = {CENTRE: score(bias, seen, self.given("none", group, some), some, conditional=False)[0]}
+            for conditional, names in ROWS.items():
+                if fit.saccade_epochs or not conditional:
+                    scored = score(model, seen, known, some, conditional=conditional, without=((CENTRE,), ()))
+                    found |= dict(zip(names, scored, strict=True))
+            for name, each in found.items():
+                scores.setdefault((name, group.source), []).append(each)
+        return {key: torch.cat(parts) for key, parts in scores.items()}
+
+
+class FoldStore:
+    """Models of folds and their scores in a folder, each computed once.
+
+    A change of the data, of the settings or of the program computes them anew.
+    """
+
+    def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
+        self.folder, code = folder, modules_digest("semfov.fit.gaze", "semfov.gaze.saliency", __name__)
+        self.what = {**what, "code": code}
+
+    def model(self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
+        """The model of a fold, read or fitted."""
+        key, path = self._place(name, fold, fit, maps)
+        path = path.with_name(f"{path.stem} model.safetensors")
+        try:
+            model = FixationDensity.from_pretrained(path)
+            if model.metadata.get("key") == key:
+                return model.requires_grad_(False)
+        except SemfovError:  # whatever is wrong with the file, it can be fitted again
+            pass
+        model = fold.fit(fit, maps)
+        model.metadata["key"] = key
+        model.save(path)
+        return model
+
+    def scores(
+        self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features", judges: Sequence[Viewed] | None = None
+    ) -> Scores:
+        """The scores of a fold, read or computed."""
+        key, path = self._place(name, fold, fit, maps)
+        kept = read_tensors(path, key)
+        if kept is None:
+            scores = fold.scores(self.model(name, fold, fit, maps), fit, maps, judges)
+            write_tensors(path, key, {f"{row}/{source}": each for (row, source), each in scores.items()})
+            return scores
+        return {(row, int(source)): kept[f"{row}/{source}"] for row, source in (key.rsplit("/", 1) for key in kept)}
+
+    def _place(self, name: str, fold: Fold, fit: GazeFit, maps: Maps) -> tuple[str, Path]:
+        what = {"name": name, "fit": fit.plain(), "fold": [fold.number, fold.count, fold.only], "maps": maps}
+        path = self.folder / f"{name} fold {fold.number + 1} of {fold.count}.safetensors"
+        return digest_of({**self.what, **what}), path
+
+
+def joined(scored: Sequence[Scores]) -> Scores:
+    """The scores of several folds as one."""
+    return {key: torch.cat([fold[key] for fold in scored]) for key in (scored[0] if scored else {})}

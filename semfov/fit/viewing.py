@@ -1,0 +1,310 @@
+"""People who view pictures: their fixations, and the maps of the pictures, each looked at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from semfov.data.fixations import Fixations, by_picture, read_osie, read_table
+from semfov.data.pictures import Pictures
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import FeatureMaps
+from semfov.detection.placement import Placement
+from semfov.errors import check
+from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.io.files import sha256
+from semfov.io.schema import Field, Schema
+from semfov.runs.config import SaliencyModel
+from semfov.runs.saliency_store import SALIENCY_CLASSES
+from semfov.runs.scene_run import digest_of, store_folder
+from semfov.runs.settings import Count, Settings
+from semfov.runs.store import SceneStore, looks_digest
+
+LONGEST = 20
+"""Number of fixations of a scanpath that are used, the first ones."""
+
+_LAYERS = ("backbone8", "backbone16", "backbone32", "head8", "head16", "head32")
+
+
+@dataclass(frozen=True)
+class ViewingData(Settings):
+    """Pictures, and the fixations of people in them.
+
+    Args:
+        fixations: files of fixations, a JSON file of OSIE's form or a table (`.csv`) for each data set.
+        pictures: folder of the pictures of each data set.
+        sizes: `width,height` of the frame of each JSON file (none: 800,600).
+        seconds: time in seconds for which people viewed a picture, for each data set (none: 3).
+        limit: use only the first so many pictures of each data set (none: all).
+        cache: folder for the maps of the pictures (None: the user's cache).
+    """
+
+    fixations: tuple[Path, ...] = ()
+    pictures: tuple[Path, ...] = ()
+    sizes: tuple[str, ...] = ()
+    seconds: tuple[float, ...] = ()
+    limit: Count | None = None
+    cache: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Check that every data set has its pictures."""
+        super().__post_init__()
+        expected = f"a folder for each of {len(self.fixations)} files of fixations"
+        check(len(self.fixations) == len(self.pictures), "pictures", expected, f"{len(self.pictures)}")
+
+    @property
+    def fingerprint(self) -> list[str]:
+        """sha256 of the pictures and of the fixations in them, for each data set."""
+        return [
+            digest_of([Pictures(root, self.people(number), ()).fingerprint, sha256(self.fixations[number])])
+            for number, root in enumerate(self.pictures)
+        ]
+
+    def people(self, number: int) -> dict[str, list[Fixations]]:
+        """The scanpaths of more than one fixation of a data set, by picture."""
+        file = self.fixations[number]
+        width, height = (int(side) for side in _at(self.sizes, number, "800,600").split(","))
+        everyone = read_table(file) if file.suffix == ".csv" else read_osie(file, size=(width, height))
+        return dict([*by_picture(each for each in everyone if len(each) > 1).items()][: self.limit])
+
+
+def _at(values: Sequence[Any], number: int, default: Any) -> Any:
+    return values[number] if number < len(values) else default
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """Pictures of one size with their feature maps `(P, C, h, w)` in half precision, and everybody's scanpaths."""
+
+    features: FeatureMaps
+    people: tuple[tuple[Fixations, ...], ...]
+    seconds: float = 3.0
+    source: int = 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(height, width)` of the pictures."""
+        return self.features.placement.size[1], self.features.placement.size[0]
+
+    def __len__(self) -> int:
+        return len(self.people)
+
+    @cached_property
+    def paths(self) -> list[list[Tensor]]:
+        """For each picture the first fixations of each person, `(n, 2)` in pixels of it."""
+        return [[torch.from_numpy(each.points[:LONGEST]).float() for each in some] for some in self.people]
+
+    def some(self, pictures: Sequence[int]) -> FeatureMaps:
+        """The feature maps of some pictures, in single precision."""
+        place = torch.as_tensor(pictures)
+        return replace(self.features, maps={name: each[place].float() for name, each in self.features.maps.items()})
+
+    def by(self, subjects: Collection[str]) -> Viewed:
+        """The same pictures, viewed by some of the people."""
+        some = tuple(tuple(each for each in people if each.subject in subjects) for people in self.people)
+        return replace(self, people=some)
+
+    @cached_property
+    def counts(self) -> Tensor:
+        """Numbers of fixations, without the first of each path, in the cells of each picture, `(P, rows, columns)`."""
+        rows, columns = cells_of(self.size)
+        return torch.stack([_counted(paths, self.size, (rows, columns)).sum(0) for paths in self.paths])
+
+
+def _counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
+    """Numbers of fixations of each path but its first in cells, `(paths, rows, columns)`."""
+    counts = torch.zeros(len(paths), cells[0] * cells[1])
+    for row, path in zip(counts, paths, strict=True):
+        at = numbers_of_cells(path[1:], size, cells)
+        row.index_add_(0, at, torch.ones(len(at)))
+    return counts.unflatten(1, cells)
+
+
+def numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
+    """Numbers of the cells that hold points; those outside the picture belong to the nearest cell."""
+    x = ((points[:, 0] + 0.5) * (cells[1] / size[1])).floor().clamp(0, cells[1] - 1)
+    y = ((points[:, 1] + 0.5) * (cells[0] / size[0])).floor().clamp(0, cells[0] - 1)
+    return (y * cells[1] + x).long()
+
+
+class MapSource(NamedTuple):
+    """What gives the maps of pictures `(1, 3, H, W)`: their names, and the settings that they depend on."""
+
+    layers: tuple[str, ...]
+    maps: Callable[[Tensor], FeatureMaps]
+    what: Mapping[str, object]
+
+
+def features_of(detector: Detector, layers: Sequence[str] = (), like: Tensor | None = None) -> MapSource:
+    """Feature maps of a detector; without `layers`, of backbone and head as far as it has them in a picture `like`."""
+    if not layers:
+        have = detector.features(torch.zeros(1, 3, 64, 64) if like is None else like).maps
+        layers = tuple(name for name in _LAYERS if name in have) or tuple(have)
+    what = {"detector": detector.settings(), "layers": list(layers)}
+    return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
+
+
+def saliency_of(name: SaliencyModel) -> MapSource:
+    """The saliency map of a model over the cells of pictures, as if it were a feature map."""
+    model = SALIENCY_CLASSES[name]()
+
+    def maps(image: Tensor) -> FeatureMaps:
+        height, width = image.shape[-2:]
+        rows, columns = cells_of((height, width))
+        cells = cell_saliency(model(image), columns, rows).unflatten(1, (1, rows, columns))
+        return covering({name: cells}, (height, width))
+
+    return MapSource((name,), maps, {"saliency": name})
+
+
+def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
+    """Maps `(B, C, rows, columns)` over the whole of pictures of `(height, width)`, without detections."""
+    rows, columns = next(iter(maps.values())).shape[-2:]
+    placement = Placement((size[1], size[0]), (columns / size[1], rows / size[0]), (0, 0))
+    return FeatureMaps(maps, (columns, rows), placement, _nothing())
+
+
+def _nothing() -> Detections:
+    return Detections(torch.zeros(0, 0, 4), torch.zeros(0, 0, 1), torch.zeros(0, 0, dtype=torch.bool))
+
+
+def look(data: ViewingData, source: MapSource) -> list[Viewed]:
+    """Look at all pictures, or read their maps from the cache; those of one data set and size are together."""
+    fields = {
+        name: Field((f"channels of {name}", f"rows of {name}", f"columns of {name}"), torch.float16, finite=False)
+        for name in source.layers
+    }
+    schema = Schema(fields | {"placed": Field((8,), torch.float64)})
+    code = looks_digest("semfov.gaze.saliency", "semfov.detection", __name__)
+    store = SceneStore(store_folder(data.cache) / "viewing", source.what, code, schema)
+    groups = []
+    for number, root in enumerate(data.pictures):
+        people = data.people(number)
+        scenes = Pictures(root, people, ())
+
+        def seen(scenes: Pictures = scenes, people: Mapping[str, list[Fixations]] = people) -> Iterable[_Seen]:
+            for index, name in enumerate(tqdm(scenes.ids, desc="looking", unit="picture")):
+                digest = scenes.digest(index)
+                kept = store.read(digest)
+                if kept is None:
+                    kept = _packed(source.maps(scenes[index].image[None]))
+                    store.write(digest, kept)
+                yield _unpacked(kept), people[str(name)]
+
+        groups += grouped(seen(), _at(data.seconds, number, 3.0), number)
+    return groups
+
+
+_Seen = tuple[FeatureMaps, Sequence[Fixations]]
+
+
+def _packed(features: FeatureMaps) -> dict[str, Tensor]:
+    place = features.placement
+    placed = [*place.size, *place.scale, *place.offset, *features.canvas]
+    halves = {name: each[0].half() for name, each in features.maps.items()}
+    return halves | {"placed": torch.tensor(placed, dtype=torch.float64)}
+
+
+def _unpacked(tensors: Mapping[str, Tensor]) -> FeatureMaps:
+    width, height, across, down, left, top, *canvas = tensors["placed"].tolist()
+    placement = Placement((int(width), int(height)), (across, down), (left, top))
+    maps = {name: each[None] for name, each in tensors.items() if name != "placed"}
+    return FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing())
+
+
+def grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:
+    """Pictures of one data set with the scanpaths in them, by the size of the pictures."""
+    kept: dict[Any, list[_Seen]] = {}
+    with torch.inference_mode():
+        for features, people in seen:
+            size = features.placement.size
+            moved = tuple(each.resized(size) for each in people)
+            kept.setdefault((features.placement, features.canvas), []).append((features, moved))
+    groups = []
+    for several in kept.values():
+        first = several[0][0]
+        maps = {name: torch.cat([features.maps[name].half() for features, _ in several]) for name in first.maps}
+        people = tuple(tuple(some) for _, some in several)
+        groups.append(Viewed(replace(first, maps=maps, detections=_nothing()), people, seconds, source))
+    return groups
+
+
+class Events(NamedTuple):
+    """Fixations to be predicted in a picture, all but the first of each path: those before, cell and person.
+
+    Shapes: before `(E, N, 2)`, NaN before a shorter path; cell `(E,)`; person `(E,)`.
+    """
+
+    before: Tensor
+    cell: Tensor
+    person: Tensor
+
+    def some(self, index: Tensor) -> Events:
+        """Some of the events."""
+        return Events(*(each[index] for each in self))
+
+
+def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Events:
+    """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
+    before, cell, person = [torch.zeros(0, LONGEST - 1, 2)], [], []
+    for number, path in enumerate(paths):
+        before += [
+            F.pad(path[:last].t(), (LONGEST - 1 - last, 0), value=math.nan).t()[None] for last in range(1, len(path))
+        ]
+        cell.append(numbers_of_cells(path[1:], size, cells))
+        person.append(torch.full((len(path) - 1,), number))
+    none = torch.zeros(0, dtype=torch.long)
+    return Events(torch.cat(before), torch.cat([none, *cell]), torch.cat([none, *person]))
+
+
+def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3, share: float = 0.05) -> Tensor:
+    """Log density of the fixations of all other people, for each person of a picture, `(people, rows, columns)`.
+
+    Counts without first fixations are blurred by `blur` cells, and mixed with a `share` of the centre bias `centre`, a
+    log density `(rows, columns)`.
+    """
+    cells = cells_of(group.size)
+    bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
+    counts = _counted(group.paths[picture], group.size, cells)
+    smooth = torch.stack([blurred(each, blur) for each in counts.sum(0) - counts]).flatten(1)
+    total = smooth.sum(1, keepdim=True)
+    density = (1 - share) * torch.where(total > 0, smooth / total, bias) + share * bias
+    return density.log().unflatten(1, cells)
+
+
+def blurred(counts: Tensor, sigma: float) -> Tensor:
+    """Counts `(rows, columns)` blurred by a Gaussian whose weights sum to 1 at the border too."""
+    for axis in (0, 1):
+        place = torch.arange(counts.shape[axis], dtype=counts.dtype)
+        weights = (-(place[:, None] - place).square() / (2 * sigma**2)).softmax(-1)
+        counts = weights @ counts if axis == 0 else counts @ weights.mT
+    return counts
+
+
+def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, blur: float = 2.5) -> Tensor:
+    """Log density of all fixations of data sets, all alike, blurred and mixed with 2 % uniform, on 39 × 52 cells."""
+    total, floor = torch.zeros(39, 52), 0.02
+    for group, some in zip(groups, pictures, strict=True):
+        if len(some):
+            seen = group.counts[torch.as_tensor(some)].sum(0)
+            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
+            total += smooth / smooth.sum()
+    return ((1 - floor) * total / total.sum() + floor / total.numel()).log()
+
+
+def folds(number: int, count: int, fold: int) -> tuple[list[int], list[int]]:
+    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out."""
+    check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
+    held = [*range(fold, number, count)]
+    return [each for each in range(number) if each not in set(held)], held

@@ -1,0 +1,136 @@
+"""Scanpaths as sequences of places, aligned by distance: ScanMatch, dynamic time warping, time delay embedding."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semfov.errors import check, check_number, check_whole
+from semfov.metrics.scanpath.multimatch import aligned
+from semfov.metrics.scanpath.sequence import cell_labels
+
+_Array = NDArray[np.float64]
+
+
+def scanmatch(
+    ours: ArrayLike,
+    theirs: ArrayLike,
+    size: tuple[float, float],
+    *,
+    cells: tuple[int, int] = (12, 8),
+    threshold: float = 3.5,
+    gap: float = 0.0,
+    durations: tuple[ArrayLike, ArrayLike] | None = None,
+    bin_ms: float = 50.0,
+) -> float:
+    r"""ScanMatch (Cristino, Mathôt, Theeuwes and Gilchrist, 2010), with a substitution matrix by distance.
+
+    Fixations become letters, the cells of a grid. Needleman and Wunsch's alignment of the two words has the largest
+    sum S, of :math:`\theta - \|c - c'\|` for every pair of letters whose cells c and c' are aligned, in widths of a
+    cell, and of the gap penalty for every other letter.
+
+    .. math:: \frac{S}{\theta \max(n, m)}
+
+    With durations a letter is repeated for every `bin_ms` that the fixation lasts. The defaults are those of the
+    authors' toolbox, which sets θ to twice the standard deviation of people's saccade lengths, in widths of a cell.
+
+    Args:
+        ours: `(n, 2)`, fixations of one scanpath.
+        theirs: `(m, 2)`, fixations of the other, in the same unit.
+        size: `(width, height)` of the picture, in the same unit.
+        cells: columns and rows of the grid.
+        threshold: θ, distance from which on an aligned pair counts against the similarity.
+        gap: what a letter without a partner adds, 0 or less.
+        durations: durations `(n,)` and `(m,)` of the fixations in milliseconds; None takes every fixation once.
+        bin_ms: milliseconds of a letter.
+
+    Returns:
+        The similarity; 1 for equal scanpaths, and at least 0 where `gap` is 0.
+
+    Raises:
+        InputError: a scanpath is empty or leaves the picture, or an argument is out of range.
+
+    >>> scanmatch([[10, 10], [70, 50]], [[10, 10], [70, 50]], (80, 60))
+    1.0
+    """
+    check_number(threshold, "threshold", 1e-6, 1e6)
+    check_number(gap, "gap", -1e6, 0)
+    check_number(bin_ms, "bin_ms", 1e-6, 1e6)
+    words = []
+    for number, path in enumerate((_path(ours, "ours"), _path(theirs, "theirs"))):
+        word = cell_labels(path, *cells, size)
+        if durations is not None:
+            lasting = np.asarray(durations[number], dtype=np.float64)
+            check(lasting.shape == word.shape, "durations", f"{len(word)} numbers", lasting.shape)
+            word = word.repeat(np.maximum(1, np.round(lasting / bin_ms)).astype(np.int64))
+        words.append(np.stack([word % cells[0], word // cells[0]], 1))
+    a, b = words
+    gain = threshold - np.linalg.norm(a[:, None] - b[None], axis=-1)
+    best = np.zeros((len(a) + 1, len(b) + 1))
+    best[:, 0], best[0] = gap * np.arange(len(a) + 1), gap * np.arange(len(b) + 1)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            best[i + 1, j + 1] = max(best[i, j] + gain[i, j], best[i, j + 1] + gap, best[i + 1, j] + gap)
+    return float(best[-1, -1] / (threshold * max(len(a), len(b))))
+
+
+def dynamic_time_warping(ours: ArrayLike, theirs: ArrayLike) -> float:
+    r"""Dynamic time warping of two scanpaths (Berndt and Clifford, 1994): the sum along the cheapest alignment.
+
+    .. math:: \min_{A} \sum_{(i, j) \in A} \|p_i - q_j\|
+
+    An alignment leads from the pair of first fixations to that of the last ones, by steps to the next fixation of one
+    scanpath or of both.
+
+    Args:
+        ours: `(n, 2)`, fixations of one scanpath.
+        theirs: `(m, 2)`, fixations of the other, in the same unit.
+
+    Returns:
+        The sum of distances, in the unit of the points; 0 for equal scanpaths.
+
+    Raises:
+        InputError: a scanpath is empty, or fixations are not points.
+
+    >>> dynamic_time_warping([[0, 0], [3, 0]], [[0, 0], [0, 0], [3, 4]])
+    4.0
+    """
+    a, b = _path(ours, "ours"), _path(theirs, "theirs")
+    cost = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    return float(cost[aligned(cost)].sum())
+
+
+def time_delay_embedding(ours: ArrayLike, theirs: ArrayLike, *, length: int = 3) -> float:
+    r"""Distance of scanpaths by time delay embedding (Wang, Chen, Wang, Jiang, Fang and Yao, 2011).
+
+    Every run of k successive fixations of ours is compared with the run of theirs that is closest to it.
+
+    .. math:: \frac1{n - k + 1} \sum_i \min_j \frac1k \big\| (p_i, \ldots, p_{i+k-1}) - (q_j, \ldots, q_{j+k-1}) \big\|
+
+    Args:
+        ours: `(n, 2)`, fixations of one scanpath, such as a model's.
+        theirs: `(m, 2)`, fixations of the other, such as a person's, in the same unit.
+        length: k, number of fixations of a run.
+
+    Returns:
+        The mean distance, in the unit of the points; NaN where a scanpath has fewer than k fixations.
+
+    Raises:
+        InputError: a scanpath is empty, fixations are not points, or k is below 1.
+
+    >>> time_delay_embedding([[0, 0], [1, 0]], [[9, 9], [0, 0], [1, 2]], length=2)
+    1.0
+    """
+    check_whole(length, "length", 1, 1000)
+    a, b = _path(ours, "ours"), _path(theirs, "theirs")
+    if min(len(a), len(b)) < length:
+        return float("nan")
+    one, other = (np.stack([path[i : i + length].ravel() for i in range(len(path) - length + 1)]) for path in (a, b))
+    return float((np.linalg.norm(one[:, None] - other[None], axis=-1).min(1) / length).mean())
+
+
+def _path(points: ArrayLike, name: str) -> _Array:
+    path = np.asarray(points, dtype=np.float64)
+    check(path.ndim == 2 and path.shape[1:] == (2,) and len(path) > 0, name, "fixations of shape (n, 2)", path.shape)
+    check(bool(np.isfinite(path).all()), name, "finite numbers", "others; leave these fixations out")
+    return path
