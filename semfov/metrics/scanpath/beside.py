@@ -14,8 +14,10 @@ from semfov.data.fixations.reading import read_fixations
 from semfov.data.fixations.record import Fixations, FixationValues
 from semfov.data.fixations.suspicions import warn_outside
 from semfov.errors import check
+from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.conditional import auc, nss
 from semfov.metrics.scanpath.multimatch import multimatch
+from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
 from semfov.paths import GazeRecord
 
@@ -68,6 +70,11 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> Scanpa
       fixations.
     - `sequence score` (`sequence_score`): of the cells of an 8 × 8 grid in the order of the fixations, 0 to 1.
     - `edit distance` (`edit_distance`): of the same sequences, divided by the longer one; 0 for equal scanpaths.
+    - `ScanMatch` (`scanmatch`): 1 for equal scanpaths.
+    - `time warping` (`dynamic_time_warping`) and `time delay embedding` (`time_delay_embedding`), in longer sides of
+      the picture; 0 for equal scanpaths.
+    - `saccade lengths` (`length_distance`), in longer sides, and `saccade directions` (`direction_distance`), in
+      radians: how far the distributions are apart.
     - `NSS` (`nss`) and `AUC` (`auc`): of the fixations in the density of all fixations of the others, blurred by a
       Gaussian of 3 % of the longer side. A person is compared with the density of the other people.
 
@@ -143,6 +150,16 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
 
         return paired(pair)
 
+    def placed(score: Callable[[FixationValues, FixationValues], float]) -> _Measure:
+        def pair(one: FixationValues, other: FixationValues) -> float:
+            a, b = inside(one), inside(other)
+            return score(a, b) if len(a) and len(b) else float("nan")
+
+        return paired(pair)
+
+    def moved(score: Callable[[FixationValues, FixationValues], float], number: int, unit: float) -> _Measure:
+        return lambda points, others: score(saccades([points])[number], saccades(others)[number]) / unit
+
     def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
         def whole(points: FixationValues, others: Sequence[FixationValues]) -> float:
             columns, rows = (max(1, round(side * _LONGEST / max(size))) for side in size)
@@ -156,6 +173,11 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
         **{f"MultiMatch {name}": matched(name) for name in ("shape", "direction", "length", "position")},
         "sequence score": spelled(sequence_score),
         "edit distance": spelled(lambda a, b: edit_distance(a, b) / max(len(a), len(b))),
+        "ScanMatch": placed(lambda a, b: scanmatch(a, b, size)),
+        "time warping": placed(lambda a, b: dynamic_time_warping(a, b) / max(size)),
+        "time delay embedding": placed(lambda a, b: time_delay_embedding(a, b) / max(size)),
+        "saccade lengths": moved(length_distance, 0, max(size)),
+        "saccade directions": moved(direction_distance, 1, 1),
         "NSS": mapped(nss),
         "AUC": mapped(auc),
     }

@@ -23,6 +23,9 @@ def people(count=4, noise=12.0, seed=0):
     return [Fixations("a.jpg", str(n), path, SIZE) for n, path in enumerate(paths)]
 
 
+_DISTANCES = {"edit distance", "time warping", "time delay embedding", "saccade lengths", "saccade directions"}
+
+
 def test_measures_of_pairs_are_means_over_people():
     mine, *others = people(4)
     table = compare_scanpath(mine, others)
