@@ -240,10 +240,6 @@ SHARES = {
     },
     "docs/pan-tilt.md": {"a tenth of its field of view": "a rule"},
     "docs/guides/live.md": {"three quarters of its width": "how the videos were made"},
-    "docs/measurements/human.md": {
-        "a fifth of the NSS difference": ("0.365", "1.739"),
-        "a quarter together with VOCUS2": ("0.446", "1.739"),
-    },
     "docs/measurements/zoom.md": {
         "One of four boxes": ("0.250", 1),
         "less than half of themselves": "visibility in the annotations of the street",

@@ -62,9 +62,9 @@ class ExploreConfig(RunConfig):
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
             (kl-calibrated); and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
-            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`,
             `vocus2` or `itti-koch`, each followed by `-raw` or `-calibrated`. With the learned map: `random-learned`,
-            `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
+            `closer-look-learned`, `expected-gain-learned`, `vocus2-learned` and
             `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
     """

@@ -18,12 +18,12 @@ from typing import Any
 
 from eval.human.search.compare import compare
 from eval.human.search.run import PeopleSearchConfig
-from eval.human.viewing import ViewingConfig, viewing
+from eval.human.viewing import ViewingConfig, compare_viewing
 from semfov.runs.command import run_command
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
     "search": (compare, PeopleSearchConfig),
-    "viewing": (viewing, ViewingConfig),
+    "viewing": (compare_viewing, ViewingConfig),
 }
 
 

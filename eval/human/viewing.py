@@ -58,7 +58,7 @@ class ViewingConfig(ViewingData, GazeFit):
     out: Path = Path("runs/human_viewing")
 
 
-def viewing(config: ViewingConfig) -> None:
+def compare_viewing(config: ViewingConfig) -> None:
     """Fit all models to the folds of the pictures, and write the tables."""
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
     check(config.studied < len(config.detectors), "studied", "the number of a detector", config.studied)

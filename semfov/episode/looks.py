@@ -26,8 +26,9 @@ class Sight:
         seconds: time by stage.
         frames: frames of a stream since the look before, including this one.
 
-    >>> from semfov.belief.observers import LandingLook
-    >>> sight = Sight(LandingLook(torch.zeros(1, 4, 1), torch.zeros(1, 4)), lambda: None, {"detect": 0.02})
+    >>> from semfov.belief.observers import SemanticLook
+    >>> look = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
+    >>> sight = Sight(look, lambda: None, {"detect": 0.02})
     >>> sight.seconds
     {'detect': 0.02}
     """

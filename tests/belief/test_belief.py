@@ -6,7 +6,7 @@ import torch
 from semfov import Detections, Grid, InputError
 from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.belief import dirichlet_belief
-from semfov.belief.observers import AnyOf, Landing, LearnedMap, Semantic, Target
+from semfov.belief.observers import AnyOf, LearnedMap, Semantic, Target
 from tests import small
 
 GRID = Grid(4, 3, (80, 60))
@@ -64,7 +64,6 @@ OBSERVERS = {
     "misses": lambda: Semantic(4, misses=small.model().double().requires_grad_(False), memory="closest"),
     "target": target_observer,
     "map": map_observer,
-    "landing": lambda: Landing(3),
     "any of targets": lambda: AnyOf(target_observer(), {1: 0.3, 2: 1.0}),
     "any of a map": lambda: AnyOf(map_observer(), {1: 0.3, 2: 1.0}),
 }
@@ -245,9 +244,9 @@ def test_beliefs_and_looks_of_another_observer_do_not_fade(kind):
     observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
     own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     with pytest.raises(InputError, match=rf"^belief: expected {type(own).__name__}"):
-        observer.fade(seen(Landing(3)), said, 0.5, visited)
+        observer.fade(seen(Semantic(4)), said, 0.5, visited)
     with pytest.raises(InputError, match=rf"^look: expected {type(said).__name__}"):
-        observer.fade(own, Landing(3).weigh(looks(), FIXATIONS, GRID), 0.5, visited)
+        observer.fade(own, Semantic(4).weigh(looks(), FIXATIONS, GRID), 0.5, visited)
 
 
 @pytest.mark.parametrize("kind", ["target"])
@@ -281,7 +280,7 @@ def test_put_replaces_the_beliefs_of_the_given_episodes():
     assert torch.equal(before.beta, rand(4, 3, 2))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in OBSERVERS if kind != "landing"])
+@pytest.mark.parametrize("kind", OBSERVERS)
 def test_fading_by_a_factor_of_one_changes_nothing(kind):
     observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)

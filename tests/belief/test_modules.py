@@ -5,7 +5,7 @@ from functools import partial
 import torch
 
 from semfov.belief import Verification
-from semfov.belief.observers import AnyOf, Landing, LearnedMap, Semantic, Target
+from semfov.belief.observers import AnyOf, LearnedMap, Semantic, Target
 from tests.base_tester import GraphTester, make_testers
 from tests.small import GRID, detections, evidence, look, mapping, model, observing, rand
 
@@ -70,7 +70,6 @@ globals().update(
             "Semantic": observing,
             "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
             "Target": lambda: Target(evidence()),
-            "Landing": lambda: Landing(3),
             "LearnedMap": lambda: LearnedMap(mapping()),
             "AnyOf": lambda: AnyOf(Target(evidence()), {1: 0.3, 2: 1.0}),
             "AnyOfOneMap": lambda: AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0}),

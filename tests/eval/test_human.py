@@ -1,16 +1,16 @@
 """`python -m eval.human` as a user runs it: small, on pictures drawn for the test, with the real detector."""
 
 import csv
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from eval.human import main
+from eval.human.viewing import beside_others, filled
 from semfov import EmbeddedScenes
 from semfov.data.fixations import Fixations, read_table, write_ruarte, write_table
+from semfov.metrics.scanpath import multimatch, time_delay_embedding
 
 pytest.importorskip("rapidfuzz")
 pytest.importorskip("sklearn")
@@ -19,40 +19,25 @@ SIZE = (240, 180)
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Four pictures, five people's fixations in each, and two people's searches with a model's."""
+    """Four pictures, and two people's searches in each with a model's."""
     folder = tmp_path_factory.mktemp("human")
     (folder / "images").mkdir()
     generator = np.random.default_rng(0)
     scenes = EmbeddedScenes(("person", "cup"), count=4, seed=0)
-    viewed, searched = [], {"a": [], "b": [], "model": []}
+    searched = {"a": [], "b": [], "model": []}
     for number in range(4):
         pixels = (scenes[number].image.permute(1, 2, 0) * 255).byte().numpy()
         name = f"{number}.png"
         Image.fromarray(pixels).resize(SIZE).save(folder / "images" / name)
-        for person in range(5):
-            points = generator.uniform(0, np.array(SIZE) - 1, (generator.integers(2, 6), 2))
-            viewed.append(Fixations(name, str(person + 1), points, SIZE))
         for who, found in searched.items():
             points = generator.uniform(0, (320, 180), (4, 2))
             box = (150.0, 60.0, 200.0, 120.0)
             found.append(Fixations(name, who, points, (320, 180), None, "cup", box, bool(generator.random() < 0.7)))
-    write_table(folder / "viewed.csv", viewed)
     (folder / "people").mkdir()
     for who in ("a", "b"):
         write_ruarte(folder / "people" / f"{who}.json", searched[who])
     write_table(folder / "model.csv", searched["model"])
-    write_table(folder / "others.csv", [each for each in viewed if each.subject == "2"])
     return folder
-
-
-def viewing(folder: Path, out: str, *more: str) -> list[str]:
-    return [
-        "viewing", "--people", str(folder / "viewed.csv"), "--data.root", str(folder / "images"),
-        "--belief.columns", "4", "--belief.rows", "3", "--density.columns", "8", "--density.rows", "6",
-        "--density.blurs", "[0, 1]", "--policies", "[kl-calibrated, objects-raw]", "--workers", "1",
-        "--sequences", "[random, vocus2, landing, kl-calibrated]", "--cache", str(folder / "cache"),
-        "--files", f"[{folder / 'others.csv'}]", "--out", str(folder / out), *more,
-    ]  # fmt: skip
 
 
 def rows(path):
@@ -60,45 +45,23 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-@pytest.fixture(scope="module")
-def finished(pictures):
-    assert main(viewing(pictures, "viewing")) == 0
-    return pictures / "viewing"
+def test_tables_are_filled_into_their_places():
+    page = "a\n<!-- table viewing -->\nold\n<!-- end -->\nb\n<!-- table other -->\nkept\n<!-- end -->\n"
+    new = filled(page, {"viewing": ["| new |"]})
+    assert new == page.replace("\nold\n", "\n\n| new |\n\n")
 
 
-@pytest.mark.weights
-def test_every_row_is_present_and_random_rows_are_at_chance(finished):
-    table = {(row["row"], row["group"], row["figure"]): float(row["mean"]) for row in rows(finished / "summary.csv")}
-    names = {"kl-calibrated", "objects-raw", "landing", "vocus2", "itti-koch", "landing + vocus2", "other people"}
-    for name in names:
-        for group in ("alone", "with habits"):
-            assert np.isfinite(table[name, group, "NSS"])
-            assert 0 <= table[name, group, "AUC"] <= 1
-    assert table["random", "alone", "NSS"] == 0
-    assert table["random", "alone", "AUC"] == 0.5
-    assert table["random", "alone", "log likelihood"] == pytest.approx(0, abs=1e-5)
-    assert ("nearby", "with habits", "NSS") in table
-
-
-@pytest.mark.weights
-def test_more_terms_do_not_fit_the_fitted_half_worse(finished):
-    bits = {(row["row"], row["group"]): float(row["bits of the fitted half"]) for row in rows(finished / "weights.csv")}
-    for name in ("kl-calibrated", "landing", "vocus2"):
-        assert bits[name, "with habits"] >= bits["nearby", "with habits"] - 1e-3
-        assert bits[name, "with habits"] >= bits[name, "alone"] - 1e-3
-
-
-@pytest.mark.weights
-def test_figures_come_from_the_held_out_half(finished):
-    written = {row["picture"] for row in rows(finished / "pictures.csv")}
-    assert written == {"1.png", "3.png"}
-    assert len({row["row"] for row in rows(finished / "sequences.csv")}) == 6
-    summary = (finished / "summary.md").read_text()
-    assert "2 pictures" in summary
-    manifest = json.loads((finished / "manifest.json").read_text())
-    assert manifest["command"][:3] == ["python", "-m", "eval.human"]
-    assert (finished / "nss_by_shift.png").stat().st_size > 5000
-    assert {path.name for path in finished.glob("scanpaths_*.png")} == {"scanpaths_1.png", "scanpaths_3.png"}
+def test_scanpaths_are_compared_with_those_of_others():
+    """Equal to the measures of each pair; the same scanpath by the same person is not a pair."""
+    generator = np.random.default_rng(0)
+    people = [generator.uniform(0, (239, 179), (count, 2)) for count in (4, 5, 3)]
+    got = beside_others(people, people, (180, 240))
+    pairs = [(a, b) for a in range(3) for b in range(3) if a != b]
+    expected = np.mean([multimatch(people[a], people[b], (240, 180)).mean for a, b in pairs])
+    assert got["MultiMatch"] == pytest.approx(expected)
+    expected = np.mean([time_delay_embedding(people[a], people[b]) for a, b in pairs]) / 240
+    assert got["time delay embedding"] == pytest.approx(expected)
+    assert beside_others(people[:1], [people[1], people[0]], (180, 240))["sequence score"] == 1
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from torch.nn import functional as F
 
+from eval.human import main as compare
 from semfov import Detector, saliency
 from semfov.data.fixations import Fixations, write_osie
 from semfov.detection import Candidates
@@ -210,3 +211,17 @@ def test_a_run_writes_a_model_and_a_report(tmp_path, monkeypatch, capsys):
     report = (tmp_path / "out/report.md").read_text()
     assert f"{rows['map']['NSS']:.3f}" in report
     assert rows["all terms"]["pictures"] == 6
+    monkeypatch.setattr("eval.human.viewing.load_detector", lambda name, **options: detector)
+    monkeypatch.setattr("eval.human.viewing.saliency_of", lambda name: features_of(detector))
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table viewing -->\n<!-- end -->\n")
+    run = [*run[: run.index("--out")], "--out", str(tmp_path / "viewing"), "--page", str(page)]
+    more = ["--detectors", "[colours]", "--saliency", "[vocus2]", "--studied", "0", "--sequences", "2"]
+    assert compare(["viewing", *run, *more]) == 0, capsys.readouterr().err
+    lines = page.read_text().splitlines()
+    assert [line.split("|")[1].strip() for line in lines if line.startswith("| ")] == [
+        "", "centre bias", "vocus2", "colours", "inter-observer", "vocus2, with oculomotor biases",
+        "colours, with oculomotor biases", "centre bias, with oculomotor biases",
+        "inter-observer, with oculomotor biases",
+    ]  # fmt: skip
+    assert "half of the people" in (tmp_path / "viewing/summary.md").read_text()

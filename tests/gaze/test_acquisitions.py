@@ -129,15 +129,6 @@ def test_a_belief_with_another_number_of_cells_is_refused(name, shape):
         small.values_of(EVERY[name](), torch.ones(shape))
 
 
-def test_evidence_of_objects_equals_the_loop():
-    beta = beliefs().beta
-    got = small.values_of(acquisition.ObjectEvidence(), beta)
-    for episode in range(3):
-        for x in range(12):
-            first, *others = beta[episode, x].tolist()
-            assert float(got[episode, x]) == pytest.approx(sum(others) / (first + sum(others)), rel=1e-6)
-
-
 def test_static_values_need_one_for_each_cell_and_uniform_ones_are_zero():
     assert EVERY["Uniform"]()(beliefs(), visits()).tolist() == [[0.0] * 12] * 3
     one = rand(12)

@@ -39,7 +39,6 @@ def functions(target, model, values):
         "ProbabilityOfImprovement": lambda: a.ProbabilityOfImprovement(model(), GRID),
         "ExpectedAccuracy": lambda: a.ExpectedAccuracy(model(), GRID),
         "CloserLook": lambda: a.CloserLook(GRID),
-        "ObjectEvidence": a.ObjectEvidence,
         "Static": lambda: a.Static(values),
         "Uniform": a.Uniform,
         "SaliencyPrior": lambda: a.SaliencyPrior(a.TargetPosterior(target), values, weight=0.5),

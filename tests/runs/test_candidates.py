@@ -81,7 +81,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
     assert not needs_model(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
     assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
-    without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
+    without = {"random", "closer-look", "saliency", "expected-gain"}
     for name in _valid_policies("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)

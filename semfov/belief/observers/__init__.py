@@ -5,7 +5,6 @@ A look is one fixation with the detections that are seen from there.
 
 from semfov.belief.observers.any_of import AnyBelief, AnyLook, AnyOf
 from semfov.belief.observers.base import Look, Observer
-from semfov.belief.observers.landing import Landing, LandingBelief, LandingLook
 from semfov.belief.observers.learned_map import LearnedMap, MapBelief, MapLook
 from semfov.belief.observers.semantic import CellMemory, Semantic, SemanticLook
 from semfov.belief.observers.target import Target, TargetBelief
@@ -14,9 +13,6 @@ __all__ = [
     "AnyBelief",
     "AnyLook",
     "AnyOf",
-    "Landing",
-    "LandingBelief",
-    "LandingLook",
     "LearnedMap",
     "Look",
     "MapBelief",

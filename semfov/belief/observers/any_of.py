@@ -25,8 +25,8 @@ class AnyLook(Look):
     Attributes:
         inner: looks of the inner observer: one for each class, or a single one about all classes.
 
-    >>> from semfov.belief.observers import LandingLook
-    >>> look = AnyLook((LandingLook(torch.zeros(2, 4, 1), torch.zeros(2, 4)),))
+    >>> from semfov.belief.observers import SemanticLook
+    >>> look = AnyLook((SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4)),))
     >>> look[:1].inner[0].distance.shape
     torch.Size([1, 4])
     """

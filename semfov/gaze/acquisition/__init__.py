@@ -12,7 +12,6 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
-from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
@@ -30,7 +29,6 @@ __all__ = [
     "KLDivergence",
     "NegativeEntropy",
     "NeighbourhoodPosterior",
-    "ObjectEvidence",
     "PlaceInformation",
     "PredictedTargetPosterior",
     "ProbabilityOfImprovement",

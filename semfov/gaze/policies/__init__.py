@@ -19,7 +19,6 @@ from semfov.gaze.policies.exploration import (
     Gain,
     Improvement,
     Negentropy,
-    ObjectSeeking,
     Peaks,
     Surprise,
 )
@@ -52,7 +51,6 @@ __all__ = [
     "Negentropy",
     "Neighbourhood",
     "NonPredictive",
-    "ObjectSeeking",
     "Peaks",
     "Policy",
     "Predictive",

@@ -20,7 +20,6 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
-from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.policies.base import Means, ModelPolicy, Policy, SamplingPolicy
 from semfov.observation.foveal import FovealObservationModel
 
@@ -229,20 +228,3 @@ class Gain(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The expected number of additional correct cells."""
         return ExpectedGain(self.model, grid)
-
-
-class ObjectSeeking(Policy):
-    """Look at objects of any class (`semfov.acquisition.ObjectEvidence`).
-
-    With the observer `semfov.observers.Landing` this is where people look.
-
-    >>> ObjectSeeking()(None, Grid(4, 3, (40, 30)))
-    ObjectEvidence()
-    """
-
-    name = "objects"
-    tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of any object."""
-        return ObjectEvidence()

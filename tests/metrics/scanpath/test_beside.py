@@ -47,9 +47,7 @@ def test_a_person_is_nearer_to_people_than_a_random_scanpath_in_any_size():
     person, random = compare_scanpath(mine, others), compare_scanpath(noise, others)
     for name, worse in random.items():
         assert (
-            (person[name].scanpath < worse.scanpath)
-            if name == "edit distance"
-            else (person[name].scanpath > worse.scanpath)
+            (person[name].scanpath < worse.scanpath) if name in _DISTANCES else (person[name].scanpath > worse.scanpath)
         ), name
         assert person[name].people == worse.people
     smaller = compare_scanpath(mine.resized((400, 300)), others)
