@@ -36,7 +36,8 @@ class FitGazeConfig(ViewingData, GazeFit):
 
     Args:
         detector: the detector whose feature maps are read.
-        layers: names of the feature maps (none: those of backbone and head at strides 8 to 32 that it has).
+        layers: names of the feature maps (none: those of the shipped model, or of backbone and head at
+            strides 8 to 32 that the detector has).
         folds: number of folds for the evaluation (0: none).
         name: name of the model (none: the detector's name).
         out: folder for the model and the report.

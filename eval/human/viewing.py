@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -63,10 +64,9 @@ def compare_viewing(config: ViewingConfig) -> None:
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
     check(config.studied < len(config.detectors), "studied", "the number of a detector", config.studied)
     prepare_worker()
-    made: dict[str, Callable[[], MapSource]] = {name: lambda name=name: saliency_of(name) for name in config.saliency}
-    for each in config.detectors:
-        chosen = DetectorConfig(name=each) if isinstance(each, str) else each
-        made[chosen.name] = lambda chosen=chosen: features_of(load_detector(chosen.name, **detector_options(chosen)))
+    detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
+    made: dict[str, Callable[[], MapSource]] = {name: partial(saliency_of, name) for name in config.saliency}
+    made |= {each.name: partial(_features, each) for each in detectors}
     data, fit, numbers = config.fingerprint, config.fit, range(config.folds)
     rows: dict[str, Scores] = {}
     splits: dict[str, Scores] = {}
@@ -76,7 +76,7 @@ def compare_viewing(config: ViewingConfig) -> None:
         groups, store = look(config, opened), FoldStore(config.out, {**opened.what, "data": data})
         folds = [Fold(groups, number, config.folds) for number in numbers]
         rows[name] = joined([store.scores(name, fold, fit) for fold in _bar(folds, name)])
-        if name == list(made)[len(config.saliency) + config.studied]:
+        if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
             splits[f"{name}: half of the people, scored by the others"] = _by_people(
                 store, name, groups, fit, config.folds
@@ -110,8 +110,12 @@ def compare_viewing(config: ViewingConfig) -> None:
     print("written:", *(f"  {path}" for path in written), sep="\n")
 
 
-def _bar(folds: Sequence[Fold], name: str) -> Sequence[Fold]:
-    return tqdm(folds, desc=name, unit="fold")  # type: ignore[no-any-return]
+def _bar(folds: Sequence[Fold], name: str) -> Iterator[Fold]:
+    yield from tqdm(folds, desc=name, unit="fold")
+
+
+def _features(detector: DetectorConfig) -> MapSource:
+    return features_of(load_detector(detector.name, **detector_options(detector)))
 
 
 def _without_maps(group: Viewed) -> Viewed:

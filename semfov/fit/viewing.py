@@ -22,7 +22,7 @@ from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.gaze.saliency.cells import cell_saliency
-from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema
 from semfov.runs.config import SaliencyModel
@@ -146,10 +146,13 @@ class MapSource(NamedTuple):
     what: Mapping[str, object]
 
 
-def features_of(detector: Detector, layers: Sequence[str] = (), like: Tensor | None = None) -> MapSource:
-    """Feature maps of a detector; without `layers`, of backbone and head as far as it has them in a picture `like`."""
+def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
+    """Feature maps of a detector; without `layers` those of the shipped model, or else of its backbone and head."""
+    shipped = None if layers else FixationDensity.if_shipped(detector.name)
+    if shipped is not None:
+        layers = tuple(shipped.layers)
     if not layers:
-        have = detector.features(torch.zeros(1, 3, 64, 64) if like is None else like).maps
+        have = detector.features(torch.zeros(1, 3, 64, 64)).maps
         layers = tuple(name for name in _LAYERS if name in have) or tuple(have)
     what = {"detector": detector.settings(), "layers": list(layers)}
     return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
@@ -207,6 +210,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
 
 
 _Seen = tuple[FeatureMaps, Sequence[Fixations]]
+"""The maps of a picture, and the fixations in it."""
 
 
 def _packed(features: FeatureMaps) -> dict[str, Tensor]:
@@ -235,8 +239,8 @@ def grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> lis
     for several in kept.values():
         first = several[0][0]
         maps = {name: torch.cat([features.maps[name].half() for features, _ in several]) for name in first.maps}
-        people = tuple(tuple(some) for _, some in several)
-        groups.append(Viewed(replace(first, maps=maps, detections=_nothing()), people, seconds, source))
+        everyone = tuple(tuple(some) for _, some in several)
+        groups.append(Viewed(replace(first, maps=maps, detections=_nothing()), everyone, seconds, source))
     return groups
 
 
