@@ -1,5 +1,6 @@
 """Reading image files of any common format into RGB tensors."""
 
+import logging
 import math
 import warnings
 from collections.abc import Iterator
@@ -26,11 +27,15 @@ FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "BM
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
+UNKNOWN = f"not an image in a format that is read ({', '.join(FORMATS)}); convert it"
+"""What is said of the content of a file that is none of these."""
+
 _SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
 _SMALL = 2**24  # pixels of a picture that may be blank
 _MOST_A_BYTE = 2**11  # pixels; the best of the common packers keeps about a thousand numbers in a byte
 _ORIENTATION_TAG = 0x0112
 _PHOTOMETRIC_TAG = 0x0106
+_SUBFILE, _PAGES = 254, 64  # tag of a TIFF with its first bit for a reduced copy, and pages that are looked through
 # Moves that turn a picture with this orientation upright. All are their own inverse except 6 and 8, which are inverse
 # to each other.
 _MOVES = {
@@ -77,8 +82,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
 
     check_white(white)
     name = f"image {Path(path)}"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
+    with quiet_decoders():
         try:
             with open_pillow(path) as image:
                 check_proportion(image, path)
@@ -92,9 +96,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:
-            raise DataError(
-                f"{name}: not an image in a format that is read ({', '.join(FORMATS)}); convert it"
-            ) from None
+            raise DataError(f"{name}: {UNKNOWN}") from None
         except Image.DecompressionBombError:
             raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; {_SMALLER}") from None
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
@@ -116,6 +118,22 @@ def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
 
 
 @contextmanager
+def quiet_decoders() -> Iterator[None]:
+    """Say nothing of damaged metadata, and of large files, which the limits refuse."""
+    logs = [logging.getLogger(name) for name in ("PIL", "tifffile")]
+    levels = [log.level for log in logs]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for log in logs:
+                log.setLevel(logging.CRITICAL)
+            yield
+        finally:
+            for log, level in zip(logs, levels, strict=True):
+                log.setLevel(level)
+
+
+@contextmanager
 def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
     """The Pillow image of a file in one of `FORMATS`, not decoded yet."""
     from PIL import Image
@@ -125,6 +143,7 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, Image.open(file, formats=[n for n in FORMATS if n in Image.OPEN]) as image:
         if image.format == "TIFF":
+            _seek_picture(image)
             tags: Any = getattr(image, "tag_v2", {})
             side = (tags[322], tags[323]) if 322 in tags else (image.width, tags.get(278, image.height))
             bits = tags.get(258, (1,))
@@ -132,6 +151,15 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
             for count in tags.get(325 if 322 in tags else 279, ()):
                 check_tile(size, count, f"image {Path(path)}")
         yield image
+
+
+def _seek_picture(image: Any) -> None:
+    """Go to the first page of a TIFF that is no reduced copy, such as a thumbnail of another one."""
+    for page in range(1, min(getattr(image, "n_frames", 1), _PAGES) if image.tag_v2.get(_SUBFILE, 0) & 1 else 0):
+        image.seek(page)
+        if not image.tag_v2.get(_SUBFILE, 0) & 1:
+            return
+    image.seek(0)
 
 
 def check_proportion(image: Any, path: str | PathLike[str]) -> None:
@@ -152,8 +180,7 @@ def check_tile(size: int, stored: int, name: str) -> None:
 
 def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about damaged metadata
+    with quiet_decoders():
         try:
             _check_pixels(image.size, name)
             array = _pixels(image, name, upright=True, white=white)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -20,9 +21,12 @@ from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
 PHOTOGRAPHS = (
-    *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".heic", ".heif", ".bmp", ".dib", ".tif", ".tiff"),
-    *(".gif", ".jp2", ".j2k", ".jpx", ".ppm", ".pgm", ".pnm"),
+    *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".apng", ".webp", ".avif", ".avifs", ".heic", ".heif", ".hif"),
+    *(".bmp", ".dib", ".tif", ".tiff", ".gif", ".jp2", ".j2k", ".jpc", ".jpf", ".jpx", ".j2c"),
+    *(".ppm", ".pgm", ".pbm", ".pnm", ".pfm"),
 )
+"""Ends of the names of photographs."""
+
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Seconds between the attempts to open a stream again that broke off."""
@@ -55,6 +59,10 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
         if path.suffix.lower() in PHOTOGRAPHS
         and not any(part.startswith(".") for part in path.relative_to(source).parts)
     )
+    mosaics = [path.name for path in source.iterdir() if path.suffix.lower() == ".vrt"]
+    if mosaics:
+        remedy = "as their files are there, too; name them to look at them"
+        warnings.warn(f"{source}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=2)
     if not files:
         where = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
         expected = f"photographs ({', '.join(PHOTOGRAPHS)}) in {source}, {where}"
@@ -63,8 +71,8 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
 
 
 def _check_there(source: Path) -> None:
-    """Raise `DataError` where a file or folder does not exist."""
-    if not source.exists():
+    """Raise `DataError` where a file or folder does not exist; a link to nothing is one that cannot be read."""
+    if not source.exists() and not source.is_symlink():
         raise DataError(f"picture: no such file or folder: {source}; check the path")
 
 

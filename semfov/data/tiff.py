@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.gdal import MOST_SIDE
-from semfov.data.images import check_tile, open_pillow
+from semfov.data.images import check_tile, open_pillow, quiet_decoders
 from semfov.data.reduction import PixelBox
 from semfov.data.tone import White, bytes_between
 from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
@@ -24,7 +24,8 @@ _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretatio
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
 _JPEG = 7
 _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _METADATA, _NODATA = 259, 262, 274, 42112, 42113  # tags
-_NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(Red|Green|Blue)</Item>')
+_NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
+_ALWAYS = (1, 8, 32946)  # compressions whose decoders are always there
 _PLANES = 2  # planar configuration of channels that are stored one after the other
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
 _INFLATERS: dict[int, Callable[[], Any]] = {
@@ -54,7 +55,10 @@ class TiffPicture(LargePicture):
         with opening(self.path, "opened"):
             self._file = tifffile.TiffFile(path)
             weakref.finalize(self, self._file.close)
-            self._page: Any = self._file.pages[0]
+            pages: Any = self._file.pages
+            # The first page may be a thumbnail of another one.
+            first = (number for number in range(min(len(pages), 64)) if not pages[number].is_reduced)
+            self._page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
         page: Any = self._page
         count = int(page.samplesperpixel)
         kind = "" if page.dtype is None else page.dtype.kind
@@ -76,7 +80,11 @@ class TiffPicture(LargePicture):
         extra = [int(each) for each in page.extrasamples]
         self._alpha = next((kind for kind in extra if kind in (_PREMULTIPLIED, _UNASSOCIATED)), 0)
         colours = count - len(extra)
-        usual = _named_bands(page.tags.get(_METADATA))
+        named = _named_bands(page.tags.get(_METADATA))
+        if self._alpha and named.get("Alpha", 0) == 0 and colours + extra.index(self._alpha) + 1 in named.values():
+            self._alpha = 0  # GDAL names that band otherwise
+        colour = tuple(named[name] for name in ("Red", "Green", "Blue") if name in named)
+        usual = colour if len(colour) == 3 else None
         if usual is None and colours == 3 and page.photometric == _RGB:
             usual = 1, 2, 3
         self._channels = [band - 1 for band in chosen_bands(count, bands, usual, self.path, alpha=bool(self._alpha))]
@@ -85,6 +93,9 @@ class TiffPicture(LargePicture):
         nodata = page.tags.get(_NODATA)
         with opening(self.path, "opened"):
             self._nodata = None if nodata is None else float(str(nodata.value).strip("\0 "))
+        if page.compression not in _ALWAYS:
+            with opening(self.path, "decoded"):
+                self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
         self._tone = tone_of(self, white, self._values, nodata=self._nodata, wide=page.dtype == np.uint16)
         self.nothing = self._colour_of_nothing()
 
@@ -175,16 +186,15 @@ def _taken(tile: NDArray[Any], channels: list[int]) -> NDArray[Any]:
     return tile if channels == [*range(tile.shape[-1])] else tile[..., channels]
 
 
-def _named_bands(metadata: Any) -> tuple[int, ...] | None:
-    """The bands that GDAL's metadata, a tag, name red, green and blue; None where they do not."""
-    named = {name: int(band) + 1 for band, name in _NAMED.findall("" if metadata is None else str(metadata.value))}
-    return (named["Red"], named["Green"], named["Blue"]) if len(named) == 3 else None
+def _named_bands(metadata: Any) -> dict[str, int]:
+    """The bands that GDAL's metadata, a tag, name, from 1, by their names."""
+    return {name: int(band) + 1 for band, name in _NAMED.findall("" if metadata is None else str(metadata.value))}
 
 
 def is_converted(path: str | PathLike[str]) -> bool:
     """Whether a TIFF is turned, or of other colours than grey and RGB, or grey with alpha: Pillow converts these."""
     try:
-        with open_pillow(path) as image:
+        with quiet_decoders(), open_pillow(path) as image:
             tags = getattr(image, "tag_v2", {})
     except Exception:  # files that Pillow does not read are left to other readers
         return False

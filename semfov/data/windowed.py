@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.images import MAX_PIXELS, warn_of_range
+from semfov.data.images import MAX_PIXELS, UNKNOWN, quiet_decoders, warn_of_range
 from semfov.data.reduction import LARGE, OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
 from semfov.data.tone import White, black_and_white, sample_windows
 from semfov.errors import DataError, SemfovError, check
@@ -125,8 +125,7 @@ def tone_of(
 def opening(path: Path, what: str) -> Iterator[None]:
     """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
     check_regular(path, f"image {path}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about damaged metadata and large files
+    with quiet_decoders():
         try:
             yield
         except FileNotFoundError:
@@ -137,5 +136,7 @@ def opening(path: Path, what: str) -> Iterator[None]:
             if type(error).__name__ == "DecompressionBombError":
                 most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
                 raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
+            if type(error).__name__ == "UnidentifiedImageError":
+                raise DataError(f"image {path}: {UNKNOWN}") from None
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None

@@ -43,6 +43,12 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
         raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
     if system is None or affine.is_identity:  # a system alone does not say where the picture lies
         return None
+    try:
+        x, y = transform(system, "EPSG:4326", [affine.c], [affine.f])
+    except Exception:  # a system of its own, such as that of a building site, has no place on earth; of any error
+        return None
+    if not np.isfinite([*x, *y]).all():
+        return None
 
     def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
         column, row = points.T

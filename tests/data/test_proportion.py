@@ -191,3 +191,29 @@ def test_sixteen_bits_with_few_values_are_warned_of(tmp_path, reader, request):
         else:
             with pytest.warns(UserWarning, match=said):
                 read(tmp_path / "a.tif")
+
+
+def test_a_thumbnail_before_the_picture_is_not_the_picture(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    array = pixels(60, 80)
+    for name, turn in (("a.tif", []), ("b.tif", [(274, "H", 1, 3, True)])):
+        with tifffile.TiffWriter(tmp_path / name) as file:
+            file.write(array[::8, ::8], photometric="rgb", subfiletype=1, extratags=turn)
+            file.write(array, photometric="rgb", subfiletype=0, extratags=turn)
+        want = np.moveaxis(np.rot90(array, 2) if turn else array, -1, 0)
+        assert np.array_equal(whole(open_large(tmp_path / name)), want)
+        assert np.array_equal(fovea(tmp_path / name), want)
+
+
+def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8)[..., 0], extratags=[(42113, "s", 0, "none", True)])
+    open_large(tmp_path / "a.tif")
+    many = np.zeros((6, 8, 300), np.uint8)
+    tifffile.imwrite(tmp_path / "b.tif", many, photometric="minisblack", planarconfig="contig")
+    with pytest.warns(UserWarning, match="of 300 bands without names"):
+        open_large(tmp_path / "b.tif")
+    (tmp_path / "c.tif").write_bytes(b"II*\0\x08\0\0\0")
+    with pytest.raises(DataError, match="cannot be opened"):
+        open_large(tmp_path / "c.tif")
+    assert not caplog.records

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from semfov.data import sources
-from semfov.data.sources import embedded_picture, open_stream, picture_files
+from semfov.data.images import FORMATS
+from semfov.data.sources import PHOTOGRAPHS, embedded_picture, open_stream, picture_files
 from semfov.errors import DataError, InputError
 
 SHADES = (20, 90, 160, 230)
@@ -36,6 +37,19 @@ def test_pictures_of_a_file_and_of_a_folder(tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
     assert picture_files(tmp_path / "b.png") == [tmp_path / "b.png"]
     assert picture_files(tmp_path) == [tmp_path / "a.jpg", tmp_path / "b.png"]
+
+
+def test_a_folder_leaves_out_no_photograph_that_is_read_alone(tmp_path):
+    Image.init()
+    registered = Image.registered_extensions().items()
+    read = {end for end, kind in registered if kind in (*FORMATS, "MPO", "DIB")}
+    assert read <= {*PHOTOGRAPHS}
+    for name in ("a.jpg", "b.VRT", "c.jpg"):
+        (tmp_path / name).touch()
+    (tmp_path / "d.jpg").symlink_to(tmp_path / "nothing.jpg")
+    with pytest.warns(UserWarning, match=r"1 mosaics, such as 'b.VRT', are left out"):
+        assert [path.name for path in picture_files(tmp_path)] == ["a.jpg", "c.jpg", "d.jpg"]
+    assert picture_files(tmp_path / "d.jpg") == [tmp_path / "d.jpg"]
 
 
 def test_frames_of_a_video_are_read_in_order(video):
