@@ -146,6 +146,7 @@ KNOWN = {
     "docs/detectors.md": {
         f"({_DETECTOR.threshold}), ({_DETECTOR.iou}, over all classes), ({_DETECTOR.limit})": "code",
         f"{len(COCO_CLASSES)} scores": "code",
+        "take 768 MiB and a pass 10 s": "code, tested with such models",
         "in [0, 1]": "a range",
         "counts 1, a wrong place or a find in a photograph without the target -1, and no find 0": "a rule",
         "91 scores": "COCO's category ids with their gaps",
@@ -178,7 +179,7 @@ KNOWN = {
         "(40 by default)": "code, tested with the agent",
     },
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
-    "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code"},
+    "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code", "in 16 bits": "a type"},
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
     "docs/guides/environments.md": {
         "is 0.05 in searches and 0.01 in explorations, and is 1": "signatures in the reference",
@@ -189,6 +190,7 @@ KNOWN = {
     },
     "docs/guides/live.md": {
         f"{MOST_CLOSER} by default": "code",
+        "for 15 s": "code, tested with a stream that breaks off",
         f"{log(2) / WINDOW_RATE:.0f} by default": "code",
         f"rate, {RATE}": "code",
         "40 of the fitting": "videos of the table",

@@ -40,7 +40,8 @@ VERDICTS = {
     "open": "some difference is beyond two standard errors, and none stands the correction",
     "differs": "the finding is that there is no difference, and there is one",
     "reversed in part": "some differences have the opposite sign, and none that of the finding",
-    "reversed": "every difference has the opposite sign, or behind from the first and never ahead",
+    "reversed": "every difference has the opposite sign, or behind from the first shift on and never ahead",
+    "behind later": "behind at later shifts, and at none ahead beyond the correction",
     "mixed": "both signs, in another order than the finding has them",
 }
 """Verdicts and their meanings; signs are corrected for all differences that are shown."""
@@ -49,9 +50,9 @@ VERDICTS = {
 def _gain_verdict(signs: set[int], expected: int, within: bool) -> str:
     """The verdict on a finding about differences.
 
-    >>> [gain_verdict(signs, 1, False) for signs in ({1}, {1, 0}, {-1}, {-1, 0}, {1, -1}, {0})]
+    >>> [_gain_verdict(signs, 1, False) for signs in ({1}, {1, 0}, {-1}, {-1, 0}, {1, -1}, {0})]
     ['holds', 'holds in part', 'reversed', 'reversed in part', 'mixed', 'open']
-    >>> gain_verdict({0}, 1, True), gain_verdict({0}, 0, True), gain_verdict({1, 0}, 0, False)
+    >>> _gain_verdict({0}, 1, True), _gain_verdict({0}, 0, True), _gain_verdict({1, 0}, 0, False)
     ('level', 'holds', 'differs')
     """
     if signs == {0}:
@@ -64,19 +65,19 @@ def _gain_verdict(signs: set[int], expected: int, within: bool) -> str:
 
 
 def _overtaken_verdict(leads: Sequence[int], trails: Sequence[int], within: bool) -> str:
-    """The verdict on a finding about who leads at first.
+    """The verdict on a finding about who leads at first; shifts are counted from 1.
 
-    >>> overtaken_verdict([1, 2], [9], False), overtaken_verdict([1], [], False), overtaken_verdict([], [4], False)
+    >>> _overtaken_verdict([1, 2], [9], False), _overtaken_verdict([1], [], False), _overtaken_verdict([], [1], False)
     ('holds', 'not overtaken', 'reversed')
-    >>> overtaken_verdict([], [], True), overtaken_verdict([5], [2], False)
-    ('level', 'mixed')
+    >>> _overtaken_verdict([], [], True), _overtaken_verdict([5], [2], False), _overtaken_verdict([], [4], False)
+    ('level', 'mixed', 'behind later')
     """
     if not leads and not trails:
         return "level" if within else "open"
     if not trails:
         return "not overtaken"
     if not leads:
-        return "reversed"
+        return "reversed" if trails[0] == 1 else "behind later"
     return "holds" if leads[-1] < trails[0] else "mixed"
 
 
