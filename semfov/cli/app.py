@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from html import escape
@@ -53,7 +54,10 @@ def serve(options: AppOptions) -> int:
         page = make_page(agent, options.seed)
         address = launched(page, options.host, options.port)
         print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
-        page.block_thread()
+        try:
+            threading.Event().wait()
+        finally:
+            page.close()
     return 0
 
 
@@ -64,7 +68,14 @@ def launched(page: Any, host: str, port: int | None) -> str:
     look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
     page.queue(default_concurrency_limit=1)
     _, address, _ = page.launch(
-        server_name=host, server_port=port, prevent_thread_lock=True, share=False, quiet=True, css=_STYLE, theme=look
+        server_name=host,
+        server_port=port,
+        prevent_thread_lock=True,
+        share=False,
+        quiet=True,
+        show_error=True,
+        css=_STYLE,
+        theme=look,
     )
     return str(address)
 

@@ -69,6 +69,8 @@ def served(agent, tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore")  # those of Gradio and of what it imports
 def test_a_picture_a_search_and_a_click_on_the_width_of_a_telephone(served, photo):
     served.set_input_files("input[type=file]", str(photo))
+    served.get_by_role("button", name="Look", exact=True).click()
+    served.get_by_text("class: expected one to search for, got all classes").wait_for(timeout=60_000)
     served.get_by_label("Class").click()
     served.get_by_role("option", name="red").click()
     served.get_by_role("button", name="Look", exact=True).click()
