@@ -9,7 +9,7 @@ from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import fields
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Literal, TextIO, get_args
+from typing import Any, Literal, TextIO, get_args, get_type_hints
 
 from semfov.agent import ActivePerception
 from semfov.agents.picture import PictureLike
@@ -157,25 +157,30 @@ def run(
     """
     kind = _TASKS[lookup(task, _TASKS, "task")]
     listed = [pictures] if isinstance(pictures, str | PathLike) else list(pictures)
-    check(bool(listed), "pictures", "a picture, a folder, or a list of them", pictures)
+    fits = bool(listed) and all(isinstance(each, str | PathLike) for each in listed)
+    expected = "files, folders or patterns (the methods of an agent take arrays and Pillow images)"
+    check(fits, "pictures", expected, type(listed[0]).__name__ if listed else "none")
     known = {field.name for field in fields(kind)} - {"pictures", "target", "agent", "quiet", "stream"}
     check_options(options, [*known], f"semfov {task}")
     made = agent if isinstance(agent, ActivePerception) else None
-    own = {"detector", "weights", "models", "classes", "device", "half", "sensor"} & options.keys()
-    check(
-        made is None or not own, "agent", f"its kind beside {', '.join(sorted(own))}", "an agent that is made already"
-    )
+    for name in {"detector", "weights", "models", "classes", "device", "half", "sensor"} & options.keys():
+        check(made is None, name, "none beside an agent that is made already", options[name])
     several = options.get("workers", 1) != 1 or options.get("scheduler") is not None
     check(made is None or not several, "workers", "1 for an agent that is made already", options.get("workers"))
-    for name in ("out", "report", "crops", "labels", "weights", "models", "embeddings"):
-        if options.get(name) is not None:
-            options[name] = Path(options[name])
+    hints = get_type_hints(kind)
+    for name, value in options.items():
+        options[name] = Path(value) if value is not None and Path in get_args(hints[name]) else value
     wanted = "a class to search for; task='find' finds all objects"
     check(task != "search" or target is not None, "target", wanted, target)
     if not isinstance(agent, ActivePerception):
         options["agent"] = agent
     if target is not None:
-        options["target"] = target if isinstance(target, str) else ",".join(target)
+        names = [target] if isinstance(target, str) else target
+        fits = isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
+        check(fits, "target", "the name of a class, or several in a list", target)
+        options["target"] = ",".join(names)
+    if isinstance(options.get("draw"), str):
+        options["draw"] = (options["draw"],)
     settings = kind(pictures=tuple(fspath(each) for each in listed), quiet=quiet, **options)
     stream = sys.stdout
     with open(os.devnull, "w") as nothing, redirect_stdout(nothing) if quiet else nullcontext():
