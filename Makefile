@@ -8,7 +8,9 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Tests are rewritten and start many processes: bytecode that is kept halves the time to collect them.
 unexport PYTHONDONTWRITEBYTECODE
 
-NUMERIC := tests/belief tests/decision tests/head tests/observation tests/sensor tests/zoom
+NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
+	$(patsubst %,tests/head/test_%.py,belief modules world) \
+	$(patsubst %,tests/zoom/test_%.py,belief certainty modules networks survey)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup search test numeric lab test-all test-quick gpu coverage mutation docs lint types constraints clean
@@ -52,10 +54,10 @@ test: lint
 	$(PYTEST) -m "not lab and not long"
 
 # Numbers are computed a second time as on a processor without AVX, on one thread: other processors round otherwise.
-# Graphs are traced alike on all of them, and a pretended GPU computes as the CPU does.
+# Graphs are traced alike on all of them, a pretended GPU computes as the CPU does, and agents only combine these numbers.
 numeric: $(STAMP)
 	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not lab and not long and not slow" \
-		-k "not compile and not export and not cuda" $(NUMERIC)
+		-k "not compile and not export and not gradcheck and not cuda" $(NUMERIC)
 
 # Some of these tests build the site.
 lab: $(STAMP)

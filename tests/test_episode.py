@@ -553,7 +553,6 @@ def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
     assert rows == [rest, rest | {"weigh": 0.0}, rest | {"weigh": 0.0}]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["map", "target"])
 def test_beliefs_have_the_device_and_dtype_of_the_looks(kind, dtype, device):
     """Beliefs, values and fixations follow the detections."""

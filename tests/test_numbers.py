@@ -139,10 +139,7 @@ KNOWN = {
         "134 MB": "of copies with at most 2 to the 25th pixels, three bytes each, and a third more",
         f"opset {OPSET}": "code",
     },
-    "docs/head.md": {
-        f"{1000 * _SPEEDS.eye_start:.0f} + {1000 * _SPEEDS.eye:.1f} A": "code",
-        f"{_CONFIRM}": "code",
-    },
+    "docs/head.md": {f"{1000 * _SPEEDS.eye_start:.0f} + {1000 * _SPEEDS.eye:.1f} A": "code", f"{_CONFIRM}": "code"},
     "docs/detectors.md": {
         f"({_DETECTOR.threshold}), ({_DETECTOR.iou}, over all classes), ({_DETECTOR.limit})": "code",
         f"{len(COCO_CLASSES)} scores": "code",
@@ -174,10 +171,7 @@ KNOWN = {
         "δ (1 + r / a)": "a formula",
         f"has {_RINGS} rings of {_WEDGES} receptors, which is {_RINGS * _WEDGES:,} receptors for 307,200": "code",
     },
-    "docs/pan-tilt.md": {
-        "from -1 to 1": "a range",
-        "(40 by default)": "code, tested with the agent",
-    },
+    "docs/pan-tilt.md": {"from -1 to 1": "a range", "(40 by default)": "code, tested with the agent"},
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
     "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code", "in 16 bits": "a type"},
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
@@ -223,17 +217,12 @@ SHARES = {
         "more than half of them were objects": (_OBJECTS[-1], _DETECTIONS[-1]),
         "one in ten at the fovea": (_OBJECTS[0], _DETECTIONS[0]),
     },
-    "docs/detectors.md": {
-        "One in five photographs is held out": "a rule",
-        "one in three if there are fewer": "a rule",
-    },
+    "docs/detectors.md": {"One in five photographs is held out": "a rule", "one in three if there are fewer": "a rule"},
     "docs/words.md": {
         "finds +0.5 ± 0.4, −0.2 ± 0.5 and +0.2 ± 0.2 points": "a study that was removed; the page names the commits",
         "is 0.356 ± 0.051 higher (331 held-out": "a study that was removed; the page names the commits",
     },
-    "docs/decisions/closer_looks.md": {
-        "a third of the photograph": "a setting",
-    },
+    "docs/decisions/closer_looks.md": {"a third of the photograph": "a setting"},
     "docs/sensors.md": {
         "a fifth of the picture": ("142.3", 640),
         "almost nine times as fine": ("166.0", "19.0"),

@@ -58,7 +58,6 @@ def features_by_loop(looks, look, target, cell):
     ]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_features_of_several_classes_equal_a_loop(random_looks, dtype, device):
     centre = torch.tensor([7.0, 7.0])
     assert torch.equal(GRID.centres[0], centre)

@@ -22,7 +22,6 @@ class Recorder(nn.Module):
 
 
 @pytest.mark.parametrize("columns", [1, 2, 6, 12, 24])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, reference, dtype, device, columns):
     said = gathered(dtype=dtype)
     said = type(said)(*(getattr(said, name).to(device) for name in said.__dataclass_fields__))
@@ -61,7 +60,6 @@ def test_blur_matches_scipy(columns, sigma, device):
         np.testing.assert_allclose(blurred.reshape(table.shape), filtered, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_nearness_falls_with_distance(dtype):
     distance = torch.tensor([0.0, 1 / 6, 1 / 3, 1.25, math.inf], dtype=dtype)
     got = nearness(distance)

@@ -168,7 +168,6 @@ def fuse_by_loop(beta, likelihood, footprint, rule):
     return beta
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
 def test_fuse_equals_the_loop(name, dtype):
     torch.manual_seed(0)
@@ -238,7 +237,6 @@ def test_likelihoods_need_one_fixation_for_each_look(shape):
         likelihoods(seen(Grid(4, 3, (100, 60))), torch.zeros(shape), Grid(4, 3, (100, 60)))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
 def test_weights_of_the_footprint_are_exponents_of_the_likelihood(name, dtype):
     """Row by row: λ to the power of its weight, scaled to a largest value of 1."""

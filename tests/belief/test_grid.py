@@ -77,7 +77,6 @@ def test_a_cell_as_a_box_covers_only_itself(size):
     assert torch.equal(grid.footprint(grid.edges.float()), torch.eye(42, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_a_centre_on_the_left_or_upper_border_of_a_box_is_inside_and_on_the_others_outside(dtype):
     """The image is a pixel wide, so that errors of half a pixel would show."""
     grid = Grid(6, 7, torch.tensor([1.0, 0.6], dtype=dtype))
@@ -177,7 +176,6 @@ def test_nan_and_infinity_are_refused_by_name(number):
             call()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [torch.float32, torch.float64])
 def test_results_have_the_dtype_of_the_boxes_and_points(dtype, size):
     grid, boxes = Grid(3, 2, torch.tensor([31.0, 17.0], dtype=size)), torch.tensor([[1.0, 2, 20, 15]], dtype=dtype)

@@ -86,7 +86,6 @@ def test_emptiness_is_finite_for_certain_cells():
     got.sum().backward()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("wide", [False, True], ids=["same for all", "of each"])
 def test_gain_equals_a_loop(toy_map, reference, dtype, wide, device):
     model = toy_map().to(device, dtype)

@@ -287,8 +287,7 @@ def test_scenes_can_be_pickled(scenes):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"min_instances": -1}, {"max_target_area": 0}, {"limit": 0}, {"coverage": "mean"}, {"crowd": "maybe"}],
+    "options", [{"min_instances": -1}, {"max_target_area": 0}, {"limit": 0}, {"coverage": "mean"}, {"crowd": "maybe"}]
 )
 def test_bad_settings(photographs, make_coco, options):
     with pytest.raises(InputError, match=next(iter(options))):

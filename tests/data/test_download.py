@@ -181,10 +181,7 @@ def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkey
     assert tree(tmp_path) == [".download/annotations_trainval2017.zip"]
     monkeypatch.undo()
     get(tmp_path, server.address)
-    assert [path for path, _ in server.requests] == [
-        "/annotations/annotations_trainval2017.zip",
-        "/zips/val2017.zip",
-    ]
+    assert [path for path, _ in server.requests] == ["/annotations/annotations_trainval2017.zip", "/zips/val2017.zip"]
     assert tree(tmp_path) == WHOLE
 
 

@@ -367,11 +367,7 @@ def test_examined_places_are_worth_a_frame_also_when_no_cell_is_worth_a_look():
 
 def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():
     judge, _ = verifier({}, 0.1)
-    for cells, presence, outcome in (
-        ({9: 0.2}, 0.2, "undecided"),
-        ({}, 0.2, "absent"),
-        ({}, 0.6, "undecided"),
-    ):
+    for cells, presence, outcome in (({9: 0.2}, 0.2, "undecided"), ({}, 0.2, "absent"), ({}, 0.6, "undecided")):
         judge.wait()
         now = step(0, cells, [0], presence, Detections.empty(1, 3))
         judge.see(now)

@@ -13,14 +13,7 @@ from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Gri
 from semfov.belief import Belief
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import (
-    Decision,
-    conclude,
-    decide,
-    goal_cells,
-    strength,
-    strongest,
-)
+from semfov.decision import Decision, conclude, decide, goal_cells, strength, strongest
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze.policies import NonPredictive, Random

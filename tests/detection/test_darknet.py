@@ -76,7 +76,6 @@ class PlainDarknet:
 
 
 @pytest.mark.parametrize("version", [(0, 1), (0, 2)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_small_network_equals_the_plain_implementation(small_cfg, write_weights, version, dtype):
     weights = write_weights(version)
     network = Darknet(read_cfg(small_cfg)).to(dtype)

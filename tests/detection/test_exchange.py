@@ -39,7 +39,6 @@ def same(a, b):
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("boxes", "scores", "mask"))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_conversion_to_supervision_and_back_is_lossless(count, dtype):
     seen = some(count, padding=2, dtype=dtype)

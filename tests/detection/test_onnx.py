@@ -176,7 +176,6 @@ MAKERS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", MAKERS)
 def test_score_vectors_of_every_head_equal_a_plain_implementation(make_onnx, kind, dtype):
     outputs, read = MAKERS[kind]()
@@ -260,7 +259,7 @@ def test_options_that_contradict_the_model_are_refused(make_onnx):
         ({"classes": ["cat", "dog"], "head": "yolox"}, "classes: expected 3 names, one for each score, got 2"),
         ({"classes": ["cat", "cat", "dog"]}, "at least one name, all different"),
         ({"head": "yolo"}, "unknown head"),
-        ({}, "classes: expected the names of the model's 3 classes"),
+        ({}, "classes: expected the names of the 3 classes of model"),
         ({"classes": NAMES, "preprocessing": {"colour": "bgr"}}, "unknown preprocessing setting"),
         ({"weights": path}, "unknown ONNX model"),
     ):

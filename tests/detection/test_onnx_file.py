@@ -146,8 +146,7 @@ def test_nanodet_plus_is_recognised_by_content_and_takes_other_sizes(shared, tmp
 
 @pytest.mark.shared
 @pytest.mark.parametrize(
-    ("name", "file"),
-    [("nanodet-plus-m-1.5x", "nanodet_plus_m_1.5x_416.onnx"), ("yolox-nano", "yolox_nano_416.onnx")],
+    ("name", "file"), [("nanodet-plus-m-1.5x", "nanodet_plus_m_1.5x_416.onnx"), ("yolox-nano", "yolox_nano_416.onnx")]
 )
 def test_a_published_model_sees_the_same_objects_at_all_sizes(name, file, shared, tmp_path, monkeypatch):
     from skimage.data import astronaut

@@ -178,11 +178,7 @@ def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
 
 
 @pytest.mark.parametrize(
-    "given",
-    [
-        signature((1, 300, 7)),
-        signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
-    ],
+    "given", [signature((1, 300, 7)), signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300)))]
 )
 def test_outputs_without_score_vectors_are_refused(given):
     with pytest.raises(InputError, match="export"):

@@ -40,7 +40,6 @@ def test_batches_of_any_size_with_fixed_and_dynamic_models(make_onnx, batch, cou
 
 
 @pytest.mark.parametrize("model", [np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_outputs_have_the_dtype_of_the_image(make_onnx, model, dtype):
     base = values(1, 5, 4)
     image = images(1, dtype)

@@ -37,7 +37,6 @@ def test_background_policies_on_computed_examples(policy, classes, objectness, b
     st.floats(0, 1),
     st.sampled_from(["residual", "normalised", "uniform", "none"]),
 )
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_score_vectors_are_points_of_the_simplex(dtype, classes, objectness, policy):
     c = Candidates(
         torch.zeros(1, 4, dtype=dtype), torch.tensor([classes], dtype=dtype), torch.tensor([objectness]).to(dtype)

@@ -43,7 +43,6 @@ OBSERVERS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", OBSERVERS)
 def test_episodes_in_many_scenes_equal_each_episode_run_alone(kind, dtype):
     """Halfway, two episodes move to other scenes, one of which is new and has more detections per look."""

@@ -12,12 +12,7 @@ from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.runs.tables import mean_or_dash, share
 from tests.lab.commands.table import small_run
 
-POLICIES = [
-    "target-evidence",
-    "random gaze",
-    "published belief",
-    "published belief, a detection at the gaze",
-]
+POLICIES = ["target-evidence", "random gaze", "published belief", "published belief, a detection at the gaze"]
 SCORES = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
 REFERENCES = [*SCORES, *PLAIN, "class frequency"]
 

@@ -388,13 +388,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     for name in _page_table("explore-sensor", runs).made_of:
         more = int("200" in name)
         records = [
-            {
-                "policy": policy,
-                "scene": scene,
-                "repetition": 0,
-                "right": [counts[scene] + more] * 21,
-                "object_cells": 5,
-            }
+            {"policy": policy, "scene": scene, "repetition": 0, "right": [counts[scene] + more] * 21, "object_cells": 5}
             for policy, counts in right.items()
             for scene in (0, 1)
         ]

@@ -24,10 +24,7 @@ DEFINITIONS = {
         "bbox": "vision_msgs/BoundingBox2D",
         "id": "string",
     },
-    "vision_msgs/Detection2DArray": {
-        "header": "std_msgs/Header",
-        "detections": "sequence<vision_msgs/Detection2D>",
-    },
+    "vision_msgs/Detection2DArray": {"header": "std_msgs/Header", "detections": "sequence<vision_msgs/Detection2D>"},
     "sensor_msgs/Image": {
         "header": "std_msgs/Header",
         "height": "uint32",

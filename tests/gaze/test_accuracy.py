@@ -43,7 +43,6 @@ def belief_of(model, dtype=torch.float32, device=None):
     return belief, visited
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_gain_is_summed_over_all_cells(model, dtype, device):
     model = model.to(device, dtype)
     belief, visited = belief_of(model, dtype, device)

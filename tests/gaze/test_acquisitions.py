@@ -65,7 +65,6 @@ def one_row(tensors, row):
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_batch_gives_the_values_of_each_episode_alone(name, dtype):
     """Bit for bit, so that results do not depend on how many episodes share a tensor."""
     known = beliefs().map(lambda tensor: tensor.to(dtype))

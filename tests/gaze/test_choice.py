@@ -65,7 +65,6 @@ def test_no_gradient_flows_through_a_choice():
 
 
 @pytest.mark.parametrize("inverse_temperature", [0.0, 0.7, 3.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_softmax_draws_in_proportion_to_exponentials(inverse_temperature, dtype, device):
     count = 40_000
     generator = torch.Generator().manual_seed(4)
@@ -147,7 +146,6 @@ def test_hard_fixations_are_draws_from_the_softmax():
     assert share[2] == 0
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_hard_fixation_has_the_gradient_of_the_soft_one(visited, dtype):
     torch.manual_seed(0)
     centres, noise = GRID.centres.to(dtype), torch.rand(3, CELLS, dtype=dtype)

@@ -115,7 +115,6 @@ def test_predictive_search_by_samples_of_true_likelihoods_equals_non_predictive_
     assert not torch.allclose(acquisition.PredictedTargetPosterior(targets, model)(belief, visited), plain, atol=5e-3)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["KLDivergence", "NegativeEntropy", "PredictedTargetPosterior"])
 def test_episodes_do_not_depend_on_their_batch(name, dtype):
     model, beta = four_classes(dtype), (0.3 + 4 * rand(5, 3, 4, seed=1) ** 2).to(dtype)

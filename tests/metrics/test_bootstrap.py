@@ -40,7 +40,6 @@ def test_error_and_interval_are_those_of_every_possible_sample():
     assert drawn.interval(0.9).tolist() == pytest.approx([low, high])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_error_and_interval_agree_with_scipy_where_every_case_is_a_group(dtype):
     values = torch.randn(80, generator=torch.Generator().manual_seed(0), dtype=torch.float64).exp().to(dtype)
     theirs = bootstrap((values.numpy(),), np.mean, n_resamples=4000, method="percentile", rng=0)

@@ -24,7 +24,6 @@ def ece_by_loop(confidence, correct, bins):
     return total
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_metrics_equal_loops(dtype):
     torch.manual_seed(0)
     p = (3 * torch.randn(500, 4, dtype=dtype)).softmax(1)
@@ -67,7 +66,6 @@ def test_shapes_that_do_not_match_are_refused():
         calibration(torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_equal_loops(dtype, device):
     """Metrics of rare events in numpy, prediction by prediction."""
     generator = np.random.default_rng(0)

@@ -35,7 +35,6 @@ def generative(scores, distance, labels, **settings):
     return model.fit(statistics, **settings)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_trained_model_beats_raw_scores_and_plain_bayes_on_new_detections(dtype):
     train, test = detections(6000, 0, dtype), detections(6000, 1, dtype)
     plain = generative(*train, expected="empirical")

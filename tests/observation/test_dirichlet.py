@@ -191,7 +191,6 @@ def exact_divergence(alpha, other):
 
 
 @pytest.mark.parametrize("size", [1.0, 1e2, 1e4, 1e6])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_large_parameters_do_not_cancel(size, dtype):
     draw = np.random.default_rng(0)
     alpha = torch.tensor(draw.random(81) * size + 0.5).to(dtype)

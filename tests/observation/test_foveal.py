@@ -124,7 +124,6 @@ def test_extreme_scores_neither_overflow_nor_vanish():
     assert got[0].argmax() == 1
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_identity_returns_the_scores(dtype):
     model = FovealObservationModel.identity(CLASSES, EDGES).to(dtype)
     scores, distance = looks(dtype=dtype)

@@ -60,7 +60,6 @@ def test_visibility_is_zero_where_nothing_is_ever_detected():
     assert bool((seen[1:, :2] > 0).all())
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_visibility_falls_as_the_miss_rate_grows(dtype, device):
     rates = torch.linspace(0, 0.95, 8, dtype=dtype)
     missed = torch.stack([torch.full_like(rates, 0.5), *[rates] * 3])

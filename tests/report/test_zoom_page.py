@@ -131,9 +131,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     )
     glances = (replace(first, detections=seen), *zoom_path.glances[1:])
     data = zoom_data(
-        replace(zoom_path, candidates=objects, decision=None, glances=glances),
-        large_picture,
-        name="crowd",
+        replace(zoom_path, candidates=objects, decision=None, glances=glances), large_picture, name="crowd"
     )
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page

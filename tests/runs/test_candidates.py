@@ -131,8 +131,7 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2")
     every = SearchConfig(
-        policies=("random", guided, "predictive-raw"),
-        belief=BeliefConfig(model="mine", target_model="sought"),
+        policies=("random", guided, "predictive-raw"), belief=BeliefConfig(model="mine", target_model="sought")
     )
     models = load_models(every, "search", eye)
     assert models == _Models("observation", TargetEvidence)

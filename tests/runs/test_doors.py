@@ -6,8 +6,6 @@ import pytest
 import torch
 import yaml
 
-from semfov import load_detector
-from semfov.data.scenes import EmbeddedScenes
 from semfov.detection import Selection
 from semfov.errors import InputError
 from semfov.fit.tempering import FitTemperingConfig
@@ -46,20 +44,6 @@ def test_invalid_selections_are_refused(wrong):
 def test_invalid_strides_are_refused(stride):
     with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
         small.Fixed(stride=stride)
-
-
-@pytest.mark.weights
-def test_invalid_strides_and_thresholds_are_refused_when_a_detector_is_loaded():
-    with pytest.raises(InputError, match=r"^stride: expected None or a multiple of 32, got 'auto'"):
-        load_detector("yolov3-tiny", stride="auto")
-    with pytest.raises(InputError, match=r"^threshold: expected a number from 0 to 1, got 2"):
-        load_detector("yolov3-tiny", threshold=2)
-
-
-def test_invalid_seeds_and_counts_of_embedded_scenes_are_refused():
-    for wrong in ({"seed": -1}, {"count": 0}):
-        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
-            EmbeddedScenes(("cup",), **wrong)
 
 
 def test_unused_settings_are_no_options_and_are_not_written(capsys):
@@ -106,14 +90,7 @@ def test_settings_out_of_their_range_are_refused_by_name(config, name, base, all
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--protocol.batch", "0"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got 0"),
-        (["--protocol.batch", "-1"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got -1"),
-        (["--protocol.starts", "0"], "protocol.starts: expected a whole number from 1 to 10,000, got 0"),
-        (["--protocol.seed", "-1"], "protocol.seed: expected a whole number from 0 to"),
         (["--protocol.shifts", "-1"], "protocol.shifts: expected a whole number from 0 to 10,000, got -1"),
-        (["--detector.threshold", "2"], "detector.threshold: expected a number from 0 to 1, got 2"),
-        (["--detector.iou", "-0.1"], "detector.iou: expected a number from 0 to 1, got -0.1"),
-        (["--belief.columns", "0"], "belief.columns: expected a whole number from 1 to 200, got 0"),
         (["--sensor.sigma", "0"], "sensor.sigma: expected a number above 0"),
         (["--workers", "0"], "workers: expected a whole number from 1 to 1,024, got 0"),
         (

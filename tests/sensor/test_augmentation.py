@@ -16,7 +16,6 @@ from tests.small import draw
 
 
 @pytest.mark.parametrize("settings", [{}, {"levels": 3, "growth": 1.0, "convention": "opencv"}])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_view_is_foveated_at_the_drawn_fixations(settings, dtype, device):
     image = draw(3, 3, 40, 56, dtype=dtype, device=device)
     augment = RandomFoveation((5.0, 9.0), p=1.0, **settings)

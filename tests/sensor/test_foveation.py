@@ -213,7 +213,6 @@ def test_learnable_sigma():
     assert abs(sensor.sigma.item() - 9.0) < 0.5
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_and_device_follow_a_large_image(dtype, device):
     image = draw(1, 3, 170, 164, device=device)
     expected = foveate(image, torch.tensor([9.0, 8.0], device=device), sigma=6.0)

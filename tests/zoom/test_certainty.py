@@ -101,7 +101,6 @@ def plain_facts(kept, boxes, scores, labels, looks, cut, latest):
 
 
 @pytest.mark.parametrize("latest", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_facts_equal_a_plain_loop(latest, dtype):
     generator = torch.Generator().manual_seed(3)
     count = 60

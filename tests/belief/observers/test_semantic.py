@@ -141,7 +141,6 @@ def test_a_belief_keeps_its_dtype_whatever_the_dtype_of_the_look(looks):
             assert observer.update(start, said).beta.dtype == other
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_a_look_has_the_dtype_of_the_scores(looks, dtype):
     seen = Detections(looks.boxes, looks.scores.to(dtype), looks.mask)
     for fixations in (FIXATIONS, FIXATIONS.double()):

@@ -7,13 +7,7 @@ import torch
 
 from semfov.errors import InputError
 from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
-from semfov.gaze.saliency.itti import (
-    _across_scales,
-    _dyadic_pyramid,
-    _gabor_kernels,
-    _orientation_energy,
-    _promote,
-)
+from semfov.gaze.saliency.itti import _across_scales, _dyadic_pyramid, _gabor_kernels, _orientation_energy, _promote
 
 
 def numpy_promote(image: np.ndarray) -> np.ndarray:

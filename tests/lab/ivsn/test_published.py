@@ -49,7 +49,6 @@ def test_attention_equals_the_loop_over_torchvisions_layers(ivsn):
         assert float(got[row, column]) == pytest.approx(total, rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attention_is_largest_at_the_target(dtype, device):
     """With the identity as network, attention is largest where the colour is that of the target."""
     identity = IVSN(nn.Identity(), nn.Identity(), picture=8, target=1).to(device)

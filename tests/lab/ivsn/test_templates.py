@@ -22,7 +22,6 @@ def make_templates(dtype=torch.float32):
     return ClassTemplates(templates.to(dtype), (mean / 10).to(dtype), ["a", "b", "c"])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attention_is_the_cosine(dtype, device):
     model = make_templates(dtype).to(device)
     features = torch.randn(2, 5, 2, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -57,7 +56,6 @@ def uniform_beliefs(batch, dtype=torch.float64, device="cpu"):
     return DirichletBelief(torch.ones(batch, 12, 4, dtype=dtype, device=device))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attention_over_several_looks_equals_the_loop(dtype, device):
     visited = torch.zeros(2, 12, dtype=torch.bool)
     visited[0, [0, 7, 11]] = visited[1, 4] = True
