@@ -13,6 +13,7 @@ import torch
 from benchmarks.beliefs import exploration, kaplan_update, predictive_search
 from benchmarks.fits import dirichlets
 from benchmarks.interleave import in_turn
+from benchmarks.kernels import fixations, half, lookahead, pictures, pyramid, roc_curve
 from benchmarks.rollouts import rollouts
 from benchmarks.saliency import saliency
 from benchmarks.sensor import foveation
@@ -24,11 +25,17 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     lambda: foveation("opencv", reuse=True),
     lambda: foveation("kornia", reuse=False),
     lambda: foveation("kornia", reuse=True),
+    pyramid,
+    pictures,
+    fixations,
+    half,
     dirichlets,
     kaplan_update,
     predictive_search,
     lambda: exploration("KL divergence"),
     lambda: exploration("negative entropy"),
+    lookahead,
+    roc_curve,
     lambda: saliency("VOCUS2"),
     lambda: saliency("Itti-Koch"),
     in_turn,

@@ -22,6 +22,21 @@ _BY_INDEX = (_aten.index.Tensor, _aten.index_put.default, _aten.index_put_.defau
 """Operations whose indices may be on the CPU."""
 
 
+_WAITING = (
+    _aten._local_scalar_dense.default,
+    _aten.is_nonzero.default,
+    _aten.nonzero.default,
+    _aten.bincount.default,
+    _aten.masked_select.default,
+    _aten.repeat_interleave.Tensor,
+    _aten._unique2.default,
+)
+"""Operations that wait for a GPU, because a value or a shape depends on what it computes."""
+
+waited: list[str] = []
+"""Names of the operations since the list was cleared that would have waited for a GPU."""
+
+
 class PretendedTensor(Tensor):
     """A tensor of the pretended GPU.
 
@@ -47,6 +62,7 @@ class PretendedTensor(Tensor):
 
     def tolist(self) -> Any:
         """The values as numbers, which a GPU gives, too."""
+        waited.append("tolist")
         return self.held.tolist()
 
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -108,6 +124,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         real_kwargs["device"] = torch.device("cpu")
     real_kwargs.pop("pin_memory", None)
     result = func(*real_args, **real_kwargs)
+    chosen = tree_flatten(args[1:])[0]
+    masks = [each for each in chosen if isinstance(each, PretendedTensor) and each.dtype == torch.bool]
+    if there and (func in _WAITING or (func in _BY_INDEX and masks) or (func in _ACROSS and not on_gpu)):
+        waited.append(str(func))
     if not on_gpu:
         return result
     result = tree_map_only(Tensor, PretendedTensor, result)

@@ -27,7 +27,7 @@ from semfov.episode import Step, StoredLooks, rollout
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
 from tests import small
-from tests.pretended import PretendedGpu
+from tests.pretended import PretendedGpu, waited
 from tests.test_modules import find_testers
 from tests.viz.test_places import calls
 
@@ -205,3 +205,34 @@ def test_the_page_on_testing_names_what_does_not_run_on_a_gpu():
     assert LEFT_OUT.keys() <= MODULES.keys() | FUNCTIONS.keys()
     rows = "\n".join(f"| `{name}` | {reason} |" for name, reason in LEFT_OUT.items())
     assert f"|---|\n{rows}\n\n" in page, f"docs/testing.md must have the table\n{rows}"
+
+
+def on_gpu(*shape: int) -> Tensor:
+    return small.rand(*shape).to(GPU)
+
+
+def foveated(count: int) -> object:
+    return semfov.foveate(on_gpu(1, 3, 16, 16), on_gpu(1, count, 2), sigma=3.0)
+
+
+def fused(count: int) -> object:
+    return semfov.belief.fuse(1 + on_gpu(count, 4, 3), on_gpu(count, 2, 3), on_gpu(count, 2, 4) < 0.5)
+
+
+def explored(count: int) -> object:
+    model = small.model().to(GPU)
+    value = semfov.acquisition.KLDivergence(model, semfov.Grid(2, 2, (16, 16))).to(GPU)
+    belief = semfov.DirichletBelief(1 + on_gpu(count, 4, len(model.classes) + 1))
+    return value(belief, torch.zeros(count, 4, dtype=torch.bool, device=GPU))
+
+
+@pytest.mark.parametrize("work", [foveated, fused, explored])
+def test_more_episodes_do_not_wait_for_the_gpu_more_often(work):
+    """Nor do more fixations: they are computed together, and few values are read."""
+    often = []
+    with torch.no_grad(), PretendedGpu():
+        for count in (2, 9):
+            waited.clear()
+            work(count)
+            often.append([*waited])
+    assert often[0] == often[1]

@@ -12,6 +12,8 @@ from semfov.belief.fusion import check_parameters
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
 
+_TOGETHER = 1 << 22  # elements of the rows that an accelerator computes at once
+
 _DataClass = TypeVar("_DataClass")
 
 
@@ -228,8 +230,10 @@ def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     """Apply a function to each row `(B, ...)` separately, so that no result depends on the other rows of its batch.
 
     The rounding of matrix products, exponentials and logarithms depends on the size of the tensor. While a graph is
-    traced, and inside `torch.func.vmap`, all rows are computed at once.
+    traced, and inside `torch.func.vmap`, all rows are computed at once. On an accelerator as many are as fit: there a
+    row costs as many launches as all of them.
     """
-    if not values_known(*rows) or len(rows[0]) <= 1:
+    some = 1 if rows[0].device.type == "cpu" else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
+    if not values_known(*rows) or len(rows[0]) <= some:
         return function(*rows)
-    return torch.cat([function(*(row[index : index + 1] for row in rows)) for index in range(len(rows[0]))])
+    return torch.cat([function(*part) for part in zip(*(row.split(some) for row in rows), strict=True)])

@@ -197,8 +197,8 @@ def check_parameters(beta: Tensor) -> None:
         return
     # The minimum and the maximum of a tensor with a NaN are NaN.
     least, largest = beta.detach().aminmax()
-    usable = bool((least > 0) & (largest < torch.inf))
-    check(usable, "beta", "positive, finite Dirichlet parameters", f"{float(least):g} to {float(largest):g}")
+    if not bool((least > 0) & (largest < torch.inf)):
+        check(False, "beta", "positive, finite Dirichlet parameters", f"{float(least):g} to {float(largest):g}")
 
 
 def scale_likelihood(likelihood: Tensor) -> Tensor:
@@ -272,8 +272,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     if soft and footprint.numel() and values_known(footprint):
         # The minimum and the maximum of a tensor with a NaN are NaN.
         least, most = footprint.detach().aminmax()
-        got = f"{float(least):g} to {float(most):g}"
-        check(bool((least >= 0) & (most <= 1)), "footprint", "weights from 0 to 1", got)
+        if not bool((least >= 0) & (most <= 1)):
+            check(False, "footprint", "weights from 0 to 1", f"{float(least):g} to {float(most):g}")
     return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
 
 

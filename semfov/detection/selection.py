@@ -58,10 +58,11 @@ def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:
     """Raise `InputError` where a detector returns NaN or infinite values."""
     if not values_known(confidence, boxes):
         return
-    for name, numbers in (("confidence", confidence.detach()), ("boxes", boxes.detach())):
-        # The range of the numbers takes one pass over them. It is finite only if all of them are.
-        low, high = numbers.aminmax() if numbers.numel() else (0.0, 0.0)
-        if not math.isfinite(high - low):
+    named = {"confidence": confidence.detach(), "boxes": boxes.detach()}
+    # The range of the numbers takes one pass over them. It is finite only if all of them are.
+    ranges = [numbers.aminmax() for numbers in named.values() if numbers.numel()]
+    if ranges and not math.isfinite(sum(high - low for low, high in ranges)):
+        for name, numbers in named.items():
             check_finite(numbers, f"detector: {name} in image {image}")
 
 
@@ -69,11 +70,12 @@ def check_scores(image: int, candidates: Candidates) -> None:
     """Raise `InputError` where a selected box has a score outside [0, 1]."""
     if not values_known(candidates.classes):
         return
-    for name, scores in (("class scores", candidates.classes), ("objectness", candidates.objectness)):
-        if scores is not None and scores.numel():
-            low, high = scores.detach().aminmax()
-            inside = float(low) >= 0 and float(high) <= 1
-            check(inside, f"detector: {name} in image {image}", "numbers in [0, 1]", "numbers outside")
+    named = {"class scores": candidates.classes, "objectness": candidates.objectness}
+    ranges = {name: each.detach().aminmax() for name, each in named.items() if each is not None and each.numel()}
+    inside = {name: (low >= 0) & (high <= 1) for name, (low, high) in ranges.items()}
+    if inside and not bool(torch.stack([*inside.values()]).all()):
+        name = next(name for name, fits in inside.items() if not bool(fits))
+        check(False, f"detector: {name} in image {image}", "numbers in [0, 1]", "numbers outside")
 
 
 def _select_one(

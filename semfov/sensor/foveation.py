@@ -80,17 +80,13 @@ def foveate(
     fixation, many = fixations(gaze, like)
     if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
         for name, value in (("sigma", sigma), ("growth", growth)):
-            positive = bool((torch.as_tensor(value) > 0).all())
-            check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
+            if not bool((torch.as_tensor(value) > 0).all()):
+                check(False, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
     widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
     size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
     elements = batch * number * like.shape[1] * size[0] * size[1]
-    given = (
-        (*source.details, like, fixation, widths, growth)
-        if isinstance(source, Bands)
-        else (like, fixation, widths, growth)
-    )
-    tensors = [each for each in given if isinstance(each, Tensor)]
+    details = source.details if isinstance(source, Bands) else ()
+    tensors = [each for each in (*details, like, fixation, widths, growth) if isinstance(each, Tensor)]
     recorded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
     alone = batch * number > 1 and elements >= _MANY and like.device.type == "cpu" and not recorded
     if not (alone and values_known(*tensors)):

@@ -157,17 +157,18 @@ class Lookahead(AcquisitionFunction):
         def values(maps: Tensor, visited: Tensor) -> Tensor:
             # So many cells at a time that their looks stay in the processor's cache; the product is faster as a whole.
             looks = self.model.alpha.shape[1] if drawn is None else drawn.shape[1:3].numel()
-            some = maps.shape[-2] if not values_known(maps) else max(1, _BLOCK // (looks * maps.shape[-1]))
-            blocks = maps.split(some, -2)
+            blocks = values_known(maps) and maps.device.type == "cpu"
+            some = max(1, _BLOCK // (looks * maps.shape[-1])) if blocks else maps.shape[-2]
+            cells = maps.split(some, -2)
             if expected is not None:
                 scores = _expected_looks(maps, expected).split(some, -3)
-                pieces = [self.cell_values(_outlook(*block)) for block in zip(blocks, scores, strict=True)]
+                pieces = [self.cell_values(_outlook(*block)) for block in zip(cells, scores, strict=True)]
             else:
                 assert drawn is not None
                 # The values of the M looks of a level stand side by side.
                 pieces = [
                     self.cell_values(look_ahead_by_samples(block, drawn, visited)).unflatten(-1, drawn.shape[1:3])
-                    for block in blocks
+                    for block in cells
                 ]
                 pieces = [piece.mean(-1) for piece in pieces]
             return self.pool(at_levels(torch.cat(pieces, -2), self.levels))
