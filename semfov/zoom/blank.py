@@ -56,14 +56,16 @@ def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], lattice: Latt
     """Whether all pixels of each cell have a colour, up to rounding; pixels `(3, h, w)` → `(rows, columns)`."""
     other = np.zeros(pixels.shape[1:], bool)
     for channel, value in zip(pixels, colour, strict=True):
-        other |= (channel < max(value, 1) - 1) | (channel > min(value, 254) + 1)
+        low, high = max(value, 1) - 1, min(value, 254) + 1
+        # Bytes below the lowest wrap round to large ones.
+        other |= np.ascontiguousarray(channel) - np.uint8(low) > high - low
     for axis, (cells, pitch, length) in enumerate(
         [(lattice.rows, lattice.pitch[1], lattice.size[1]), (lattice.columns, lattice.pitch[0], lattice.size[0])]
     ):
         scale = other.shape[axis] / length
+        first, end = np.array([*_spans(cells, pitch * scale, other.shape[axis])]).T
         # Pixels at the border of two cells count for both.
-        spans = _spans(cells, pitch * scale, other.shape[axis])
-        other = np.stack([other.take(range(*span), axis).any(axis) for span in spans], axis)
+        other = np.logical_or.reduceat(other, first, axis) | other.take(end - 1, axis)
     return ~other
 
 
