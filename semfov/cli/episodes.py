@@ -39,7 +39,7 @@ from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
 from semfov.runs.setup import prepare_worker
-from semfov.runs.workers import run_tasks
+from semfov.runs.workers import run_tasks, worth_starting
 
 
 class PictureJob(ABC):
@@ -276,10 +276,17 @@ def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tu
         yield 0, job.outcome(0)
         return
     _process["job"] = job
+    left, where = [number for number in range(len(job.sources)) if number not in before], job.options.where
+    if left and where != 1 and (where is None or isinstance(where, int)):
+        # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
+        start = time.process_time()
+        first = left.pop(0)
+        yield first, job.outcome(first)
+        where = worth_starting(where, len(left), time.process_time() - start, start)
     done = run_tasks(
         _outcome,
-        [number for number in range(len(job.sources)) if number not in before],
-        where=job.options.where,
+        left,
+        where=where,
         setup=_prepare,
         settings=(type(job), job.options),
         title="pictures",
