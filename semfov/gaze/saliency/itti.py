@@ -11,6 +11,7 @@ from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape
 from semfov.gaze.saliency.conspicuity import rescale
 from semfov.gaze.saliency.opponent import anchor, double_opponency
+from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import pyrdown
 
 CENTRES = (2, 3, 4)
@@ -59,15 +60,21 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     return kernels / kernels.abs().sum((-2, -1), keepdim=True)
 
 
+@constant
+def _filters(orientations: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The Gabor filters as weights of a convolution, `(2n, 1, 9, 9)`."""
+    return _gabor_kernels(orientations).to(device, dtype)[:, None]
+
+
 def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
 
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
     check_shape(intensity, "intensity", None, 1, None, None)
-    kernels = _gabor_kernels(orientations).to(intensity)
+    kernels = _filters(tuple(orientations), intensity.dtype, intensity.device)
     reach = _TAPS // 2
-    answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels[:, None])
+    answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels)
     return answers.abs().unflatten(1, (-1, 2)).sum(2)
 
 

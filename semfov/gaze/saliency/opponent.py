@@ -4,7 +4,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.errors import check, check_shape
+from semfov.errors import check, check_shape, values_known
+
+_PIXELS = 1 << 15  # that are worked on at once
 
 
 def _check_image(image: Tensor) -> None:
@@ -56,7 +58,15 @@ def double_opponency(image: Tensor) -> Tensor:
     """
     _check_image(image)
     intensity = image.mean(1)
-    visible = intensity > intensity.amax((-2, -1), keepdim=True) / 10
+    least = intensity.amax((-2, -1), keepdim=True) / 10
+    # So many rows at once that they stay in the processor's cache.
+    some = max(1, _PIXELS // max(1, len(image) * image.shape[-1])) if values_known(image) else image.shape[-2]
+    rows = zip(image.split(some, 2), intensity.split(some, 1), strict=True)
+    return torch.cat([_opponencies(part, bright, bright > least) for part, bright in rows], 2)
+
+
+def _opponencies(image: Tensor, intensity: Tensor, visible: Tensor) -> Tensor:
+    """The three channels, given the intensity `(B, H, W)` and where it is large enough."""
     gain = visible / torch.where(visible, intensity, 1.0)
     red, green, blue = (image * gain[:, None]).unbind(1)
     mean = (red + green) / 2
