@@ -111,7 +111,7 @@ def roc_curve(count: int = 16_000) -> Comparison:
     scores, truth = score.numpy(), there.numpy()
 
     def scikit() -> tuple[Array, ...]:
-        return peer(truth, scores, drop_intermediate=False)  # type: ignore[no-any-return]
+        return peer(truth, scores, drop_intermediate=False)
 
     def agree() -> None:
         for ours, theirs in zip(roc(score, there), scikit()[:2], strict=True):

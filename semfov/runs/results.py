@@ -7,10 +7,9 @@ import json
 import math
 import sqlite3
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -152,17 +151,21 @@ class StoredRecords:
 
     def __init__(self, results: SceneResults, scenes: int) -> None:
         self._results, self._scenes = results, scenes
+        self._seconds: dict[str, float] | None = None
 
     def __iter__(self) -> Iterator[ResultRecord]:
         """The records."""
-        for result in self._results.read(self._scenes):
-            yield from result["records"]
-
-    @cached_property
-    def seconds(self) -> dict[str, float]:
-        """Seconds that each stage took in all scenes."""
         seconds: dict[str, float] = defaultdict(float)
         for result in self._results.read(self._scenes):
+            yield from result["records"]
             for stage, value in result["seconds"].items():
                 seconds[stage] += value
-        return dict(seconds)
+        self._seconds = dict(seconds)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each stage took in all scenes."""
+        if self._seconds is None:
+            deque(self, maxlen=0)
+        assert self._seconds is not None
+        return self._seconds
