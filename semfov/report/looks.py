@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.report.episode import Data
-from semfov.viz.labels import place_labels
+from semfov.viz.labels import place_labels, place_within
 
 ABOUT = {
     "name": "Photograph",
@@ -75,14 +75,21 @@ def _picture(data: Data, place: str) -> str:
     windows = [(number, look) for number, look in enumerate(data["looks"]) if not look["whole"]]
     sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     tags = place_labels([tuple(look["box"]) for _, look in windows], sizes, (width, height))
+    words = [f"{each['label']} {each['score']:.2f}" for each in data["objects"]]
+    spans = [(unit * (6.3 * len(text) + 4), unit * 13) for text in words]
+    boxes = [tuple(each["box"]) for each in data["objects"]]
+    around = [
+        [(x, y) for x in (x1 + w / 2, x2 - w / 2, x1 - w / 2, x2 + w / 2) for y in (y1 - h / 2, y2 + h / 2)]
+        for (x1, y1, x2, y2), (w, h) in zip(boxes, spans, strict=True)
+    ]
+    places = place_within(around, spans, (width, height), tags)
     shapes = []
-    for order, each in enumerate(data["objects"], 1):
+    for order, (each, text, where) in enumerate(zip(data["objects"], words, places, strict=True), 1):
         sure = ", confirmed" if each["confirmed"] else ""
         kind = "object confirmed" if sure else "object"
-        words = f"{escape(each['label'])} {each['score']:.2f}"
-        x, y = each["box"][0] + 2 * unit, max(each["box"][1] - 6 * unit, 7 * unit)
-        name = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{words}</text>'
-        title = f"<title>{words}{sure}, look {each['look']}</title>"
+        x, y = where[0] + 2 * unit, (where[1] + where[3]) / 2
+        name = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{escape(text)}</text>'
+        title = f"<title>{escape(text)}{sure}, look {each['look']}</title>"
         inside = f"{title}{_framed(each['box'])}{name}"
         shapes.append(f'<g class="{kind}" data-look="{each["look"]}" data-object="{order}">{inside}</g>')
     for (number, look), tag in zip(windows, tags, strict=True):
@@ -187,8 +194,10 @@ def _crop(data: Data, each: Data, place: str) -> str:
     if data["turns"]:  # views are no parts of the picture
         source, left, top = f"{place}-picture", 0, 0
     margin = 0.1 * max(x2 - x1, y2 - y1, 1)
-    view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {x2 - x1 + 2 * margin:.1f} {y2 - y1 + 2 * margin:.1f}"
-    return f'<svg class="crop" viewBox="{view}" aria-hidden="true"><use href="#{source}"/></svg>'
+    across, down = x2 - x1 + 2 * margin, y2 - y1 + 2 * margin
+    view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {across:.1f} {down:.1f}"
+    width = f"width: {min(4.0, 3 * across / down):.2f}rem"
+    return f'<svg class="crop" viewBox="{view}" style="{width}" aria-hidden="true"><use href="#{source}"/></svg>'
 
 
 def _left_out(count: int, what: str) -> str:
