@@ -15,6 +15,7 @@ NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google
 CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
 
 
+@pytest.mark.slow
 def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, photo):
     image = read_image(photo)
     own = agent.search(image, "wine glass", how="fovea", start=47, shifts=3, closer=0)

@@ -26,6 +26,7 @@ def flight(photo, tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_call_and_the_command_write_the_same(run, agent, flight, tmp_path, capsys):
     rows = semfov.run(flight, "red", agent=agent, recursive=True, passes=1, out=tmp_path / "call.csv")
     assert capsys.readouterr().out == ""
