@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -47,6 +48,11 @@ def serve(options: AppOptions) -> int:
         import gradio  # noqa: F401
     except ImportError:
         raise DataError('app: expected Gradio for the page; pip install "semfov[app]"') from None
+    try:
+        socket.create_server((options.host, options.port or 0)).close()
+    except OSError as error:
+        where = f"{options.host}:{options.port or 'any'}"
+        raise DataError(f"app: cannot be served on {where}: {error.strerror or error}") from None
     detector_classes(options)
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:

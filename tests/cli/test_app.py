@@ -1,8 +1,11 @@
 """The page on which to try an agent out: looks at given cells, and the page in Chromium."""
 
 import os
+import re
 import shutil
+import socket
 import sys
+from types import ModuleType
 
 import pytest
 import torch
@@ -37,6 +40,14 @@ def test_without_gradio_it_is_said_how_to_install_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert main(["app"]) == 1
     assert capsys.readouterr().err == 'error: app: expected Gradio for the page; pip install "semfov[app]"\n'
+
+
+def test_an_address_that_cannot_be_served_is_told_before_anything_is_loaded(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "gradio", ModuleType("gradio"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["app", "--port", str(port)]) == 1
+    assert re.fullmatch(rf"error: app: cannot be served on 127.0.0.1:{port}: .*\n", capsys.readouterr().err)
 
 
 @pytest.fixture
