@@ -67,6 +67,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
         if "site" in fixtures or (item.path.is_relative_to(here) and item.path.relative_to(here).parts[0] in LAB):
             item.add_marker(pytest.mark.lab)
+    items.sort(key=lambda item: "site" not in getattr(item, "fixturenames", ()))  # what takes longest begins first
 
 
 @pytest.fixture(scope="module", params=[torch.float32, torch.float64], ids=str)
