@@ -12,7 +12,7 @@ from torch import Tensor
 
 _ROUNDING = 1e-3
 
-Name = TypeVar("Name", bound=str)
+_Name = TypeVar("_Name", bound=str)
 
 
 def printable(text: str) -> str:
@@ -215,7 +215,7 @@ def check_finite(tensor: Tensor, argument: str) -> None:
         check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
-def lookup(name: str, known: Iterable[Name], what: str) -> Name:
+def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
     """Return a name if it is known; otherwise suggest the nearest known names.
 
     Args:

@@ -13,7 +13,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import semfov
-from semfov.cli.main import options_of
+from semfov.cli.main import _options_of
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -103,7 +103,7 @@ def test_the_commands_that_try_a_release_exist():
     (commands,) = (step.split(" && ") for step in steps if step.startswith("semfov"))
     for command in commands:
         name, *options = command.split()[1:]
-        known = {f"--{each.name}".replace("_", "-") for each in fields(options_of(name))}
+        known = {f"--{each.name}".replace("_", "-") for each in fields(_options_of(name))}
         assert {option for option in options if option.startswith("--")} <= known
 
 

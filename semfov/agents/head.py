@@ -28,7 +28,7 @@ from semfov.io.pretrained import shipped_model
 from semfov.paths import Ending, HeadPath, RecordedLook, reduced_copy
 from semfov.sensor.foveation import Foveation
 
-SIGMA = 100.0
+_SIGMA = 100.0
 """Width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels."""
 
 _PASSES = 40
@@ -80,7 +80,7 @@ class HeadAgent(nn.Module):
             InputError: no models are shipped for a detector of this name.
             DataError: the weights cannot be obtained, or are damaged.
         """
-        eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
+        eye = Eye(Foveation(_SIGMA, growth=2.0), load_detector(name, **options))
         shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
         models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
         for model in models:
@@ -102,7 +102,7 @@ class HeadAgent(nn.Module):
         Returns:
             Views with the scene's fields of view and the agent's fovea.
         """
-        return Views(open_scene(scene, color), fovea=SIGMA / self.eye.reference)
+        return Views(open_scene(scene, color), fovea=_SIGMA / self.eye.reference)
 
     def search(
         self,

@@ -40,7 +40,7 @@ USUAL_PASSES = 24
 LIKELY = 0.5
 """Default for the least probability of the objects that a record counts."""
 
-NEW_OBJECTS = 0.01
+_NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
 
 WINDOW_RATE = 0.03
@@ -175,7 +175,7 @@ class ZoomAgent(nn.Module):
         seconds: float | None = None,
         on_look: OnLook | None = None,
         batch: int = 1,
-        worth: float = NEW_OBJECTS,
+        worth: float = _NEW_OBJECTS,
         least: float | None = None,
     ) -> ZoomPath:
         """Find all objects of a class, of several or of all classes.
@@ -307,7 +307,7 @@ class WindowEpisode(Episode[ZoomPath]):
         give_up: float | None = None,
         closer: int | None = None,
         batch: int = 1,
-        worth: float = NEW_OBJECTS,
+        worth: float = _NEW_OBJECTS,
         least: float | None = None,
         color: Color = "rgb",
         eye: WindowEye | None = None,

@@ -34,7 +34,7 @@ _SUBCOMMANDS: dict[str, tuple[str, str]] = {
 _LOOKING = "search", "find", "explore", "live"
 
 
-def options_of(name: str) -> type[Any]:
+def _options_of(name: str) -> type[Any]:
     """The options of a subcommand, imported when they are asked for: help and mistakes need no tensors."""
     if name == "fit":
         from semfov.fit.settings import FitDetectorConfig
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     from semfov.runs.command import GOES_ON, make_parser, run_command
 
-    options, positional, program = options_of(name), _SUBCOMMANDS[name], f"semfov {name}"
+    options, positional, program = _options_of(name), _SUBCOMMANDS[name], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
         usage = texts.HELP[name].partition("\nusage:")[0]
         make_parser(options, usage, positional, program).print_help()
@@ -155,7 +155,7 @@ def _unknown(name: str) -> str:
 
 def _option_names(name: str) -> list[str]:
     """Names of the options of a subcommand, without the positional one."""
-    return [field.name for field in fields(options_of(name)) if field.name != _SUBCOMMANDS[name][0]]
+    return [field.name for field in fields(_options_of(name)) if field.name != _SUBCOMMANDS[name][0]]
 
 
 def _of_others(own: str, rest: Sequence[str]) -> str | None:

@@ -108,7 +108,7 @@ def names_of(name: str) -> tuple[str, ...]:
 
 
 # Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
-ALIASES = {
+_ALIASES = {
     "aeroplane": "airplane",
     "motorbike": "motorcycle",
     "sofa": "couch",
@@ -116,7 +116,7 @@ ALIASES = {
     "diningtable": "dining table",
     "tvmonitor": "tv",
 }
-_SPELT = {"".join(new.split()): [old for old in ALIASES if ALIASES[old] == new] for new in ALIASES.values()}
+_SPELT = {"".join(new.split()): [old for old in _ALIASES if _ALIASES[old] == new] for new in _ALIASES.values()}
 _MOST_NAMED = 12
 """Largest number of classes that a message names."""
 
@@ -136,7 +136,7 @@ def canonical_name(name: str) -> str:
     ('tv', 'traffic light')
     """
     plain = " ".join(name.replace("_", " ").lower().split())
-    return ALIASES.get(plain, plain)
+    return _ALIASES.get(plain, plain)
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
@@ -230,7 +230,7 @@ def _few(classes: Sequence[str]) -> str:
 def _plain_key(name: str) -> str:
     """A name in lower case, without spaces, underscores and hyphens, in COCO's spelling."""
     plain = re.sub(r"[\s_-]+", "", name.lower())
-    return re.sub(r"\s", "", ALIASES.get(plain, plain))
+    return re.sub(r"\s", "", _ALIASES.get(plain, plain))
 
 
 def _other_numbers(key: str) -> set[str]:

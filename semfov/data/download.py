@@ -63,10 +63,10 @@ def _download_coco(split: str, root: str | os.PathLike[str], *, address: str = _
     """
     images = _SPLITS[lookup(split, _SPLITS, "split")]
     check(address.startswith(("http://", "https://")), "address", "http://... or https://...", repr(address))
-    fetch_split(split, Path(root), images, _ANNOTATIONS, address=address, keep=keep)
+    _fetch_split(split, Path(root), images, _ANNOTATIONS, address=address, keep=keep)
 
 
-def fetch_split(
+def _fetch_split(
     split: str, root: Path, images: _Archive, annotations: _Archive, *, address: str, keep: bool, pause: float = 1.0
 ) -> None:
     """`_download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
@@ -78,10 +78,10 @@ def fetch_split(
             brought = root / archive.name
             if brought.exists():
                 _verify(brought, archive, f"delete it, and run again to fetch {address}/{archive.path}")
-                unpack_members(brought, root, members)
+                _unpack_members(brought, root, members)
                 continue
             file = _fetch_archive(archive, root / ".download", address=address, pause=pause)
-            unpack_members(file, root, members)
+            _unpack_members(file, root, members)
             if keep:
                 file.replace(brought)
             else:
@@ -129,7 +129,7 @@ def _fetch_archive(archive: _Archive, folder: Path, *, address: str = _ADDRESS, 
     return file
 
 
-def unpack_members(file: Path, root: Path, members: str) -> None:
+def _unpack_members(file: Path, root: Path, members: str) -> None:
     """Unpack members whose names begin with `members`, each atomically; files that are right already are skipped."""
     from tqdm import tqdm
 

@@ -63,7 +63,7 @@ def open_raster(path: str | PathLike[str]) -> Any:
     path = Path(path)
     path.stat()  # GDAL has many messages for a file that is not there
     driver = _DRIVERS[path.suffix.lower()]
-    source = io.BytesIO(mosaic_text(path)) if driver == "VRT" else path.absolute()
+    source = io.BytesIO(_mosaic_text(path)) if driver == "VRT" else path.absolute()
     file = _without_others(rasterio.open(source, driver=driver), path)
     if max(file.width, file.height) > MOST_SIDE:
         got = f"{file.width} × {file.height}"
@@ -72,7 +72,7 @@ def open_raster(path: str | PathLike[str]) -> Any:
     return file
 
 
-def mosaic_text(path: Path) -> bytes:
+def _mosaic_text(path: Path) -> bytes:
     """GDAL's text of a mosaic, made anew of what is known in it; its sources are pictures in its folder or below."""
     if path.stat().st_size > _MOST_BYTES:
         raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}")

@@ -14,13 +14,13 @@ PixelBox = tuple[int, int, int, int]
 LARGE = 1 << 24
 """Pictures with more pixels have copies."""
 
-STRIP = 1 << 23
+_STRIP = 1 << 23
 """Pixels that are read at once for a copy."""
 
 FIRST = 4
 """Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
 
-LARGEST = 1 << 25
+_LARGEST = 1 << 25
 """Most pixels of a copy, so that all copies together take at most 134 MB."""
 
 OVERSAMPLING = 1.5
@@ -40,7 +40,7 @@ def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
 
 
 def first_for(size: tuple[int, int]) -> int:
-    """Factor by which the largest copy of a picture is reduced, so that it has at most `LARGEST` pixels.
+    """Factor by which the largest copy of a picture is reduced, so that it has at most `_LARGEST` pixels.
 
     >>> first_for((20_000, 15_000)), first_for((40_000, 40_000))
     (4, 8)
@@ -48,7 +48,7 @@ def first_for(size: tuple[int, int]) -> int:
     Shapes: size `(width, height)`.
     """
     first = FIRST
-    while size[0] * size[1] > LARGEST * first**2:
+    while size[0] * size[1] > _LARGEST * first**2:
         first *= 2
     return first
 
@@ -111,7 +111,7 @@ class ReducedCopies:
         first = self.first
         wide, high = (max(1, length // first) for length in self.size)
         width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
-        rows = max(1, STRIP // self.size[0] // first)
+        rows = max(1, _STRIP // self.size[0] // first)
         copy = torch.empty(high, wide, 3, dtype=torch.uint8)
         for top in range(0, high, rows):
             bottom = min(top + rows, high)

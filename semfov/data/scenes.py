@@ -67,7 +67,7 @@ _DISTRACTORS = (
 _TEXTURES = ("brick.png", "grass.png", "gravel.png")
 
 
-class Item(NamedTuple):
+class _Item(NamedTuple):
     """The place of a photograph in a scene."""
 
     photograph: Photograph
@@ -122,7 +122,7 @@ class EmbeddedScenes(ComposedScenes):
         image = torch.from_numpy(self._pixels(index)).permute(2, 0, 1).contiguous()
         return self._scene(index, "search array", image.float() / 255)
 
-    def items(self, index: int) -> list[Item]:
+    def items(self, index: int) -> list[_Item]:
         """List the photographs in a scene with their places, objects first.
 
         Args:
@@ -169,7 +169,7 @@ class EmbeddedScenes(ComposedScenes):
         return canvas
 
 
-def _layout(generator: np.random.Generator) -> list[Item]:
+def _layout(generator: np.random.Generator) -> list[_Item]:
     """Five objects and five distractors, each at a random position in a slot of its own."""
     photographs = [_PHOTOGRAPHED_OBJECTS[i] for i in generator.permutation(len(_PHOTOGRAPHED_OBJECTS))[:5]]
     photographs += [_DISTRACTORS[i] for i in generator.permutation(len(_DISTRACTORS))[:5]]
@@ -184,7 +184,7 @@ def _layout(generator: np.random.Generator) -> list[Item]:
         width, height = side * (right - left) // longer, side * (bottom - top) // longer
         x = slot % columns * pitch[0] + int(generator.integers(_MARGIN, pitch[0] - width - _MARGIN, endpoint=True))
         y = slot // columns * pitch[1] + int(generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True))
-        items.append(Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
+        items.append(_Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
     return items
 
 

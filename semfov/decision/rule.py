@@ -26,7 +26,7 @@ NEARLY = 0.9
 """A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
 
 
-ABSENT = 0.5
+_ABSENT = 0.5
 """A search that ends without a find decides that the target is absent below this probability of the picture."""
 
 
@@ -60,7 +60,7 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
     probable as the most probable one (`NEARLY`) and probable enough itself. A search gives up if no remaining cell is
     probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
-    then absent, unless the image holds it with a probability of at least `ABSENT`.
+    then absent, unless the image holds it with a probability of at least `_ABSENT`.
 
     Shapes: target `(A,)` → `(A,)`.
     """
@@ -74,7 +74,7 @@ def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Threshold
 
     Shapes: presence `(A,)`, looked `(A,)`, left `(A,)` → `(A,)`.
     """
-    rest = torch.where(left < thresholds.give_up, torch.where(presence < ABSENT, 2, 3), 0)
+    rest = torch.where(left < thresholds.give_up, torch.where(presence < _ABSENT, 2, 3), 0)
     return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
 
 
@@ -122,14 +122,14 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
     """Decide a search after closer looks.
 
     It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
-    enough; otherwise the target is absent if the picture holds it with a probability below `ABSENT`.
+    enough; otherwise the target is absent if the picture holds it with a probability below `_ABSENT`.
     """
     best = max(places, default=0.0)
     if places and best >= (confirm if over else surely(confirm)):
         return OUTCOMES.index("found")
     if not over:
         return 0
-    return OUTCOMES.index("absent") if presence < ABSENT else len(OUTCOMES) - 1
+    return OUTCOMES.index("absent") if presence < _ABSENT else len(OUTCOMES) - 1
 
 
 def outcome_of(

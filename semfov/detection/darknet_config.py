@@ -99,7 +99,7 @@ def read_cfg(path: str | PathLike[str]) -> list[Section]:
         raise DataError(f"{str(path)!r}: expected a Darknet cfg, got a file that is not text") from error
 
 
-ANCHORS = "10,13, 16,30, 33,23, 30,61, 62,45, 59,119, 116,90, 156,198, 373,326"
+_ANCHORS = "10,13, 16,30, 33,23, 30,61, 62,45, 59,119, 116,90, 156,198, 373,326"
 _TINY_ANCHORS = "10,14, 23,27, 37,58, 81,82, 135,169, 344,319"
 
 
@@ -162,7 +162,7 @@ def _yolov3(size: int, classes: int, pyramid: list[Section]) -> list[Section]:
         sections += [_convolution(width, 1), _convolution(2 * width, 3), _convolution(width, 1)]
         sections += pyramid if lateral is None else []
         sections += [_convolution(2 * width, 3), _convolution(width, 1), _convolution(2 * width, 3)]
-        sections += _head(mask, ANCHORS, classes)
+        sections += _head(mask, _ANCHORS, classes)
     return sections
 
 

@@ -14,7 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.errors import InputError, lookup
 
-LEAST_STRIDE = 8
+_LEAST_STRIDE = 8
 """Smallest stride of the maps that are named; finer ones hold edges and colours."""
 
 
@@ -79,7 +79,7 @@ def landmarks(steps: Sequence[NetworkStep]) -> dict[str, str]:
         late = [name for name in strides if strides[name] == stride and readers[name] and order[name] >= min(begun)]
         if late:
             named["head", stride] = ([name for name in late if readers[name] > 1] or late)[-1]
-    return {f"{place}{stride}": name for (place, stride), name in sorted(named.items()) if stride >= LEAST_STRIDE}
+    return {f"{place}{stride}": name for (place, stride), name in sorted(named.items()) if stride >= _LEAST_STRIDE}
 
 
 def stride_of(canvas: int, side: int) -> int:

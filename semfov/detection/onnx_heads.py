@@ -39,7 +39,7 @@ def _grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float,
     return torch.cat(levels)
 
 
-def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
+def _decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
     """Decode the raw output of YOLOX (Ge et al. 2021).
 
     For the cell (i, j) of a level with stride s, centre and size of the box are
@@ -55,7 +55,7 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
     return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
 
 
-def decode_yolov5(rows: Tensor) -> Candidates:
+def _decode_yolov5(rows: Tensor) -> Candidates:
     """Decode YOLOv5-style rows, whose boxes the network itself has decoded; rows `(B, N, 5 + K)`."""
     check_shape(rows, "rows", None, None, None)
     return Candidates(_corners(rows[..., :4]), rows[..., 5:], rows[..., 4])
@@ -68,7 +68,7 @@ def decode_yolov8(columns: Tensor) -> Candidates:
     return Candidates(_corners(rows[..., :4]), rows[..., 4:])
 
 
-def decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
+def _decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
     """Decode rows `x1 y1 x2 y2 score class` that a network has selected itself (YOLOv10): all other scores are 0.
 
     Shapes: rows `(B, N, 6)`.
@@ -96,7 +96,7 @@ def decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
     )
 
 
-def decode_distances(
+def _decode_distances(
     classes: Tensor,
     distances: Tensor,
     canvas: tuple[int, int],
@@ -190,7 +190,7 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
     return None
 
 
-Outputs = Mapping[str, Tensor]
+_Outputs = Mapping[str, Tensor]
 _Canvas = tuple[int, int]
 
 _FRACTIONS = 2.0
@@ -214,7 +214,7 @@ _DETR_LOGITS = ("logits", "pred_logits")
 class _DetectionHead(NamedTuple):
     """The head of a family of networks; `decode` takes outputs, `(width, height)` and the number of names, if known."""
 
-    decode: Callable[[Outputs, _Canvas, int | None], Candidates]
+    decode: Callable[[_Outputs, _Canvas, int | None], Candidates]
     preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
     faint: float = FAINT
@@ -233,7 +233,7 @@ class Signature:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-def recognise(signature: Signature, run: Callable[[], Outputs] | None = None) -> str:
+def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -> str:
     """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes."""
     task = signature.metadata.get("task", "detect")
     check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
@@ -253,7 +253,7 @@ def recognise(signature: Signature, run: Callable[[], Outputs] | None = None) ->
     )
 
 
-def _fits(name: str, outputs: Outputs, signature: Signature) -> bool:
+def _fits(name: str, outputs: _Outputs, signature: Signature) -> bool:
     """Whether the boxes that a head makes of outputs lie on the canvas."""
     try:
         found = HEADS[name].decode(outputs, signature.canvas, signature.classes)
@@ -355,11 +355,11 @@ def _classes(outputs: Mapping[str, object]) -> str:
     return "classes" if "classes" in outputs else "scores"
 
 
-def _first(outputs: Outputs) -> Tensor:
+def _first(outputs: _Outputs) -> Tensor:
     return next(iter(outputs.values()))
 
 
-def _rows(outputs: Outputs, canvas: _Canvas, *, across: bool = False) -> Tensor:
+def _rows(outputs: _Outputs, canvas: _Canvas, *, across: bool = False) -> Tensor:
     """The only tensor of a head as rows `(B, N, C)`; `across`: usually the boxes are its columns."""
     tensor, counts = _first(outputs), _box_counts(canvas)
     check_shape(tensor, "outputs", None, None, None)
@@ -367,13 +367,13 @@ def _rows(outputs: Outputs, canvas: _Canvas, *, across: bool = False) -> Tensor:
     return tensor.mT if (columns and not rows) or (across and rows == columns) else tensor
 
 
-def _candidates(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+def _candidates(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     return Candidates(
         outputs["boxes"], outputs[_classes(outputs)], outputs.get("objectness"), outputs.get("background")
     )
 
 
-def _level_maps(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
     maps = list(outputs.values())
@@ -385,22 +385,22 @@ def _level_maps(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candida
         got = [tuple(each.shape) for each in maps]
         raise InputError(f"outputs: expected a class and a distance map at each of strides {strides}, got {got}")
     classes, distances = (torch.cat([level[index] for level in levels], 1) for index in (0, 1))
-    return decode_distances(classes, distances, canvas, strides=strides)
+    return _decode_distances(classes, distances, canvas, strides=strides)
 
 
-def _nanodet_plus(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode NanoDet-Plus: class scores, then distances with 8 bins for each side."""
     rows = _first(outputs)
-    return decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
+    return _decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
 
 
-def _end_to_end(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+def _end_to_end(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if count is None:
         raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
-    return decode_end_to_end(_first(outputs), count)
+    return _decode_end_to_end(_first(outputs), count)
 
 
-def _rtdetr(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if "pred_boxes" in outputs:
         return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
     return _decode_rtdetr_rows(_first(outputs), canvas)
@@ -408,9 +408,9 @@ def _rtdetr(outputs: Outputs, canvas: _Canvas, count: int | None) -> Candidates:
 
 HEADS: dict[str, _DetectionHead] = {
     "candidates": _DetectionHead(_candidates),
-    "yolox": _DetectionHead(lambda outputs, canvas, _: decode_yolox(_first(outputs), canvas), _YOLOX),
-    "yolox-decoded": _DetectionHead(lambda outputs, canvas, _: decode_yolov5(_first(outputs)), _YOLOX),
-    "yolov5": _DetectionHead(lambda outputs, canvas, _: decode_yolov5(_rows(outputs, canvas))),
+    "yolox": _DetectionHead(lambda outputs, canvas, _: _decode_yolox(_first(outputs), canvas), _YOLOX),
+    "yolox-decoded": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_first(outputs)), _YOLOX),
+    "yolov5": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_rows(outputs, canvas))),
     "yolov8": _DetectionHead(lambda outputs, canvas, _: decode_yolov8(_rows(outputs, canvas, across=True).mT)),
     "end2end": _DetectionHead(_end_to_end),
     "picodet": _DetectionHead(_level_maps, _IMAGENET),

@@ -13,7 +13,7 @@ from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.zoom_scenery import open_zoom_scenery
 from semfov.errors import lookup
 
-IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
+_IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
 
 _Action = Literal["cell", "window"]
 """Kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
@@ -31,7 +31,7 @@ def register() -> None:
     >>> sorted(name for name in gymnasium.registry if name.startswith("semfov/"))
     ['semfov/GazeExplore-v0', 'semfov/GazeSearch-v0']
     """
-    for task, name in IDS.items():
+    for task, name in _IDS.items():
         if name not in gymnasium.registry:
             one, many = f"{__name__}:make", f"{__name__}:_make_vector"
             gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})

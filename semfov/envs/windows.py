@@ -117,7 +117,7 @@ class WindowGaze(Gazes):
 
     def places(self, rows: Tensor) -> Tensor:
         """The middle of the window and its magnification, each from 0 to 1."""
-        return torch.from_numpy(action_of(self.glances.lattice, self.window))[None]
+        return torch.from_numpy(_action_of(self.glances.lattice, self.window))[None]
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
         """Windows of the picture that were not looked at, padded to the largest number of windows of any picture."""
@@ -190,7 +190,7 @@ def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
     return on_lattice(lattice, (level, column, row))
 
 
-def action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
+def _action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
     """The action that looks at a window; → `(x, y, magnification)`."""
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)

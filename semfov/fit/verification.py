@@ -35,10 +35,10 @@ from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
 from semfov.runs.tables import mean_or_dash, share, table
 
-LEVELS = tuple(number / 100 for number in range(50, 100))
+_LEVELS = tuple(number / 100 for number in range(50, 100))
 """Values from which the threshold `confirm` is chosen."""
 
-SHIPPED = ("yolox-nano", "yolov3-tiny")
+_SHIPPED = ("yolox-nano", "yolov3-tiny")
 """Shipped models whose mean is the centre of the prior for other detectors."""
 
 _STRENGTH = 10.0
@@ -169,7 +169,7 @@ def fit_verification(config: FitVerificationConfig) -> None:
         seed=config.seed,
         store=store,
     )
-    fitted = fit_in_folds(photographs, evidence, config)
+    fitted = _fit_in_folds(photographs, evidence, config)
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
@@ -177,12 +177,12 @@ def fit_verification(config: FitVerificationConfig) -> None:
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
 
 
-def fit_in_folds(
+def _fit_in_folds(
     photographs: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
     config: FitVerificationConfig,
     prior: Verification | None = None,
-    surest: float = LEVELS[-1],
+    surest: float = _LEVELS[-1],
 ) -> VerificationResult:
     """Fit the model to closer looks at photographs, search again in folds, and choose the threshold `confirm`."""
     closer = examine(photograph_searches(photographs, evidence, config.looks, "looking"), config.folds)
@@ -265,10 +265,10 @@ def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _Sea
     return None, len(search)
 
 
-def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, surest: float = LEVELS[-1]) -> float:
-    """Choose from `LEVELS` the least threshold, at most `surest`, at which few enough absent targets are found."""
+def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, surest: float = _LEVELS[-1]) -> float:
+    """Choose from `_LEVELS` the least threshold, at most `surest`, at which few enough absent targets are found."""
     absent = [each for each in searches if not each.present]
-    for confirm in LEVELS:
+    for confirm in _LEVELS:
         if sum(each.found(confirm)[0] is not None for each in absent) <= false_alarms * len(absent):
             return min(confirm, surest)
     return surest
@@ -321,8 +321,8 @@ def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None)
 
 
 def _shipped_mean() -> Verification:
-    """Return the mean of two shipped models (`SHIPPED`), without thresholds: the centre of the prior."""
-    return mean_of([Verification.from_pretrained(name) for name in SHIPPED])
+    """Return the mean of two shipped models (`_SHIPPED`), without thresholds: the centre of the prior."""
+    return mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
 
 
 def mean_of(models: Sequence[Verification]) -> Verification:
@@ -457,7 +457,7 @@ class VerificationFit(PartFit):
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
-        fitted = fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
+        fitted = _fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])

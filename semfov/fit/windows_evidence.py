@@ -56,7 +56,7 @@ def closer_windows(
             yield closer, steps, (x1, y1, x2, y2)
 
 
-def found_by(glance: Glance, annotation: Annotation, score: float = DETECTION_SCORE, iou: float = 0.5) -> Tensor:
+def _found_by(glance: Glance, annotation: Annotation, score: float = DETECTION_SCORE, iou: float = 0.5) -> Tensor:
     """Find the objects that a look shows with a detection of their class; → `(M,)`."""
     detections = glance.detections
     sure = detections.confidence[0] >= score
@@ -76,7 +76,7 @@ def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LE
     """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`."""
     annotation = pictures.annotation(index)
     looks = [
-        WindowResult(glance.window, glance.gist, glance.show, found_by(glance, annotation))
+        WindowResult(glance.window, glance.gist, glance.show, _found_by(glance, annotation))
         for glance in glances.see(windows_of(pictures, index, glances.lattice))
     ]
     return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)

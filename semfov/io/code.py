@@ -32,7 +32,7 @@ def package_digest() -> str:
 @cache
 def modules_digest(*modules: str) -> str:
     """Compute a sha256 over modules of the package and every module of it that they import, directly or not."""
-    return _digest(closure(modules, lambda name: name.partition(".")[0] == _PACKAGE))
+    return _digest(_closure(modules, lambda name: name.partition(".")[0] == _PACKAGE))
 
 
 def class_digest(kind: type) -> str:
@@ -45,11 +45,11 @@ def class_digest(kind: type) -> str:
     if any(_file(module) is None for module in modules):
         return f"{kind.__qualname__}, process {_THIS_PROCESS}"
     own = {module.partition(".")[0] for module in modules} - {_PACKAGE}
-    files = closure(modules, lambda name: name.partition(".")[0] in own or not _of_others(name))
+    files = _closure(modules, lambda name: name.partition(".")[0] in own or not _of_others(name))
     return hashlib.sha256(f"{kind.__qualname__} {_digest(files)}".encode()).hexdigest()
 
 
-def closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]:
+def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]:
     """Find the files of modules and of every module that they import, directly or not."""
     files: dict[Path, None] = {}
     todo = list(modules)

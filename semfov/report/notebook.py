@@ -10,7 +10,7 @@ from semfov.report.episode import episode_data, jpeg_uri
 from semfov.report.page import page_html
 from semfov.viz.style import FOUND, GAZE, TARGET
 
-MOST_CHARACTERS = 3_000_000
+_MOST_CHARACTERS = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
 
 _HEIGHT = 760
@@ -19,7 +19,7 @@ _HEIGHT = 760
 _FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
 """Widths in pixels and JPEG qualities of the pictures; the first pair that fits is taken."""
 
-_MAPS = MOST_CHARACTERS // 4
+_MAPS = _MOST_CHARACTERS // 4
 """Largest number of bytes of the probability maps."""
 
 
@@ -86,7 +86,7 @@ def scanpath_html(scanpath: Scanpath) -> str:
             f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
             f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
         )
-        if len(frame.encode()) <= MOST_CHARACTERS:
+        if len(frame.encode()) <= _MOST_CHARACTERS:
             return frame
     text = escape(repr(scanpath))
     return f"<pre>{text}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _Curves = Mapping[str, NDArray[np.float64]]
 
-REST = "0.6"
+_REST = "0.6"
 """Colour of the curves that the legend does not name."""
 
 
@@ -101,7 +101,7 @@ def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequ
     rest = [name for name in curves if name not in named]
     for number, name in enumerate(rest):
         label = others_named(len(rest)) if number == 0 else None
-        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=REST, linewidth=0.8, label=label, zorder=1)
+        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=_REST, linewidth=0.8, label=label, zorder=1)
     for order, name in enumerate(named):
         curve, style = curves[name], line_style(order, len(named))
         shifts = np.arange(len(curve))

@@ -176,12 +176,12 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
     objects, label = probabilities[:, 1:].max(-1)
     sure = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
     best = torch.where(sure, label + 1, 0)
-    groups = regions(best.reshape(grid.rows, grid.columns))
+    groups = _regions(best.reshape(grid.rows, grid.columns))
     named = [(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max())) for cells in groups]
     return sorted(named, key=lambda region: -len(region[1]))
 
 
-def regions(labels: Tensor) -> list[list[int]]:
+def _regions(labels: Tensor) -> list[list[int]]:
     """Regions of cells that touch at a side and share a label other than 0; labels `(Y, X)`."""
     rows, columns = labels.shape
     flat, seen, groups = labels.flatten().tolist(), set[int](), []

@@ -115,10 +115,10 @@ class LiveGlances(Glances):
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         hints = hints or any(_points_closer(window, self.lattice) for window in windows)
         looks = self.eye.glance(self.view, fixations, [window.within for window in windows], hints=hints)
-        return [glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
+        return [_glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
-def glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
+def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
     detections = _only(looks.detections, number)
     look_gist, faint = None, None

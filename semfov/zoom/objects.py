@@ -13,7 +13,7 @@ from semfov.zoom.certainty import FACTS, Certainty, object_facts, overlapping
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 
-INSIDE = 0.5
+_INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
 
 _SAME = 0.5
@@ -95,7 +95,7 @@ def merge_with_facts(
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
-    index = unlike(boxes, scores, labels, looks, cut, sharpness, inside=INSIDE)
+    index = unlike(boxes, scores, labels, looks, cut, sharpness, inside=_INSIDE)
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]

@@ -9,7 +9,7 @@ import pytest
 
 import semfov
 from semfov.cli import agent, live, search, start
-from semfov.cli.main import _SUBCOMMANDS, main, options_of
+from semfov.cli.main import _SUBCOMMANDS, _options_of, main
 from semfov.errors import InputError
 from semfov.runs.command import make_parser
 
@@ -131,7 +131,7 @@ def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
             main(["search", *words, "--print-config"])
         assert stopped.value.code == 0
         assert "give_up: 0.2" in capsys.readouterr().out
-    parser = make_parser(options_of("search"), "", _SUBCOMMANDS["search"])
+    parser = make_parser(_options_of("search"), "", _SUBCOMMANDS["search"])
     assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
 
 

@@ -1,12 +1,12 @@
 import pytest
 
 from semfov.data import canonical_name, class_index
-from semfov.data.classes import ALIASES, alike, class_indices, class_numbers
+from semfov.data.classes import _ALIASES, alike, class_indices, class_numbers
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.errors import InputError
 
 
-@pytest.mark.parametrize(("old", "new"), ALIASES.items())
+@pytest.mark.parametrize(("old", "new"), _ALIASES.items())
 def test_both_spellings_give_the_same_class(old, new):
     assert canonical_name(old) == canonical_name(new) == new
     assert class_index(old, ("person", new)) == class_index(new, ("person", old)) == 2

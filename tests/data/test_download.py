@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from semfov.data import download
-from semfov.data.download import _SPLITS, _Archive, _download_coco, _fetch_archive, fetch_split, main, unpack_members
+from semfov.data.download import _SPLITS, _Archive, _download_coco, _fetch_archive, _fetch_split, _unpack_members, main
 from semfov.errors import DataError, InputError
 
 NAMES = [f"{n:012d}.jpg" for n in (139, 285, 632)]
@@ -98,7 +98,7 @@ def unreachable_address():
 
 
 def get(root, address, *, keep=False):
-    fetch_split("val2017", root, IMAGES, ANNOTATIONS, address=address, keep=keep, pause=0)
+    _fetch_split("val2017", root, IMAGES, ANNOTATIONS, address=address, keep=keep, pause=0)
 
 
 def tree(root):
@@ -175,7 +175,7 @@ def test_without_a_network_the_error_suggests_copying_the_archive(tmp_path, unre
 
 
 def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(download, "unpack_members", lambda *_: 1 / 0)
+    monkeypatch.setattr(download, "_unpack_members", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         get(tmp_path, server.address)
     assert tree(tmp_path) == [".download/annotations_trainval2017.zip"]
@@ -214,7 +214,7 @@ def test_unpacking_keeps_complete_files_and_replaces_damaged_ones(tmp_path):
     (tmp_path / first).write_bytes(PICTURES[first])
     (tmp_path / second).write_bytes(PICTURES[second][:-1] + b"?")
     before = (tmp_path / first).stat().st_mtime_ns
-    unpack_members(tmp_path / "val2017.zip", tmp_path, "val2017/")
+    _unpack_members(tmp_path / "val2017.zip", tmp_path, "val2017/")
     assert all((tmp_path / name).read_bytes() == content for name, content in PICTURES.items())
     assert (tmp_path / first).stat().st_mtime_ns == before
 
@@ -248,7 +248,7 @@ def linked():
 def test_archives_that_are_unsafe_damaged_or_empty_are_refused(tmp_path, content, message):
     (tmp_path / "a.zip").write_bytes(content)
     with pytest.raises(DataError, match=message):
-        unpack_members(tmp_path / "a.zip", tmp_path / "root", "val2017/")
+        _unpack_members(tmp_path / "a.zip", tmp_path / "root", "val2017/")
     assert tree(tmp_path) == ["a.zip"]
 
 
@@ -285,7 +285,7 @@ def test_an_interrupted_program_says_how_to_resume(tmp_path, monkeypatch, capsys
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(download, "fetch_split", interrupt)
+    monkeypatch.setattr(download, "_fetch_split", interrupt)
     assert main(["val2017", "--root", str(tmp_path)]) == 130
     assert "same command to resume" in capsys.readouterr().err
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semfov.data.gdal import mosaic_text
+from semfov.data.gdal import _mosaic_text
 from semfov.data.images import read_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.raster import RasterPicture
@@ -165,7 +165,7 @@ def test_what_a_mosaic_may_not_name(private, text, refused):
     ):
         (folder / name).write_text(content)
     with pytest.raises(DataError, match=refused):
-        mosaic_text(folder / "mosaic.vrt")
+        _mosaic_text(folder / "mosaic.vrt")
 
 
 def test_a_mosaic_names_files_of_its_folder(private, monkeypatch):
@@ -177,7 +177,7 @@ def test_a_mosaic_names_files_of_its_folder(private, monkeypatch):
     more = '<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">../private/photo.png</MDI></Metadata>'
     for name, relative in (("below/a.png", 1), ("below/a.png", 0), (str(folder / "below/a.png"), 0)):
         (folder / "b.vrt").write_text(mosaic(name, relative, more=more))
-        root = XML.fromstring(mosaic_text(folder / "b.vrt"))
+        root = XML.fromstring(_mosaic_text(folder / "b.vrt"))
         assert [part.tag for part in root] == ["SRS", "VRTRasterBand"]
         (source,) = root.iter("SourceFilename")
         assert (source.text, source.attrib) == (str(folder / "below/a.png"), {"relativeToVRT": "0"})

@@ -15,7 +15,7 @@ from tests.data.test_large import pixels
 @pytest.fixture
 def strips(monkeypatch):
     """Small pictures are large, and are read in strips of 20 or 24 rows."""
-    monkeypatch.setattr("semfov.data.reduction.STRIP", 4700)
+    monkeypatch.setattr("semfov.data.reduction._STRIP", 4700)
     monkeypatch.setattr("semfov.data.windowed.LARGE", 4700)
 
 
@@ -105,7 +105,7 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
 
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):
     """Copies have at most 1600 pixels here."""
-    monkeypatch.setattr("semfov.data.reduction.LARGEST", 1600)
+    monkeypatch.setattr("semfov.data.reduction._LARGEST", 1600)
     array, rows = pixels(256, 384), []
 
     class Counting(_ArrayPicture):

@@ -84,7 +84,7 @@ def test_mirrored_boxes_follow_the_pixels():
     for mirrored in (False, True):
         shown = np.asarray(patch)[:, ::-1] if mirrored else np.asarray(patch)
         rows, columns = np.nonzero(shown > 127)
-        box = module.Item(photograph, (200, 100, 250, 130), mirrored).box()
+        box = module._Item(photograph, (200, 100, 250, 130), mirrored).box()
         seen = (columns.min() + 200, rows.min() + 100, columns.max() + 201, rows.max() + 101)
         assert np.abs(np.subtract(box, seen)).max() <= 0.5
 

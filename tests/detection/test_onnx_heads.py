@@ -44,7 +44,7 @@ def close(actual, expected):
 def test_yolox(dtype, canvas, strides):
     cells = cell_list(canvas, strides)
     raw = noise(2, len(cells), 8, dtype=dtype)
-    found = heads.decode_yolox(raw, canvas, strides)
+    found = heads._decode_yolox(raw, canvas, strides)
     expected = [
         [
             corners((x + c) * s, (y + r) * s, math.exp(w) * s, math.exp(h) * s)
@@ -63,7 +63,7 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     strides = (8, 16, 32, 64)
     cells = cell_list(canvas, strides)
     classes, distances = noise(1, len(cells), 3, dtype=dtype), 2 * noise(1, len(cells), 4 * bins, dtype=dtype)
-    found = heads.decode_distances(classes, distances, canvas, strides=strides, offset=offset)
+    found = heads._decode_distances(classes, distances, canvas, strides=strides, offset=offset)
     expected = []
     for (column, row, stride), numbers in zip(cells, distances[0].tolist(), strict=True):
         sides = []
@@ -83,26 +83,26 @@ def test_decoders_are_differentiable():
 
     check = torch.autograd.gradcheck
     raw, boxes = noise(1, 5, 7).requires_grad_(), noise(1, 5, 4, seed=1).sigmoid().requires_grad_()
-    assert check(lambda x: numbers(heads.decode_yolox(x, (16, 16), (8, 16))), raw)
-    assert check(lambda x: numbers(heads.decode_yolov5(x)), raw)
+    assert check(lambda x: numbers(heads._decode_yolox(x, (16, 16), (8, 16))), raw)
+    assert check(lambda x: numbers(heads._decode_yolov5(x)), raw)
     assert check(lambda x: numbers(heads.decode_yolov8(x)), raw)
     assert check(lambda x, y: numbers(heads.decode_detr(x, y, (16, 8))), (raw, boxes))
     assert check(lambda x, y: numbers(heads.decode_rtdetr(x, y, (16, 8))), (raw, boxes))
     distances = noise(1, 5, 12).requires_grad_()
-    assert check(lambda x, y: numbers(heads.decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
+    assert check(lambda x, y: numbers(heads._decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
 
 
 def test_decoder_compiles():
     raw = noise(1, 84, 8)
-    compiled = torch.compile(heads.decode_yolox, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(raw, (64, 64)).boxes, heads.decode_yolox(raw, (64, 64)).boxes)
+    compiled = torch.compile(heads._decode_yolox, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(raw, (64, 64)).boxes, heads._decode_yolox(raw, (64, 64)).boxes)
 
 
 def test_wrong_shapes_are_refused_by_name():
     with pytest.raises(InputError, match="84 rows, one for each cell of a 64 x 64 canvas"):
-        heads.decode_yolox(noise(1, 83, 8), (64, 64))
+        heads._decode_yolox(noise(1, 83, 8), (64, 64))
     with pytest.raises(InputError, match="bins"):
-        heads.decode_distances(noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
+        heads._decode_distances(noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
     with pytest.raises(InputError, match="boxes"):
         heads.decode_detr(noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
@@ -205,13 +205,13 @@ def test_places_of_a_pass_tell_heads_of_one_shape_apart():
 
 def test_end_to_end_rows_are_one_hot_vectors():
     rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 2.0], [1.0, 1.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
-    found = heads.decode_end_to_end(rows, 3)
+    found = heads._decode_end_to_end(rows, 3)
     assert torch.equal(found.boxes, rows[..., :4])
     assert torch.equal(found.classes, torch.tensor([[[0, 0, 0.9], [0.2, 0, 0], [0, 0, 0]]]))
     with pytest.raises(InputError, match="classes: expected a name for each class of the rows, got 2, and class 2"):
-        heads.decode_end_to_end(rows, 2)
+        heads._decode_end_to_end(rows, 2)
     with pytest.raises(InputError, match="rows: expected a whole number"):
-        heads.decode_end_to_end(rows + 0.5, 9)
+        heads._decode_end_to_end(rows + 0.5, 9)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 
 from semfov.envs.environment import EpisodeEnv
 from semfov.envs.vector import GazeVectorEnv
-from semfov.envs.windows import action_of
+from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.exploration_protocol import explore_noise
 from semfov.runs.search_protocol import Trial, tie_noise
@@ -62,7 +62,7 @@ class WindowAgent:
         gaze, belief, lattice = self.gaze, self.gaze.belief, self.gaze.glances.lattice
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
-        return action_of(lattice, overview(lattice) if choice is None else choice[0])
+        return _action_of(lattice, overview(lattice) if choice is None else choice[0])
 
 
 @dataclass

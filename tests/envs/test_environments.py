@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from semfov import DataError, EmbeddedScenes, Grid, InputError
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
-from semfov.envs.registration import IDS
+from semfov.envs.registration import _IDS
 from semfov.metrics.search import random_search
 from tests.envs.agents import MaskedRandom, run_agent
 
@@ -33,7 +33,7 @@ def equal(one, other):
 )
 def test_environments_pass_the_checker_of_gymnasium(world, task, more):
     """Warnings are errors."""
-    env = gymnasium.make(IDS[task], **world, **more)
+    env = gymnasium.make(_IDS[task], **world, **more)
     assert isinstance(env.unwrapped, KINDS[task])
     check_env(env.unwrapped)
 
@@ -42,7 +42,7 @@ def test_environments_pass_the_checker_of_gymnasium(world, task, more):
 def test_vectorised_episodes_equal_those_of_gymnasium(sceneries, task):
     """At every reset and every step, with ends of episodes in between."""
     options = {"belief": True, "scenery": sceneries[task]}
-    ours = gymnasium.make_vec(IDS[task], num_envs=3, together=False, **options)
+    ours = gymnasium.make_vec(_IDS[task], num_envs=3, together=False, **options)
     assert isinstance(ours, GazeVectorEnv)
     theirs = SyncVectorEnv([lambda: KINDS[task](**options)] * 3)
     assert ours.observation_space == theirs.observation_space
@@ -256,7 +256,7 @@ def test_invalid_calls_are_refused(sceneries):
     with pytest.raises(InputError, match="actions: expected 2 cells from 0 to 19"):
         envs.step(np.array([0, 20]))
     with pytest.raises(InputError, match="unknown action 'pixel'"):
-        gymnasium.make(IDS["search"], action="pixel")
+        gymnasium.make(_IDS["search"], action="pixel")
 
 
 def test_actions_are_those_of_the_space(sceneries):
@@ -318,7 +318,7 @@ def test_importing_registers_the_names_once(fresh):
         "register()\n"
         "print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
     )
-    assert fresh(code).strip() == str(sorted(IDS.values()))
+    assert fresh(code).strip() == str(sorted(_IDS.values()))
 
 
 def test_without_gymnasium_the_error_has_the_install_command(fresh):

@@ -14,7 +14,7 @@ from PIL import Image
 
 from semfov import InputError
 from semfov.envs import ZoomExplore, ZoomSearch, open_zoom_scenery
-from semfov.envs.registration import IDS
+from semfov.envs.registration import _IDS
 from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.glances import on_lattice, overview
@@ -52,7 +52,7 @@ def test_an_action_selects_the_nearest_window_and_converts_back(size, place, num
 @pytest.mark.slow
 @pytest.mark.parametrize("task", KINDS)
 def test_environments_pass_the_checker_of_gymnasium(cache, task):
-    env = gymnasium.make(IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
+    env = gymnasium.make(_IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
     assert isinstance(env.unwrapped, KINDS[task])
     check_env(env.unwrapped)
 
@@ -149,7 +149,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
     _, info = explore.reset(seed=0)
     assert info["result"] == int(info["result"])
 
-    envs = gymnasium.make_vec(IDS["exploration"], num_envs=2, action="window", scenery=scenery, belief=True)
+    envs = gymnasium.make_vec(_IDS["exploration"], num_envs=2, action="window", scenery=scenery, belief=True)
     assert isinstance(envs, SyncVectorEnv)
     observations, infos = envs.reset(seed=[0, 3])
     assert observations["belief"].shape == (2, 2, 10, 10)

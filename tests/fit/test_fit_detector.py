@@ -362,7 +362,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.verification.fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.verification._fit_in_folds", fail)
     assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))

@@ -15,17 +15,17 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
 from semfov.fit.searches import _search_photograph, open_photographs, photograph_searches
 from semfov.fit.verification import (
+    _LEVELS,
+    _SHIPPED,
     _STRENGTH,
-    LEVELS,
-    SHIPPED,
     FitVerificationConfig,
     _CloserLooks,
+    _fit_in_folds,
     _shipped_mean,
     _VerifiedSearch,
     choose_confirm,
     examine,
     fit,
-    fit_in_folds,
     verify,
 )
 from semfov.gaze.policies import NonPredictive, Random
@@ -114,7 +114,7 @@ def test_a_single_closer_look_is_not_enough():
 
 
 def test_the_prior_is_the_mean_of_the_shipped_models():
-    files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in SHIPPED]
+    files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in _SHIPPED]
     for name, tensor in _shipped_mean().named_parameters():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
@@ -138,7 +138,7 @@ def searched(present, places, ends, presence, looks):
 PLACES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=3)
 
 
-@given(PLACES, st.sampled_from(LEVELS))
+@given(PLACES, st.sampled_from(_LEVELS))
 def test_the_decision_at_a_threshold_equals_a_walk_through_the_closer_looks(places, confirm):
     ends = tuple(range(2, 2 + len(places)))
     verified = searched(True, tuple(places), ends, 0.5, 9)
@@ -163,8 +163,8 @@ def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
     def alarms(confirm):
         return sum(place >= confirm for place in places) / len(places)
 
-    fits = [level for level in LEVELS if alarms(level) <= share + 1e-12]
-    assert chosen == (fits[0] if fits else LEVELS[-1])
+    fits = [level for level in _LEVELS if alarms(level) <= share + 1e-12]
+    assert chosen == (fits[0] if fits else _LEVELS[-1])
 
 
 def opened(detector, store=None):
@@ -297,7 +297,7 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
         assert list(each.ends) == sorted(each.ends)
         assert each.looks >= max(each.ends, default=1)
     with pytest.raises(DataError, match="got only one kind"):
-        fit_in_folds([], evidence, config)
+        _fit_in_folds([], evidence, config)
 
 
 class Limited(Blobs):

@@ -69,7 +69,7 @@ def test_the_digest_of_a_class_without_a_file_is_valid_in_one_process_only():
 def test_the_code_of_looks_does_not_include_beliefs_or_gaze():
     from semfov.runs.looks import LOOK_SOURCES
 
-    files = code.closure(LOOK_SOURCES, lambda name: name.startswith("semfov."))
+    files = code._closure(LOOK_SOURCES, lambda name: name.startswith("semfov."))
     folders = {file.relative_to(file.parents[1]).as_posix() for file in files}
     for name in ("sensor/pyramid.py", "detection/selection.py", "detection/onnx_heads.py", "data/images.py"):
         assert name in folders
@@ -85,7 +85,7 @@ def test_relative_imports_and_packages_are_followed(tmp_path, monkeypatch):
     (folder / "a.py").write_text("from .b import value\n")
     (folder / "b.py").write_text("value = 1\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    files = code.closure(["own_package"], lambda name: name.startswith("own_package"))
+    files = code._closure(["own_package"], lambda name: name.startswith("own_package"))
     assert {file.name for file in files} == {"__init__.py", "a.py", "b.py"}
     for name in [name for name in sys.modules if name.startswith("own_package")]:
         sys.modules.pop(name)
@@ -112,7 +112,7 @@ def user_files(tmp_path, monkeypatch):
     """Names of the files of a user's module that imports the library; it is found, and not imported."""
     (tmp_path / "own_user.py").write_text(USER)
     monkeypatch.syspath_prepend(str(tmp_path))
-    files = code.closure(["own_user"], lambda name: name == "own_user" or not code._of_others(name))
+    files = code._closure(["own_user"], lambda name: name == "own_user" or not code._of_others(name))
     assert not {"own_library", "own_library.part", "own_user"} & sys.modules.keys()
     return sorted(file.relative_to(tmp_path).as_posix() for file in files if file.is_relative_to(tmp_path))
 

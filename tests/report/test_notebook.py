@@ -77,7 +77,7 @@ def test_the_size_of_the_output_is_limited(looks, columns, classes, size, shown)
     """If the output is too large: coarser pictures and fewer classes, then only text."""
     noise = torch.rand(3, size * 3 // 4, size)
     text = with_photograph(scanpath_of(looks, columns, classes), noise)._repr_html_()
-    assert len(text.encode()) <= notebook.MOST_CHARACTERS
+    assert len(text.encode()) <= notebook._MOST_CHARACTERS
     if shown:
         episode = data_of(Frame(text).tags[0][1]["srcdoc"])["episodes"][0]
         assert len(episode["fixations"]) == looks

@@ -12,7 +12,7 @@ import torch
 from semfov import Grid
 from semfov.cli.text import _regions_lines
 from semfov.viz import cell_entropy, plot_semantic_map
-from semfov.viz.semantic import borders, named_regions, regions
+from semfov.viz.semantic import _regions, borders, named_regions
 from tests import small
 
 CLASSES = ("background", "cat", "cup", "dog")
@@ -39,17 +39,17 @@ def labelled(table):
 def test_regions_equal_those_of_scipy(shape, classes):
     for seed in range(6):
         table = torch.randint(classes + 1, shape, generator=torch.Generator().manual_seed(seed))
-        found = regions(table)
+        found = _regions(table)
         assert {(int(table.flatten()[cells[0]]), tuple(cells)) for cells in found} == labelled(table.numpy())
         assert all(cells == sorted(cells) for cells in found)
         assert sorted(cell for cells in found for cell in cells) == table.flatten().nonzero()[:, 0].tolist()
 
 
 def test_regions_of_empty_and_uniform_tables():
-    assert regions(torch.zeros(3, 4, dtype=torch.long)) == []
-    assert regions(torch.full((3, 4), 2)) == [list(range(12))]
+    assert _regions(torch.zeros(3, 4, dtype=torch.long)) == []
+    assert _regions(torch.full((3, 4), 2)) == [list(range(12))]
     snake = torch.tensor([[1, 1, 1], [0, 0, 1], [1, 1, 1], [1, 0, 0], [1, 1, 1]])
-    assert [len(cells) for cells in regions(snake)] == [11]
+    assert [len(cells) for cells in _regions(snake)] == [11]
 
 
 @pytest.mark.parametrize("count", [2, 4, 12])
@@ -114,7 +114,7 @@ def test_borders_go_around_regions():
     table = torch.randint(3, (6, 7), generator=torch.Generator().manual_seed(0))
     grid = Grid(7, 6, (70, 60))
     padded = np.pad(table.numpy(), 1, constant_values=-1)
-    for region in regions(table):
+    for region in _regions(table):
         inside = np.zeros(42, dtype=int)
         inside[region] = 1
         framed = np.pad(inside.reshape(6, 7), 1)

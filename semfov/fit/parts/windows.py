@@ -150,7 +150,7 @@ class WindowsFit(PartFit):
         eye = WindowEye(self.run.eye.detector).eval().requires_grad_(False)
         mosaics = make_mosaics(config, eye.detector.classes)
         store = make_store(config, eye)
-        model, figures = fit_mosaics(config, eye, mosaics, store)
+        model, figures = _fit_mosaics(config, eye, mosaics, store)
         judged = mosaics["judged"]
         opened = open_all(eye, judged, store)
         curves = {
@@ -178,7 +178,7 @@ class WindowsFit(PartFit):
         return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
 
 
-def fit_mosaics(
+def _fit_mosaics(
     config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, str]:
     """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""

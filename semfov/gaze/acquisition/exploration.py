@@ -142,7 +142,7 @@ class TwoPeaks(Lookahead):
 
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Absolute change of the margin."""
-        return (lead(outlook.next_mean) - lead(outlook.mean)[..., None]).abs()
+        return (_lead(outlook.next_mean) - _lead(outlook.mean)[..., None]).abs()
 
     def pool(self, values: Tensor) -> Tensor:
         """The largest change over the map."""
@@ -240,7 +240,7 @@ def divergence(outlook: Outlook) -> Tensor:
     return (terms * outlook.mean[..., None, :]).sum(-1)
 
 
-def lead(mean: Tensor) -> Tensor:
+def _lead(mean: Tensor) -> Tensor:
     """Margin of the most probable class of means `(..., K+1)`: its probability minus the second largest one."""
     first, place = mean.max(-1, keepdim=True)
     return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)

@@ -20,7 +20,7 @@ from semfov.io.schema import Number as JsonNumber
 from semfov.io.storage import checksum
 from semfov.sensor.lines import constant
 
-CELLS = 52
+_CELLS = 52
 """Cells along the longer side of a picture in which densities are computed."""
 
 _HALF = torch.float16
@@ -378,7 +378,7 @@ class FixationDensity(Pretrained):
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:
     """Rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
-    return max(1, round(CELLS * size[0] / longer)), max(1, round(CELLS * size[1] / longer))
+    return max(1, round(_CELLS * size[0] / longer)), max(1, round(_CELLS * size[1] / longer))
 
 
 def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from semfov.gaze.saliency.opponent import anchor, double_opponency
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import pyrdown
 
-CENTRES = (2, 3, 4)
+_CENTRES = (2, 3, 4)
 _DELTAS = (3, 4)
 _ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
 
@@ -96,14 +96,14 @@ def _promote(maps: Tensor) -> Tensor:
     Shapes: maps `(..., h, w)`.
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
-    peaks = local_maxima(maps) & (maps > _PEAK)
+    peaks = _local_maxima(maps) & (maps > _PEAK)
     count = peaks.sum((-2, -1), keepdim=True)
     # The largest maximum is exactly 1, and is always among the peaks.
     others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
     return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
 
 
-def local_maxima(maps: Tensor) -> Tensor:
+def _local_maxima(maps: Tensor) -> Tensor:
     """Local maxima: pixels above their earlier neighbours and no less than their later ones, in row-major order.
 
     Shapes: maps `(..., h, w)`.
@@ -117,7 +117,7 @@ def local_maxima(maps: Tensor) -> Tensor:
     return (maps > earlier) & (maps >= later)
 
 
-def conspicuity(image: Tensor) -> Tensor:
+def _conspicuity(image: Tensor) -> Tensor:
     r"""Conspicuity maps of intensity, colour and orientation at scale 4 (Itti, Koch and Niebur, 1998).
 
     .. math:: \bar I = \bigoplus_{c,s} N(I_{c,s}), \quad
@@ -132,16 +132,16 @@ def conspicuity(image: Tensor) -> Tensor:
 
     Shapes: image `(B, 3, H, W)` → `(B, 3, h, w)`.
     """
-    levels = max(CENTRES) + max(_DELTAS)
+    levels = max(_CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
-    features = [torch.cat([level, _orientation_energy(level[:, :1])], 1) for level in pyramid[min(CENTRES) :]]
+    features = [torch.cat([level, _orientation_energy(level[:, :1])], 1) for level in pyramid[min(_CENTRES) :]]
     total = torch.zeros((), dtype=image.dtype, device=image.device)
-    for centre in CENTRES:
-        here = features[centre - min(CENTRES)]
-        around = [features[centre - min(CENTRES) + delta] for delta in _DELTAS]
+    for centre in _CENTRES:
+        here = features[centre - min(_CENTRES)]
+        around = [features[centre - min(_CENTRES) + delta] for delta in _DELTAS]
         maps = _promote(torch.stack([_across_scales(here, surround) for surround in around], 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
-        total = total + _dyadic_pyramid(maps, max(CENTRES) - centre)[-1]
+        total = total + _dyadic_pyramid(maps, max(_CENTRES) - centre)[-1]
     intensity, colour, orientation = total.split([1, 2, len(_ORIENTATIONS)], 1)
     channels = [intensity, colour.sum(1, keepdim=True), _promote(orientation).sum(1, keepdim=True)]
     return torch.cat(channels, 1)
@@ -152,7 +152,7 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
 
     .. math:: S = \tfrac{1}{3} (N(\bar I) + N(\bar C) + N(\bar O))
 
-    It is computed at scale 4 and enlarged bilinearly to the size of the image; see `conspicuity`.
+    It is computed at scale 4 and enlarged bilinearly to the size of the image; see `_conspicuity`.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
@@ -172,7 +172,7 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
     """
     # Peaks depend on the last digits of a map: in half precision nearly every pixel is one, and no saliency remains.
     with torch.autocast(image.device.type, enabled=False):
-        saliency = _promote(conspicuity(image)).mean(1, keepdim=True)
+        saliency = _promote(_conspicuity(image)).mean(1, keepdim=True)
     size = (image.shape[-2], image.shape[-1])
     saliency = F.interpolate(saliency, size, mode="bilinear", align_corners=False)[:, 0]
     return rescale(saliency) if normalise else saliency
