@@ -45,7 +45,7 @@ _AREA = 0.2
 """Classes that cover a larger share of a photograph are not searched for."""
 
 
-class Limits(Protocol):
+class _Limits(Protocol):
     """Settings of the fit (see `FitZoomConfig`)."""
 
     @property
@@ -69,7 +69,7 @@ class Limits(Protocol):
         ...
 
 
-class WholeSearch(TargetSearch[WindowLook]):
+class _WholeSearch(TargetSearch[WindowLook]):
     """A search of a photograph after the look at the whole; objects `(M, 4)`, closer looks by their box."""
 
     after = (1,)
@@ -132,7 +132,7 @@ class WholeSearch(TargetSearch[WindowLook]):
 
 
 def fit_photographs(
-    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: Limits, prior: Verification | None = None
+    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: _Limits, prior: Verification | None = None
 ) -> str:
     """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
 
@@ -150,7 +150,7 @@ def fit_photographs(
         held[index, pictures.annotation(index).labels - 1] = True
     evidence = PhotographEvidence(model.classes).eval().requires_grad_(False)
     evidence.usual.copy_(_usual(held.sum(0), count))
-    searches: list[WholeSearch] = []
+    searches: list[_WholeSearch] = []
     facts, right = [], []
     for number, index in enumerate(track(single[: config.photographs], "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
@@ -161,7 +161,7 @@ def fit_photographs(
         # The same draw with more absent classes begins with the same ones.
         for place, target in enumerate(choose_classes(pictures, index, annotation, 2, _AREA, config.seed, _ABSENT)):
             boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
-            searches.append(WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
+            searches.append(_WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
         for some in (looks[:1], looks):
             found, about = merge_with_facts(some, glances.lattice)
             hits = right_boxes(found, annotation)
@@ -181,7 +181,7 @@ def _usual(held: Tensor, count: int) -> Tensor:
     return ((held + 0.5) / (count + 1)).double().logit()
 
 
-def _fit_whole(evidence: PhotographEvidence, searches: Sequence[WholeSearch], held: Tensor, count: int) -> None:
+def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], held: Tensor, count: int) -> None:
     """Fit the probability after the look at the whole, with frequencies in the other photographs; held `(P, K)`."""
     total = held.sum(0)
     best = torch.tensor([search.best for search in searches], dtype=torch.float64)
@@ -194,7 +194,7 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[WholeSearch], he
 
 
 def _fit_closer(
-    evidence: PhotographEvidence, searches: Sequence[WholeSearch], config: Limits, prior: Verification | None
+    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: _Limits, prior: Verification | None
 ) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
     closer = examine(searches, _FOLDS)
