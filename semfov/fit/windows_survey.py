@@ -3,7 +3,7 @@
 import random
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,8 +17,7 @@ _LATER = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
 
 
-@dataclass(frozen=True)
-class _LookCounts:
+class _LookCounts(NamedTuple):
     """A look, and how many new objects each of the closer looks inside it found; counts `(N,)`."""
 
     gist: Gist
@@ -52,8 +51,7 @@ class _LookCounts:
         return torch.cat(terms).mean() if terms else logs.sum() * 0
 
 
-@dataclass(frozen=True)
-class SurveyExample:
+class SurveyExample(NamedTuple):
     """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found."""
 
     overview: _LookCounts

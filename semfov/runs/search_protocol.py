@@ -1,7 +1,6 @@
 """The protocol of searches: the episodes of a scene, and their results."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -20,8 +19,7 @@ from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One search for a target class in a scene."""
 
     scene: int

@@ -53,7 +53,7 @@ def test_a_named_sensor_is_made_again_from_its_settings(name):
 
 
 def test_every_name_can_be_given_in_settings():
-    assert get_args(SensorName) == tuple(SENSORS)
+    assert set(get_args(SensorName)) == set(SENSORS)
 
 
 def test_settings_of_a_sensor_are_given_by_their_names(capsys):
@@ -79,9 +79,7 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
     assert sensor_of(config.make().settings()).share == 0.25
     assert Dimmed.describe(config.make().settings()) == "share 0.25"
     monkeypatch.undo()
-    with pytest.raises(
-        InputError, match=r"the settings of a Foveation or a LogPolar or a MultiScaleFovea, got \{'kind': 'dimmed'"
-    ):
+    with pytest.raises(InputError, match=r"the settings of a Foveation or a .*, got \{'kind': 'dimmed'"):
         sensor_of({"kind": "dimmed", "share": 0.5})
 
 
